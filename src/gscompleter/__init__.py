@@ -1,0 +1,70 @@
+"""GSCompleter: complete 3D Gaussian Splatting scenes by generating, then registering."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from gscompleter.completer import CompleterConfig, GSCompleter
+    from gscompleter.errors import InputError
+    from gscompleter.generators import load_generator
+    from gscompleter.io.ply import load_ply, save_ply
+    from gscompleter.io.scene import load_camera, load_cameras, load_views
+    from gscompleter.reconstructors import load_reconstructor
+    from gscompleter.render import load_renderer
+    from gscompleter.types import Camera, Completion, Gaussians, Render, View, merge
+
+# Where each public name lives. They are imported on first use, so that `import gscompleter` and
+# `gscompleter --help` do not wait for torch.
+_HOMES = {
+    "GSCompleter": "completer",
+    "CompleterConfig": "completer",
+    "InputError": "errors",
+    "load_generator": "generators",
+    "load_ply": "io.ply",
+    "save_ply": "io.ply",
+    "load_camera": "io.scene",
+    "load_cameras": "io.scene",
+    "load_views": "io.scene",
+    "load_reconstructor": "reconstructors",
+    "load_renderer": "render",
+    "Camera": "types",
+    "Completion": "types",
+    "Gaussians": "types",
+    "Render": "types",
+    "View": "types",
+    "merge": "types",
+}
+
+__all__ = [
+    "Camera",
+    "CompleterConfig",
+    "Completion",
+    "GSCompleter",
+    "Gaussians",
+    "InputError",
+    "Render",
+    "View",
+    "load_camera",
+    "load_cameras",
+    "load_generator",
+    "load_ply",
+    "load_reconstructor",
+    "load_renderer",
+    "load_views",
+    "merge",
+    "save_ply",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'gscompleter' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"gscompleter.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -1,0 +1,89 @@
+"""Rays, projection, and how cameras lie to each other."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.types import Camera
+
+
+def unproject(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w 3"]:
+    """World points at z-depth `depth` behind each pixel centre of `camera`."""
+    return camera.center + depth[..., None] * camera.z_rays()
+
+
+def project(
+    points: Float[Tensor, "*shape 3"], camera: Camera
+) -> tuple[Float[Tensor, "*shape 2"], Float[Tensor, "*shape"]]:
+    """Pixel coordinates (x, y) and z-depth of world `points` in `camera`.
+
+    Coordinates of points that do not lie in front of the camera (z <= 0) mean nothing.
+    """
+    camera_points = (points - camera.center) @ camera.c2w[:3, :3]
+    z = camera_points[..., 2]
+    homogeneous = camera_points @ camera.K.T
+    return homogeneous[..., :2] / z.abs().clamp_min(torch.finfo(z.dtype).tiny)[..., None], z
+
+
+def inside(
+    pixels: Float[Tensor, "*shape 2"], z: Float[Tensor, "*shape"], camera: Camera
+) -> Bool[Tensor, "*shape"]:
+    """Where projected points lie in front of the camera and within its image."""
+    x, y = pixels.unbind(-1)
+    return (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+
+
+def sample(
+    values: Float[Tensor, "h w c"], pixels: Float[Tensor, "*shape 2"], mode: str = "bilinear"
+) -> Float[Tensor, "*shape c"]:
+    """`values` at pixel coordinates, `bilinear` or `nearest`; the border is extended."""
+    h, w = values.shape[:2]
+    size = torch.tensor([w, h], dtype=pixels.dtype, device=pixels.device)
+    grid = (pixels / size * 2 - 1).reshape(1, 1, -1, 2)
+    sampled = torch.nn.functional.grid_sample(
+        values.permute(2, 0, 1)[None], grid, mode, padding_mode="border", align_corners=False
+    )
+    return sampled[0, :, 0].T.reshape(*pixels.shape[:-1], -1)
+
+
+def distance_from_depth(
+    depth: Float[Tensor, "h w"], camera: Camera
+) -> Float[Tensor, "h w"]:
+    """Euclidean distance along each pixel's ray, from z-depth (paper, Eq. 7)."""
+    return depth * camera.z_rays().norm(dim=-1)
+
+
+def rotation_between(a: Camera, b: Camera) -> float:
+    """Full angle of the rotation that turns one camera into the other, in degrees.
+
+    The arctangent of sine and cosine keeps small angles exact, where the arccosine of the
+    trace alone loses half of the digits.
+    """
+    relative = (a.c2w[:3, :3].T @ b.c2w[:3, :3]).double()
+    cos = (relative.trace() - 1) / 2
+    axis = torch.stack(
+        [
+            relative[2, 1] - relative[1, 2],
+            relative[0, 2] - relative[2, 0],
+            relative[1, 0] - relative[0, 1],
+        ]
+    )
+    return torch.rad2deg(torch.atan2(axis.norm() / 2, cos)).item()
+
+
+def baseline_between(a: Camera, b: Camera) -> float:
+    """Distance between the camera centres, in scene units."""
+    return (a.center - b.center).norm().item()
+
+
+def same_camera(a: Camera, b: Camera) -> bool:
+    """Whether two cameras see the same image, up to float rounding."""
+    extent = max(a.center.abs().max().item(), b.center.abs().max().item())
+    return (
+        (a.width, a.height) == (b.width, b.height)
+        and torch.allclose(a.K, b.K, rtol=1e-5, atol=1e-4)
+        and baseline_between(a, b) <= 1e-6 * extent
+        and rotation_between(a, b) <= 1e-3
+    )

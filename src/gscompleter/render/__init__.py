@@ -1,0 +1,89 @@
+"""Renderers: colour, z-depth and alpha of Gaussians seen from a camera.
+
+All of them draw the 3DGS image formation of gsplat's classic mode: perspective EWA splatting with
+0.3 px² added to the 2D covariance, contributions under alpha 1/255 dropped, alpha capped at 0.999,
+compositing stopped when transmittance falls to 1e-4, colour over black.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from typing import Literal, Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.types import Camera, Gaussians, Render
+
+OpacityRender = Callable[[Float[Tensor, "n"]], Render]
+"""Renders a frozen scene plus Gaussians of which only the opacities [n] may change."""
+
+
+class FrozenView(Protocol):
+    """A context scene that will not change, seen from a camera that will not move.
+
+    Whatever depends on these two alone is computed once, so that the optimisations, which
+    render the same context a hundred times, pay only for what they move.
+    """
+
+    @property
+    def context(self) -> Render:
+        """The context alone."""
+
+    def composite(self, new: Gaussians) -> Render:
+        """Context and `new` together; differentiable in `new`."""
+
+    def plan(self, new: Gaussians) -> OpacityRender:
+        """Fix all of `new` but the opacities; the function it returns is differentiable."""
+
+
+class Renderer(Protocol):
+    """Draws Gaussians; differentiable in means, quats, scales, opacities and sh."""
+
+    def render(self, gaussians: Gaussians, camera: Camera) -> Render: ...
+
+    def freeze(self, context: Gaussians, camera: Camera) -> FrozenView: ...
+
+
+def load_renderer(name: Literal["reference", "cpu", "cuda"]) -> Renderer:
+    """The renderer called `name`.
+
+    Raises:
+        InputError: where the name is unknown, or `cuda` lacks a GPU or gsplat.
+    """
+    if name == "cpu":
+        from gscompleter.render.cpu import CpuRenderer
+
+        return CpuRenderer()
+    if name == "reference":
+        from gscompleter.render.reference import ReferenceRenderer
+
+        return ReferenceRenderer()
+    if name == "cuda":
+        from gscompleter.render.cuda import CudaRenderer
+
+        return CudaRenderer()
+    raise InputError(f"There is no renderer {name!r}; choose reference, cpu or cuda.")
+
+
+def choose_device(device: Literal["auto", "cpu", "cuda"] = "auto") -> Literal["cpu", "cuda"]:
+    """The device to run on: `auto` takes a GPU where torch sees one and gsplat is installed.
+
+    Raises:
+        InputError: where `cuda` is asked for and there is none.
+    """
+    has_gpu = torch.cuda.is_available()
+    has_gsplat = importlib.util.find_spec("gsplat") is not None
+    if device == "auto":
+        return "cuda" if has_gpu and has_gsplat else "cpu"
+    if device == "cuda" and not has_gpu:
+        raise InputError("--device cuda needs a GPU, and torch sees none here; use --device cpu.")
+    if device == "cuda" and not has_gsplat:
+        raise InputError(
+            "--device cuda renders through gsplat, which is not installed; "
+            "run `pip install gscompleter[cuda]` or use --device cpu."
+        )
+    return device

@@ -1,0 +1,316 @@
+"""What the stages exchange.
+
+Conventions, the same everywhere: OpenCV axes (x right, y down, z forward); `c2w` takes camera
+coordinates to world coordinates; intrinsics are in pixels and the centre of the top-left pixel
+is (0.5, 0.5); images are [h, w, 3] in [0, 1]; `depth` is z-depth in scene units and `distance`
+the Euclidean length along a unit ray; quaternions are wxyz; scales are linear, opacities lie in
+[0, 1] and spherical harmonics are [n, k, 3] in the basis of 3DGS.
+
+Values are frozen: a stage returns new ones and writes to none it was given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with OpenCV axes: x right, y down, z forward."""
+
+    c2w: Float[Tensor, "4 4"]
+    """Camera-to-world transform. Its last column is the camera centre."""
+    K: Float[Tensor, "3 3"]
+    """Intrinsics in pixels. The centre of the top-left pixel is (0.5, 0.5)."""
+    width: int
+    height: int
+    near: float | None = None
+    """Smallest z-depth of the scene, in scene units; None where it is not known."""
+    far: float | None = None
+    """Largest z-depth of the scene, in scene units; None where it is not known."""
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """Camera centre in world coordinates."""
+        return self.c2w[:3, 3]
+
+    @property
+    def forward(self) -> Float[Tensor, "3"]:
+        """Unit viewing direction (the z axis) in world coordinates."""
+        return self.c2w[:3, 2]
+
+    @property
+    def viewmat(self) -> Float[Tensor, "4 4"]:
+        """World-to-camera transform, for the rasteriser's door only."""
+        return torch.linalg.inv(self.c2w.double()).to(self.c2w.dtype)
+
+    @property
+    def near_plane(self) -> float:
+        """z-depth in front of which no Gaussian is drawn: a hundredth of `near`, else 0.01.
+
+        It follows the unit of the scene wherever `near` is known, so that a scene in
+        millimetres and the same scene in kilometres give the same image.
+        """
+        return 0.01 * self.near if self.near is not None else 0.01
+
+    def rays(self) -> Float[Tensor, "h w 3"]:
+        """Unit directions through the pixel centres, in world axes."""
+        return torch.nn.functional.normalize(self.z_rays(), dim=-1)
+
+    def z_rays(self) -> Float[Tensor, "h w 3"]:
+        """Directions through the pixel centres, in world axes, of unit z in the camera.
+
+        A point at z-depth `depth` is `center + depth * z_ray`.
+        """
+        x = torch.arange(self.width, device=self.K.device, dtype=self.K.dtype) + 0.5
+        y = torch.arange(self.height, device=self.K.device, dtype=self.K.dtype) + 0.5
+        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+        pixels = torch.nn.functional.pad(pixels, (0, 1), value=1.0)
+        return pixels @ torch.linalg.inv(self.K).T @ self.c2w[:3, :3].T
+
+    def to(self, device: torch.device | str) -> Camera:
+        return replace(self, c2w=self.c2w.to(device), K=self.K.to(device))
+
+
+@dataclass(frozen=True)
+class View:
+    """A photograph (or a synthesized image) and the camera that took it."""
+
+    image: Float[Tensor, "h w 3"]
+    camera: Camera
+    frame: int | None = None
+    """Number of the frame in its scene; None for a view that is not one of its frames."""
+    depth: Float[Tensor, "h w"] | None = None
+    """Measured z-depth in scene units, 0 where unknown. For scoring: no stage reads it."""
+
+    def to(self, device: torch.device | str) -> View:
+        depth = None if self.depth is None else self.depth.to(device)
+        return replace(
+            self, image=self.image.to(device), camera=self.camera.to(device), depth=depth
+        )
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """A set of n 3D Gaussians in the world frame, with their provenance."""
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    """Rotations as wxyz quaternions, of any length but zero."""
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the rotated axes, in scene units (linear)."""
+    opacities: Float[Tensor, "n"]
+    sh: Float[Tensor, "n k 3"]
+    """Spherical harmonics; k is 1, 4, 9 or 16 for degree 0 to 3."""
+    generated: UInt8[Tensor, "n"]
+    """0 where observed, else the 1-based number of the target that created the Gaussian."""
+    encoded: Float[Tensor, "n 4"] | None = None
+    """Log-scales and logit opacity as the file held them, where these came from a file.
+
+    Exponential and logarithm are not exact inverses in float32. Writing uses these values
+    wherever they still stand for `scales` and `opacities`, which makes round trips exact.
+    """
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def __getitem__(self, index: Tensor | slice) -> Gaussians:
+        """The Gaussians at `index`: a boolean mask [n], integers [m] or a slice."""
+        return Gaussians(
+            self.means[index],
+            self.quats[index],
+            self.scales[index],
+            self.opacities[index],
+            self.sh[index],
+            self.generated[index],
+            None if self.encoded is None else self.encoded[index],
+        )
+
+    @property
+    def sh_degree(self) -> int:
+        return {1: 0, 4: 1, 9: 2, 16: 3}[self.sh.shape[1]]
+
+    def to(self, device: torch.device | str) -> Gaussians:
+        return Gaussians(
+            self.means.to(device),
+            self.quats.to(device),
+            self.scales.to(device),
+            self.opacities.to(device),
+            self.sh.to(device),
+            self.generated.to(device),
+            None if self.encoded is None else self.encoded.to(device),
+        )
+
+
+def observed(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    opacities: Float[Tensor, "n"],
+    sh: Float[Tensor, "n k 3"],
+) -> Gaussians:
+    """Gaussians whose provenance is a photograph."""
+    generated = torch.zeros(len(means), dtype=torch.uint8, device=means.device)
+    return Gaussians(means, quats, scales, opacities, sh, generated)
+
+
+def merge(parts: Sequence[Gaussians]) -> Gaussians:
+    """All Gaussians of `parts`, in order, each with its provenance.
+
+    Spherical harmonics of a lower degree are padded with zeros, which changes no colour.
+    """
+    if not parts:
+        raise ValueError("merge needs at least one set of Gaussians, got none")
+    k = max(part.sh.shape[1] for part in parts)
+    sh = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
+    encoded = None
+    if any(part.encoded is not None for part in parts):
+        unknown = float("nan")  # equal to nothing: the writer encodes these anew
+        encoded = torch.cat(
+            [
+                part.means.new_full((len(part), 4), unknown)
+                if part.encoded is None
+                else part.encoded
+                for part in parts
+            ]
+        )
+    return Gaussians(
+        torch.cat([part.means for part in parts]),
+        torch.cat([part.quats for part in parts]),
+        torch.cat([part.scales for part in parts]),
+        torch.cat([part.opacities for part in parts]),
+        torch.cat(sh),
+        torch.cat([part.generated for part in parts]),
+        encoded,
+    )
+
+
+def sh_from_rgb(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
+    """Degree-0 spherical harmonics that show `rgb` from everywhere."""
+    return ((rgb - 0.5) / SH_C0)[:, None]
+
+
+@dataclass(frozen=True)
+class Render:
+    """What a camera sees of a set of Gaussians, over black."""
+
+    image: Float[Tensor, "h w 3"]
+    depth: Float[Tensor, "h w"]
+    """z-depth, sum(w z) / sum(w) over the compositing weights w; 0 where nothing is seen."""
+    alpha: Float[Tensor, "h w"]
+    """Accumulated opacity, sum(w)."""
+
+    def depth_map(self, min_alpha: float = 0.5) -> DepthMap:
+        """The depth, valid where the Gaussians cover at least `min_alpha` of the pixel."""
+        return DepthMap(self.depth, self.alpha >= min_alpha)
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """z-depth per pixel and where it can be trusted."""
+
+    depth: Float[Tensor, "h w"]
+    valid: Bool[Tensor, "h w"]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What a reconstructor Ψ makes of its views: Gaussians and a depth map per view."""
+
+    gaussians: Gaussians
+    depths: tuple[DepthMap, ...]
+    """One per view, in the order of the views."""
+    view_index: Int[Tensor, "n"] | None = None
+    """For pixel-aligned models, the view each Gaussian came from; None for others."""
+    pixel_index: Int[Tensor, "n"] | None = None
+    """For pixel-aligned models, the row-major pixel of that view; None for others."""
+
+
+@dataclass(frozen=True)
+class SceneContext:
+    """What is known of the scene when a generator Φ is asked for an unseen image."""
+
+    views: tuple[View, ...]
+    """The photographs."""
+    at_views: tuple[Render, ...]
+    """The context scene rendered at the cameras of `views`, in their order."""
+    at_target: Render
+    """The context scene rendered at the target camera: alpha tells where its holes are."""
+
+
+@dataclass(frozen=True)
+class Lift:
+    """The synthesized image lifted to 3D by stereo with the anchor (paper, Sec. III-D)."""
+
+    gaussians: Gaussians
+    """Candidates: the Gaussians of the reference image only, in the world frame."""
+    reference_depth: DepthMap
+    anchor_depth: DepthMap
+    pixel_index: Int[Tensor, "n"] | None
+    """The row-major pixel of the reference each candidate came from, where known."""
+
+
+@dataclass(frozen=True)
+class DepthAffine:
+    """`context depth = scale * predicted depth + shift`, on z-depth (paper, Eq. 6)."""
+
+    scale: float = 1.0
+    shift: float = 0.0
+    inliers: float = 0.0
+    """Share of the compared pixels that agree with the fit."""
+    method: Literal["ransac", "median", "identity"] = "identity"
+    """How the fit was found; the later ones are the fallbacks of the earlier."""
+
+
+@dataclass(frozen=True)
+class TargetCompletion:
+    """What happened at one target, kept for inspection."""
+
+    target: Camera
+    before: Render
+    """The scene as it was, seen from the target."""
+    after: Render
+    hole_mask: Bool[Tensor, "h w"]
+    """True where the scene had a hole, before dilation."""
+    reference: View | None
+    """The synthesized view; None where there was nothing to complete."""
+    anchor: int
+    """Index of the anchor among the context views."""
+    anchor_fallback: bool
+    """True where every view was turned too far and the least-turned one was taken."""
+    affine: DepthAffine
+    added: Gaussians
+    losses: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """Loss per iteration of the two optimisations, `register` and `refine`."""
+    notes: tuple[str, ...] = ()
+    """Fallbacks that were taken, a sentence each."""
+
+    @property
+    def hole_fraction(self) -> float:
+        return self.hole_mask.float().mean().item()
+
+
+@dataclass(frozen=True)
+class Completion:
+    """A completed scene."""
+
+    scene: Gaussians
+    """The context, bit for bit as it was, followed by everything that was added."""
+    context: Gaussians
+    targets: tuple[TargetCompletion, ...]
+    seconds: Mapping[str, float]
+    """Wall time of context, generate, lift, register, integrate and total."""
+
+    @property
+    def added(self) -> Gaussians:
+        """The generated Gaussians of all targets."""
+        return self.scene[len(self.context) :]

@@ -1,0 +1,21 @@
+"""Every shape in an annotation is a run-time check while the tests run."""
+
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+# All of the package but `gscompleter.kernels`, whose functions numba compiles.
+CHECKED = ["types", "geometry", "io", "completer", "stages", "render", "reconstructors"]
+CHECKED += ["generators", "evaluation"]
+install_import_hook([f"gscompleter.{name}" for name in CHECKED], "beartype.beartype")
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture
+def shared() -> Path:
+    """Real photographs and files for development, where they lie beside the project."""
+    if not SHARED.is_dir():
+        pytest.skip(f"needs the development data, and there is no folder {SHARED}")
+    return SHARED

@@ -1,0 +1,131 @@
+"""Small synthetic rooms whose true geometry is known, drawn by casting rays.
+
+A room is a box seen from inside, with smaller boxes standing in it. Every surface carries a
+texture that is a fixed function of the world point, so that all views agree on colour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.types import Camera, Gaussians, View, observed, sh_from_rgb
+
+
+@dataclass(frozen=True)
+class Room:
+    """Axis-aligned boxes [low, high]; the first is seen from inside, the others from outside."""
+
+    boxes: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = (
+        ((-3.0, -1.5, -1.0), (3.0, 1.5, 5.0)),
+        ((-0.5, 0.3, 2.2), (0.3, 1.5, 3.0)),
+        ((0.9, -0.2, 3.2), (1.5, 1.5, 3.8)),
+    )
+    unit: float = 1.0
+    """Everything is multiplied by this factor."""
+
+
+def camera_at(
+    x: float = 0.0,
+    y: float = 0.0,
+    z: float = 0.0,
+    yaw: float = 0.0,
+    *,
+    size: int = 96,
+    focal: float = 0.9,
+    unit: float = 1.0,
+) -> Camera:
+    """A square camera at (x, y, z), turned by `yaw` degrees about the downward axis.
+
+    `focal` is in image widths; near and far enclose the default room.
+    """
+    angle = torch.deg2rad(torch.tensor(yaw, dtype=torch.float64))
+    c2w = torch.eye(4, dtype=torch.float64)
+    c2w[0, 0] = c2w[2, 2] = angle.cos()
+    c2w[0, 2], c2w[2, 0] = angle.sin(), -angle.sin()
+    c2w[:3, 3] = torch.tensor([x, y, z]) * unit
+    K = torch.tensor([[focal * size, 0.0, size / 2], [0.0, focal * size, size / 2], [0, 0, 1]])
+    return Camera(c2w.float(), K.float(), size, size, near=0.5 * unit, far=20.0 * unit)
+
+
+def texture(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Colour of world points: waves of several lengths and directions, enough for stereo."""
+    generator = torch.Generator().manual_seed(7)
+    colour = torch.full_like(points, 0.5)
+    for wavelength, strength in ((2.5, 0.16), (1.0, 0.10), (0.45, 0.08), (0.22, 0.06)):
+        for _ in range(3):
+            direction = torch.randn(3, generator=generator).to(points)
+            direction = direction / direction.norm() * (6.2832 / wavelength)
+            phase = torch.rand(3, generator=generator).to(points) * 6.2832
+            colour = colour + strength * torch.sin((points @ direction)[..., None] + phase)
+    return colour.clamp(0, 1)
+
+
+def cast(room: Room, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+    """True image and z-depth at the pixel centres."""
+    origin, z_rays = camera.center.double(), camera.z_rays().double()
+    depth = torch.full(z_rays.shape[:2], torch.inf, dtype=torch.float64)
+    for index, (low, high) in enumerate(room.boxes):
+        low_t = torch.tensor(low, dtype=torch.float64) * room.unit
+        high_t = torch.tensor(high, dtype=torch.float64) * room.unit
+        to_low, to_high = (low_t - origin) / z_rays, (high_t - origin) / z_rays
+        enter = torch.minimum(to_low, to_high).nan_to_num(-torch.inf).amax(-1)
+        leave = torch.maximum(to_low, to_high).nan_to_num(torch.inf).amin(-1)
+        hit = leave if index == 0 else enter.where((enter < leave) & (enter > 0), torch.inf)
+        depth = torch.minimum(depth, hit)
+    points = (origin + depth[..., None] * z_rays) / room.unit
+    return texture(points).float(), depth.float()
+
+
+def view_of(room: Room, camera: Camera, frame: int | None = None) -> View:
+    """The photograph `camera` takes of the room, with its true depth."""
+    image, depth = cast(room, camera)
+    return View(image, camera, frame, depth)
+
+
+def gaussians_of(view: View, depth: Float[Tensor, "h w"] | None = None) -> Gaussians:
+    """One round, nearly opaque Gaussian per pixel at its true (or the given) z-depth."""
+    camera = view.camera
+    depth = view.depth if depth is None else depth
+    assert depth is not None
+    means = (camera.center + depth[..., None] * camera.z_rays()).reshape(-1, 3)
+    n = len(means)
+    return observed(
+        means=means,
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        scales=(0.6 * depth / camera.K[0, 0]).reshape(-1, 1).repeat(1, 3),
+        opacities=torch.full((n,), 0.95),
+        sh=sh_from_rgb(view.image.reshape(-1, 3)),
+    )
+
+
+def random_gaussians(n: int, seed: int = 0, sh_degree: int = 0) -> Gaussians:
+    """n Gaussians of every shape in front of (and around) `camera_at()`."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator)
+
+    means = torch.stack(
+        [uniform(n) * 4 - 2, uniform(n) * 4 - 2, uniform(n) * 4 + 1], dim=-1
+    )
+    return observed(
+        means=means,
+        quats=torch.randn(n, 4, generator=generator),
+        scales=torch.exp(uniform(n, 3) * 3 - 5),
+        opacities=uniform(n) * 0.95 + 0.02,
+        sh=torch.randn(n, (sh_degree + 1) ** 2, 3, generator=generator) * 0.4,
+    )
+
+
+def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
+    """The same Gaussians in another unit of length."""
+    return replace(
+        gaussians,
+        means=gaussians.means * factor,
+        scales=gaussians.scales * factor,
+        encoded=None,
+    )
