@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from gscompleter.completer import CompleterConfig, GSCompleter
+    from gscompleter.completer import GSCompleter
+    from gscompleter.config import CompleterConfig, load_config
     from gscompleter.errors import InputError
     from gscompleter.generators import load_generator
     from gscompleter.io.ply import load_ply, save_ply
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 # `gscompleter --help` do not wait for torch.
 _HOMES = {
     "GSCompleter": "completer",
-    "CompleterConfig": "completer",
+    "CompleterConfig": "config",
+    "load_config": "config",
     "InputError": "errors",
     "load_generator": "generators",
     "load_ply": "io.ply",
@@ -50,6 +52,7 @@ __all__ = [
     "View",
     "load_camera",
     "load_cameras",
+    "load_config",
     "load_generator",
     "load_ply",
     "load_reconstructor",

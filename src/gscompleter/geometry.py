@@ -48,9 +48,7 @@ def sample(
     return sampled[0, :, 0].T.reshape(*pixels.shape[:-1], -1)
 
 
-def distance_from_depth(
-    depth: Float[Tensor, "h w"], camera: Camera
-) -> Float[Tensor, "h w"]:
+def distance_from_depth(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w"]:
     """Euclidean distance along each pixel's ray, from z-depth (paper, Eq. 7)."""
     return depth * camera.z_rays().norm(dim=-1)
 

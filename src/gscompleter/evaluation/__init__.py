@@ -1,0 +1,1 @@
+"""What judges a result, apart from what produces it."""

@@ -6,7 +6,7 @@ A generator is any callable of that form. The table of names serves the command 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -15,6 +15,7 @@ from gscompleter.errors import InputError
 from gscompleter.types import Camera, SceneContext, View
 
 
+@runtime_checkable
 class Generator(Protocol):
     """Φ of the paper: `image = generator(nearest, target, context)`.
 

@@ -6,12 +6,13 @@ A reconstructor is anything callable with views. The table of names serves the c
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from gscompleter.errors import InputError
 from gscompleter.types import Reconstruction, View
 
 
+@runtime_checkable
 class Reconstructor(Protocol):
     """Ψ of the paper.
 

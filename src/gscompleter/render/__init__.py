@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -22,6 +22,7 @@ OpacityRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene plus Gaussians of which only the opacities [n] may change."""
 
 
+@runtime_checkable
 class FrozenView(Protocol):
     """A context scene that will not change, seen from a camera that will not move.
 
@@ -40,6 +41,7 @@ class FrozenView(Protocol):
         """Fix all of `new` but the opacities; the function it returns is differentiable."""
 
 
+@runtime_checkable
 class Renderer(Protocol):
     """Draws Gaussians; differentiable in means, quats, scales, opacities and sh."""
 

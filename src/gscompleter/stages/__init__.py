@@ -1,0 +1,1 @@
+"""The four stages of the paper, a file each, in its order."""

@@ -1,0 +1,63 @@
+# `make demo` and `make test` do all their own set-up; they need Python >= 3.10 and nothing else.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+TORCH ?= torch==2.13.0
+TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
+# Without a GPU the CPU build of torch saves gigabytes of CUDA packages. It comes first, so that
+# nothing that depends on torch pulls another build.
+TORCH_INDEX := $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url $(TORCH_CPU_INDEX))
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+.PHONY: demo test test-slow lint format types cases bench clean
+
+demo: $(VENV)/installed
+	$(BIN)/gscompleter demo --out demo --overwrite
+
+test: $(VENV)/installed-test
+	$(BIN)/python -m pytest
+
+test-slow: $(VENV)/installed-test
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(VENV)/installed-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+types: $(VENV)/installed-dev
+	$(BIN)/mypy
+
+# Completes every case of a cases.json: make cases CASES=path/to/cases.json
+CASES ?= ../shared/data/cases.json
+cases: $(VENV)/installed
+	$(BIN)/python benchmarks/cases.py $(CASES)
+
+bench: $(VENV)/installed-test
+	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
+
+$(VENV)/bin/python:
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "gscompleter needs Python 3.10 or newer: make PYTHON=python3.11 ...")'
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/torch: | $(VENV)/bin/python
+	$(PIP) --no-deps --retries 1 $(TORCH_INDEX) $(TORCH)
+	touch $@
+
+$(VENV)/installed: pyproject.toml | $(VENV)/torch
+	$(PIP) -e .
+	touch $@
+
+$(VENV)/installed-test: pyproject.toml | $(VENV)/torch
+	$(PIP) -e '.[test]'
+	touch $@ $(VENV)/installed
+
+$(VENV)/installed-dev: pyproject.toml | $(VENV)/torch
+	$(PIP) -e '.[test,dev]'
+	touch $@ $(VENV)/installed $(VENV)/installed-test
+
+clean:
+	rm -rf $(VENV) demo build dist .pytest_cache .mypy_cache .ruff_cache

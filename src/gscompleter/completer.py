@@ -1,0 +1,262 @@
+"""GSCompleter: the four stages of the paper, in order."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from gscompleter.config import CompleterConfig
+from gscompleter.errors import InputError
+from gscompleter.generators import Generator, load_generator
+from gscompleter.geometry import same_camera
+from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.reconstructors.depth_range import estimate_depth_range
+from gscompleter.render import FrozenView, Renderer, load_renderer
+from gscompleter.stages.anchor import lift, select_anchor, synthesize
+from gscompleter.stages.context import depth_range_of_scene, init_context
+from gscompleter.stages.integration import (
+    dilate,
+    do_no_harm,
+    error_with_loss,
+    hole_mask,
+    keep_in_holes,
+    refine_opacities,
+    squared_error,
+)
+from gscompleter.stages.registration import register
+from gscompleter.types import (
+    Camera,
+    Completion,
+    DepthAffine,
+    Gaussians,
+    SceneContext,
+    TargetCompletion,
+    View,
+    merge,
+)
+
+MAX_TARGETS = 255
+"""Provenance is a byte per Gaussian: 0 for observed, 1 to 255 for the targets."""
+
+
+@dataclass(frozen=True)
+class GSCompleter:
+    """Completes a scene as seen from one or several target cameras.
+
+    The defaults are the embedded models, which need no weights and no GPU.
+    """
+
+    reconstructor: Reconstructor = field(default_factory=lambda: load_reconstructor("plane-sweep"))
+    """Ψ: views -> Gaussians and depth maps."""
+    generator: Generator = field(default_factory=lambda: load_generator("warp-inpaint"))
+    """Φ: nearest view and target camera -> image."""
+    renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
+    """Draws Gaussians, differentiably."""
+    config: CompleterConfig = CompleterConfig()
+    """Settings of the stages."""
+    seed: int = 0
+    """Of the random samples that RANSAC draws."""
+
+    def __call__(
+        self,
+        views: Sequence[View],
+        target: Camera | Sequence[Camera],
+        scene: Gaussians | None = None,
+    ) -> Completion:
+        """Complete what `views` never saw, as seen from `target`.
+
+        Args:
+            views: Photographs with their cameras: at least two, or one with `scene`.
+            target: The camera (or cameras, completed one after the other into one scene).
+            scene: Gaussians that are the context already, in the frame and unit of the cameras;
+                they are kept as they are. Without it Ψ reconstructs the context from `views`.
+
+        Raises:
+            InputError: too few views, no baseline, too many targets, a scene nobody sees.
+        """
+        targets = [target] if isinstance(target, Camera) else list(target)
+        first_number = 1 if scene is None or len(scene) == 0 else int(scene.generated.max()) + 1
+        if not targets:
+            raise InputError("No target camera was given; name at least one view to complete.")
+        if first_number + len(targets) - 1 > MAX_TARGETS:
+            raise InputError(
+                f"{len(targets)} targets were given after {first_number - 1} in the scene, and a "
+                f".ply can tell {MAX_TARGETS} apart; complete the scene in several runs."
+            )
+        if len(views) < (2 if scene is None else 1):
+            raise InputError(
+                f"{len(views)} context view was given, and stereo needs at least 2; name more "
+                "frames, or bring a scene."
+            )
+
+        clock = Clock()
+        with clock("context"):
+            near, far = self.depth_range(views, scene)
+            views = [replace(v, camera=ranged(v.camera, near, far)) for v in views]
+            targets = [ranged(camera, near, far) for camera in targets]
+            context = init_context(self.reconstructor, views) if scene is None else scene
+            allowed = self.allowed_errors(context, views)
+
+        current, results = context, []
+        for number, camera in enumerate(targets, start=first_number):
+            result = self.complete_target(current, views, camera, number, allowed, clock)
+            if len(result.added) > 0:
+                current = merge([current, result.added])
+            results.append(result)
+        return Completion(current, context, tuple(results), clock.seconds())
+
+    def complete_target(
+        self,
+        scene: Gaussians,
+        views: Sequence[View],
+        target: Camera,
+        number: int,
+        allowed_errors: Sequence[float],
+        clock: Clock,
+    ) -> TargetCompletion:
+        """Stages 2 to 4 for one target: what it adds to `scene`, and how it came about."""
+        random = torch.Generator().manual_seed(self.seed)
+        with clock("context"):
+            at_target = self.renderer.freeze(scene, target)
+            holes = hole_mask(at_target.context, self.config.holes)
+            choice = select_anchor(target, views, self.config.anchor)
+            anchor = views[choice.index]
+        nothing = TargetCompletion(
+            target=target,
+            before=at_target.context,
+            after=at_target.context,
+            hole_mask=holes,
+            reference=None,
+            anchor=choice.index,
+            anchor_fallback=choice.fallback,
+            affine=DepthAffine(),
+            added=scene[:0],
+        )
+        if any(same_camera(target, view.camera) for view in views):
+            return replace(nothing, notes=("The target is a context view: nothing to complete.",))
+        if not holes.any():
+            return replace(nothing, notes=("The scene has no hole here: nothing to complete.",))
+
+        with clock("generate"):
+            at_views = [self.renderer.freeze(scene, view.camera) for view in views]
+            renders = tuple(frozen.context for frozen in at_views)
+            known = SceneContext(tuple(views), renders, at_target.context)
+            reference = synthesize(self.generator, target, known)
+
+        with clock("lift"):
+            lifted = lift(self.reconstructor, reference, anchor)
+
+        with clock("register"):
+            registration = register(
+                lifted,
+                at_target,
+                at_views[choice.index].context,
+                reference,
+                anchor.camera,
+                self.renderer,
+                random,
+                self.config.registration,
+            )
+
+        with clock("integrate"):
+            mask = dilate(holes, self.config.holes.dilation)
+            kept = keep_in_holes(registration.gaussians, lifted.pixel_index, mask, target)
+            kept = replace(kept, generated=torch.full_like(kept.generated, number))
+            refined, refine_losses = self.refine(kept, at_target, reference, at_views, views)
+            added = do_no_harm(refined, at_views, views, allowed_errors, self.config.harm)
+            after = self.renderer.render(merge([scene, added]), target)
+
+        return replace(
+            nothing,
+            after=after,
+            reference=reference,
+            affine=registration.affine,
+            added=added,
+            losses={"register": registration.losses, "refine": refine_losses},
+            notes=notes_of(choice.fallback, registration.affine),
+        )
+
+    def refine(
+        self,
+        added: Gaussians,
+        at_target: FrozenView,
+        reference: View,
+        at_views: Sequence[FrozenView],
+        views: Sequence[View],
+    ) -> tuple[Gaussians, tuple[float, ...]]:
+        """Refine the opacities of `added` against the context views nearest to the target."""
+        nearest = sorted(
+            range(len(views)),
+            key=lambda i: (views[i].camera.center - reference.camera.center).norm().item(),
+        )[: self.config.refine.num_views]
+        return refine_opacities(
+            added,
+            at_target,
+            reference,
+            [at_views[i] for i in nearest],
+            [views[i] for i in nearest],
+            self.config.refine,
+        )
+
+    def depth_range(self, views: Sequence[View], scene: Gaussians | None) -> tuple[float, float]:
+        """Near and far plane in scene units: as given, else estimated from what there is."""
+        near, far = views[0].camera.near, views[0].camera.far
+        if near is not None and far is not None:
+            return near, far
+        if scene is None:
+            low, high = estimate_depth_range(views)
+        else:
+            low, high = depth_range_of_scene(scene, [v.camera for v in views], self.renderer)
+        return near if near is not None else low, far if far is not None else high
+
+    def allowed_errors(self, context: Gaussians, views: Sequence[View]) -> list[float]:
+        """Largest mean squared error that each photograph may have once all is done."""
+        renders = [self.renderer.render(context, view.camera).image for view in views]
+        tolerance = self.config.harm.tolerance or 0.0
+        return [
+            error_with_loss(squared_error(image, view.image).item(), tolerance)
+            for image, view in zip(renders, views, strict=True)
+        ]
+
+
+def ranged(camera: Camera, near: float, far: float) -> Camera:
+    """`camera` with the depth range of the scene."""
+    return replace(camera, near=near, far=far)
+
+
+def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
+    """A sentence for each fallback that was taken."""
+    notes = []
+    if anchor_fallback:
+        notes.append("Every view is turned too far; the least-turned one is the anchor.")
+    if affine.method == "median":
+        notes.append("RANSAC found no trustworthy affine; the median depth ratio took its place.")
+    if affine.method == "identity":
+        notes.append("There was nothing to fit an affine to; depths were left as predicted.")
+    return tuple(notes)
+
+
+class Clock:
+    """Wall time by stage."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self._seconds = dict.fromkeys(("context", "generate", "lift", "register", "integrate"), 0.0)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            self._seconds[stage] += time.perf_counter() - start
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds of each stage so far, and of all of it."""
+        return {**self._seconds, "total": time.perf_counter() - self._start}

@@ -1,0 +1,118 @@
+"""The command `demo`: complete a real stereo pair that scikit-image carries.
+
+The Middlebury 2014 motorcycle pair, downsampled by four, with its calibration and the true
+disparity of the left image (Scharstein et al., GCPR 2014). The completion sees both photographs
+and is asked for a view beyond each of them, where neither camera has looked.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from rich.console import Console
+from skimage.data import stereo_motorcycle
+
+from gscompleter.io.files import check_output, output_folder
+from gscompleter.io.image import read_image, write_image
+from gscompleter.io.scene import write_cameras
+from gscompleter.options import CompleteOptions, DemoOptions
+from gscompleter.report import strip
+from gscompleter.run import run_completion
+from gscompleter.types import Camera
+
+FOCAL_PX = 994.978
+PRINCIPAL_POINT_PX = (311.193, 254.877)
+PRINCIPAL_POINT_DX_PX = 31.086
+"""How much further right the principal point of the right image lies."""
+BASELINE_M = 0.193001
+BEYOND = 1.0
+"""How far the targets lie beyond the two cameras, in baselines."""
+RESOLUTION = (250, 370)
+"""Half the size of the photographs, which keeps the demo short."""
+
+
+def motorcycle_cameras(width: int, height: int) -> tuple[Camera, Camera]:
+    """The left and the right camera, in metres; the left one is the world frame."""
+    K = torch.tensor(
+        [
+            [FOCAL_PX, 0.0, PRINCIPAL_POINT_PX[0]],
+            [0.0, FOCAL_PX, PRINCIPAL_POINT_PX[1]],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    left = Camera(torch.eye(4), K, width, height)
+    K_right = K.clone()
+    K_right[0, 2] += PRINCIPAL_POINT_DX_PX
+    return left, replace(moved(left, BASELINE_M), K=K_right)
+
+
+def moved(camera: Camera, x: float) -> Camera:
+    """`camera` moved by `x` metres to the right."""
+    c2w = camera.c2w.clone()
+    c2w[0, 3] += x
+    return replace(camera, c2w=c2w)
+
+
+def write_motorcycle_scene(folder: Path) -> None:
+    """Write the pair as a scene folder with true depth, and `targets.json` beyond its cameras."""
+    left_image, right_image, disparity = stereo_motorcycle()
+    height, width = disparity.shape
+    left, right = motorcycle_cameras(width, height)
+    (folder / "images").mkdir(parents=True)
+    (folder / "depth").mkdir()
+    for name, image in (("left", left_image), ("right", right_image)):
+        write_image(folder / "images" / f"{name}.png", torch.from_numpy(image / 255).float())
+    with np.errstate(invalid="ignore"):
+        depth_mm = 1000 * FOCAL_PX * BASELINE_M / (disparity + PRINCIPAL_POINT_DX_PX)
+    known = np.isfinite(disparity)
+    depth_png = np.where(known, np.nan_to_num(depth_mm), 0).round().astype(np.uint16)
+    cv2.imwrite(str(folder / "depth" / "left.png"), depth_png)
+
+    write_cameras(folder / "transforms.json", [left, right])
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"][0] |= {"file_path": "images/left.png", "depth_file_path": "depth/left.png"}
+    content["frames"][1] |= {"file_path": "images/right.png"}
+    (folder / "transforms.json").write_text(json.dumps(content, indent=2) + "\n")
+    beyond = [moved(left, -BEYOND * BASELINE_M), moved(right, BEYOND * BASELINE_M)]
+    write_cameras(folder / "targets.json", beyond)
+
+
+def run_demo(options: DemoOptions) -> None:
+    """Write the scene, complete it for both targets, and put before and after side by side.
+
+    Raises:
+        InputError: where the output folder cannot be written.
+    """
+    check_output(options.out, options.overwrite)
+    with output_folder(options.out, options.overwrite) as folder:
+        scene = folder / "scene"
+        write_motorcycle_scene(scene)
+        run_completion(
+            CompleteOptions(
+                folder=scene,
+                context=(0, 1),
+                target=(str(scene / "targets.json"),),
+                out=folder / "completion",
+                resolution=RESOLUTION,
+                device=options.device,
+                seed=options.seed,
+                quiet=options.quiet,
+            )
+        )
+        images = folder / "completion" / "images"
+        names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
+        write_image(
+            folder / "before_after.png", strip([read_image(images / f"{n}.png") for n in names])
+        )
+    if not options.quiet:
+        Console().print(
+            f"Before and after, beyond the left and the right camera: "
+            f"{options.out / 'before_after.png'}",
+            highlight=False,
+            soft_wrap=True,
+        )

@@ -1,0 +1,172 @@
+"""Completion cases on posed photographs: complete, then score against what was held back.
+
+A case names two or more context frames and a target frame whose photograph no stage sees, and
+frames beside the target ("neighbours"), which a flat billboard in front of the target camera
+cannot satisfy. A file of cases is JSON: `{"resolution": [h, w], "cases": [{"scene", "context",
+"target", "near", "far", "neighbours"}, ...]}` with scene folders beside the file.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.completer import GSCompleter
+from gscompleter.errors import InputError
+from gscompleter.evaluation.metrics import psnr, ssim
+from gscompleter.io.scene import load_views
+from gscompleter.render import Renderer
+from gscompleter.types import Completion, Gaussians, View
+
+
+@dataclass(frozen=True)
+class Case:
+    """One completion task."""
+
+    scene: Path
+    """Folder of the scene."""
+    context: tuple[int, ...]
+    target: int
+    neighbours: tuple[int, ...]
+    """Frames beside the target, for scoring only."""
+    resolution: tuple[int, int]
+    """Height and width."""
+    near: float | None = None
+    far: float | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.scene.name} {'+'.join(map(str, self.context))}>{self.target}"
+
+    def load(self, frames: tuple[int, ...]) -> list[View]:
+        """Photographs of `frames`."""
+        return load_views(self.scene, list(frames), self.resolution, near=self.near, far=self.far)
+
+
+def read_cases(path: Path) -> list[Case]:
+    """The cases of a file.
+
+    Raises:
+        InputError: where the file is missing or holds no cases.
+    """
+    try:
+        content = json.loads(path.read_text())
+        height, width = content["resolution"]
+        return [
+            Case(
+                path.parent / row["scene"],
+                tuple(row["context"]),
+                row["target"],
+                tuple(row.get("neighbours", ())),
+                (height, width),
+                row.get("near"),
+                row.get("far"),
+            )
+            for row in content["cases"]
+        ]
+    except OSError as error:
+        raise InputError(f"Cannot read the cases {path}: {error.strerror}.") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path} is no file of cases ({type(error).__name__}: {error}); it needs resolution "
+            "and cases, each with scene, context and target."
+        ) from error
+
+
+@dataclass(frozen=True)
+class Change:
+    """One score before and after completion."""
+
+    before: float
+    after: float
+
+    @property
+    def gain(self) -> float:
+        return self.after - self.before
+
+
+@dataclass(frozen=True)
+class CaseScores:
+    """How a completion fares against the photographs it did not see. None: no truth exists."""
+
+    name: str
+    hole_fraction: float
+    target_psnr: Change
+    target_ssim: Change
+    neighbours_psnr: Change | None
+    """Mean over the neighbours."""
+    context_psnr: tuple[Change, ...]
+    """Of each context view."""
+    depth_observed: float | None
+    """AbsRel at the target where the context covers it."""
+    depth_hole: float | None
+    """AbsRel at the target where the context has a hole and the completion fills it."""
+    hole_psnr: float | None
+    """PSNR at the target over the pixels of the hole only, after completion."""
+    seconds: float
+
+
+def run_case(case: Case, completer: GSCompleter) -> tuple[Completion, View, CaseScores]:
+    """Complete a case and score it; the target's photograph is looked at afterwards only."""
+    views = case.load(case.context)
+    (target,) = case.load((case.target,))
+    completion = completer(views, target.camera)
+    scores = score(case, completion, views, target, completer.renderer)
+    return completion, target, scores
+
+
+def score(
+    case: Case, completion: Completion, views: list[View], target: View, renderer: Renderer
+) -> CaseScores:
+    """All scores of one completed case."""
+    (result,) = completion.targets
+    before, after = result.before, result.after
+    hole = result.hole_mask
+    neighbours = [change(completion, v, renderer) for v in case.load(case.neighbours)]
+    return CaseScores(
+        name=case.name,
+        hole_fraction=result.hole_fraction,
+        target_psnr=Change(psnr(before.image, target.image), psnr(after.image, target.image)),
+        target_ssim=Change(ssim(before.image, target.image), ssim(after.image, target.image)),
+        neighbours_psnr=mean_change(neighbours),
+        context_psnr=tuple(change(completion, view, renderer) for view in views),
+        depth_observed=absrel(after.depth, target.depth, ~hole & (after.alpha >= 0.5)),
+        depth_hole=absrel(after.depth, target.depth, hole & (after.alpha >= 0.5)),
+        hole_psnr=psnr(after.image[hole][None], target.image[hole][None]) if hole.any() else None,
+        seconds=completion.seconds["total"],
+    )
+
+
+def change(completion: Completion, view: View, renderer: Renderer) -> Change:
+    """PSNR of a photograph before and after."""
+
+    def of(scene: Gaussians) -> float:
+        with torch.no_grad():
+            return psnr(renderer.render(scene, view.camera).image, view.image)
+
+    return Change(of(completion.context), of(completion.scene))
+
+
+def mean_change(changes: list[Change]) -> Change | None:
+    """Mean before and mean after; None of nothing."""
+    if not changes:
+        return None
+    n = len(changes)
+    return Change(sum(c.before for c in changes) / n, sum(c.after for c in changes) / n)
+
+
+def absrel(
+    depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]
+) -> float | None:
+    """Mean of |depth - truth| / truth over pixels of `where` with known (non-zero) truth."""
+    if truth is None:
+        return None
+    known = where & (truth > 0)
+    if not known.any():
+        return None
+    return ((depth - truth).abs() / truth.clamp_min(1e-12))[known].mean().item()

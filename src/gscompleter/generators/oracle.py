@@ -1,0 +1,38 @@
+"""The true image, to measure the geometry alone (as the paper's study of long sequences does)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.geometry import same_camera
+from gscompleter.types import Camera, SceneContext, View
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Φ that knows the answer: the photograph taken by the target camera itself."""
+
+    photographs: Sequence[View]
+    """True images; the one whose camera is the target's is returned."""
+
+    def __call__(
+        self, nearest: View, target: Camera, context: SceneContext
+    ) -> Float[Tensor, "h w 3"]:
+        """The photograph of `target`.
+
+        Raises:
+            InputError: where there is none.
+        """
+        for photograph in self.photographs:
+            if same_camera(photograph.camera, target):
+                return photograph.image.to(target.K.device)
+        raise InputError(
+            f"The generator 'oracle' has {len(self.photographs)} photographs, none of them taken "
+            "by the target camera; give it the photograph of the target frame, or choose "
+            "'warp-inpaint' where there is none."
+        )

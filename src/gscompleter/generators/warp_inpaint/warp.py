@@ -1,0 +1,84 @@
+"""Carry all photographs into the target camera, through the depth of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.geometry import inside, project, sample, unproject
+from gscompleter.types import Camera, Render, SceneContext, View
+
+
+@dataclass(frozen=True)
+class WarpConfig:
+    min_alpha: float = 0.5
+    """Opacity of the scene from which a pixel of the target counts as observed."""
+    depth_tolerance: float = 0.02
+    """Difference between the depth of a point and the depth that a photograph sees in its
+    direction, relative to the depth, at which the weight of the photograph has fallen to 1/e."""
+    sharpness: float = 2.0
+    """Power of the weights: larger ones prefer the nearest photograph to the average."""
+
+
+@dataclass(frozen=True)
+class Warped:
+    """What is known of the target image."""
+
+    image: Float[Tensor, "h w 3"]
+    known: Bool[Tensor, "h w"]
+    """True where the image shows the scene; elsewhere it means nothing."""
+    depth: Float[Tensor, "h w"]
+    """z-depth in the target camera, in scene units, where known."""
+
+
+def warp_photographs(
+    target: Camera, context: SceneContext, config: WarpConfig = WarpConfig()
+) -> Warped:
+    """Colours of all photographs at the surfaces that the target sees.
+
+    A photograph counts where the scene, seen from its camera, lies at the depth of the surface:
+    elsewhere something stands before it. What no photograph shows keeps the colour of the render.
+    """
+    scene = context.at_target
+    known = scene.alpha >= config.min_alpha
+    points = unproject(scene.depth, target)
+    colour = torch.zeros_like(scene.image)
+    total = torch.zeros_like(scene.depth)
+    for view, render in zip(context.views, context.at_views, strict=True):
+        pixels, z = project(points, view.camera)
+        weight = _visibility(pixels, z, view, render, config) * _closeness(points, target, view)
+        weight = weight**config.sharpness
+        colour = colour + weight[..., None] * sample(view.image, pixels)
+        total = total + weight
+    rendered = scene.image / scene.alpha.clamp_min(config.min_alpha)[..., None]
+    trust = (total / (total + 1e-4))[..., None]
+    image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
+    return Warped(image.clamp(0, 1), known, scene.depth)
+
+
+def _visibility(
+    pixels: Float[Tensor, "h w 2"],
+    z: Float[Tensor, "h w"],
+    view: View,
+    render: Render,
+    config: WarpConfig,
+) -> Float[Tensor, "h w"]:
+    """1 where the point at depth `z` is what the photograph shows at `pixels`, towards 0 else."""
+    layers = torch.stack([render.depth, render.alpha], dim=-1)
+    depth, alpha = sample(layers, pixels).unbind(-1)
+    error = (z - depth).abs() / (config.depth_tolerance * z.abs().clamp_min(1e-12))
+    visible = inside(pixels, z, view.camera) & (alpha >= config.min_alpha)
+    return torch.exp(-(error**2)) * visible
+
+
+def _closeness(
+    points: Float[Tensor, "h w 3"], target: Camera, view: View
+) -> Float[Tensor, "h w"]:
+    """1 where target and photograph look at a point along the same ray, less the more they turn."""
+    to_target = torch.nn.functional.normalize(target.center - points, dim=-1)
+    to_view = torch.nn.functional.normalize(view.camera.center - points, dim=-1)
+    angle = torch.acos((to_target * to_view).sum(-1).clamp(-1, 1))
+    return 1 / (angle + 0.02)

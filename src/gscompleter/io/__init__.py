@@ -1,0 +1,1 @@
+"""Reading and writing: Gaussians, posed photographs, cameras, images and output folders."""

@@ -1,0 +1,75 @@
+"""What the commands can be told. The command line is derived from these classes.
+
+Nothing here imports torch, so that `gscompleter --help` answers at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Device = Literal["auto", "cpu", "cuda"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompleteOptions:
+    """Fill what the photographs never saw, as seen from the targets, and write the scene."""
+
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """Folder of posed photographs with a nerfstudio transforms.json."""
+    context: tuple[int, ...]
+    """Numbers of the frames to start from, in the order of the sorted file paths."""
+    target: tuple[str, ...]
+    """Frames to complete the scene for, by number, or a JSON file of cameras. Several are
+    completed one after the other into one scene."""
+    out: Path
+    """Folder for completed.ply, context.ply, images/ and summary.json."""
+    scene: Path | None = None
+    """A .ply of Gaussians to complete, in the frame of the photographs. It is kept as it is.
+    Without it the context is reconstructed from the photographs."""
+    reconstructor: str = "plane-sweep"
+    """The model that turns views into Gaussians."""
+    generator: str = "warp-inpaint"
+    """The model that synthesizes the image at the target."""
+    resolution: tuple[int, int] | None = None
+    """Height and width to work at: photographs are scaled to cover it and cropped around the
+    centre. If not given, they keep their own size."""
+    near: float | None = None
+    """Smallest depth in the scene, in its own unit. Estimated if not given."""
+    far: float | None = None
+    """Largest depth in the scene, in its own unit. Estimated if not given."""
+    device: Device = "auto"
+    """Where to run."""
+    seed: int = 0
+    """Of everything random. The same seed gives the same bytes on a CPU."""
+    config: str = "default"
+    """Settings of the stages: default, paper, an ablation such as no-sa, or a YAML file."""
+    drop_nonfinite: bool = False
+    """Leave out Gaussians of the .ply that hold NaN or infinity."""
+    overwrite: bool = False
+    """Replace what an earlier run left in the output folder."""
+    quiet: bool = False
+    """Say nothing but errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """Complete a real stereo pair beyond its left and its right camera, and show before/after.
+
+    The photographs are the Middlebury motorcycle pair that scikit-image carries. Nothing is
+    downloaded.
+    """
+
+    out: Path = Path("demo")
+    """Folder for the scene, its completion and before_after.png."""
+    device: Device = "auto"
+    """Where to run."""
+    seed: int = 0
+    """Of everything random."""
+    overwrite: bool = False
+    """Replace what an earlier run left in the output folder."""
+    quiet: bool = False
+    """Say nothing but errors."""

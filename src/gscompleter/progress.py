@@ -1,0 +1,34 @@
+"""Progress bars, shown where somebody watches: the command line turns them on, a library call
+stays silent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import track as rich_track
+
+T = TypeVar("T")
+
+_console: ContextVar[Console | None] = ContextVar("console", default=None)
+
+
+@contextmanager
+def shown_on(console: Console | None) -> Iterator[None]:
+    """Show the bars of everything called inside on `console`; None keeps them hidden."""
+    token = _console.set(console)
+    try:
+        yield
+    finally:
+        _console.reset(token)
+
+
+def track(items: Sequence[T], description: str) -> Iterable[T]:
+    """`items`, one after the other, with a bar where bars are shown."""
+    console = _console.get()
+    if console is None:
+        return items
+    return rich_track(items, description, console=console, transient=True)

@@ -1,0 +1,154 @@
+"""What a completion leaves in its output folder: two scenes, images and numbers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter import __version__
+from gscompleter.evaluation.metrics import psnr, ssim
+from gscompleter.io.image import write_image
+from gscompleter.io.ply import save_ply
+from gscompleter.render import Renderer
+from gscompleter.types import Camera, Completion, TargetCompletion, View
+
+
+@dataclass(frozen=True)
+class Target:
+    """A camera to complete, and what is known of it for scoring."""
+
+    camera: Camera
+    frame: int | None = None
+    """Its number in the scene; None for a camera from elsewhere."""
+    photograph: Float[Tensor, "h w 3"] | None = None
+    """What the camera took, where it took anything. No stage sees it but `oracle`."""
+
+
+@dataclass(frozen=True)
+class Images:
+    """One camera's view of the scene before and after."""
+
+    before: Float[Tensor, "h w 3"]
+    after: Float[Tensor, "h w 3"]
+    truth: Float[Tensor, "h w 3"] | None
+
+    def scores(self) -> dict[str, float | None]:
+        """PSNR (dB) and SSIM against the photograph; None where there is none."""
+        if self.truth is None:
+            return dict.fromkeys(("psnr_before", "psnr_after", "ssim_before", "ssim_after"))
+        return {
+            "psnr_before": psnr(self.before, self.truth),
+            "psnr_after": psnr(self.after, self.truth),
+            "ssim_before": ssim(self.before, self.truth),
+            "ssim_after": ssim(self.after, self.truth),
+        }
+
+
+def compare(
+    completion: Completion, camera: Camera, truth: Float[Tensor, "h w 3"] | None, renderer: Renderer
+) -> Images:
+    """The context and the completed scene as `camera` sees them."""
+    with torch.no_grad():
+        before = renderer.render(completion.context, camera).image
+        after = renderer.render(completion.scene, camera).image
+    return Images(before, after, truth)
+
+
+def summarize(
+    completion: Completion,
+    views: Sequence[View],
+    targets: Sequence[Target],
+    context_images: Sequence[Images],
+    target_images: Sequence[Images],
+    settings: Mapping[str, Any],
+    seed: int,
+    device: str,
+) -> dict[str, Any]:
+    """The content of `summary.json`."""
+    return {
+        "version": __version__,
+        "settings": dict(settings),
+        "seed": seed,
+        "device": device,
+        "context": [
+            {"frame": view.frame, **images.scores()}
+            for view, images in zip(views, context_images, strict=True)
+        ],
+        "targets": [
+            {
+                "frame": target.frame,
+                "anchor": views[result.anchor].frame,
+                "anchor_fallback": result.anchor_fallback,
+                "hole_fraction": result.hole_fraction,
+                "affine": asdict(result.affine),
+                **images.scores(),
+                "generated": provenance(result),
+                "added": len(result.added),
+                "notes": list(result.notes),
+            }
+            for target, result, images in zip(
+                targets, completion.targets, target_images, strict=True
+            )
+        ],
+        "gaussians": {"context": len(completion.context), "added": len(completion.added)},
+        "seconds": dict(completion.seconds),
+    }
+
+
+def provenance(result: TargetCompletion) -> int | None:
+    """The value of the property `generated` that marks what this target added."""
+    return int(result.added.generated[0]) if len(result.added) else None
+
+
+def write_report(
+    folder: Path,
+    completion: Completion,
+    views: Sequence[View],
+    targets: Sequence[Target],
+    renderer: Renderer,
+    settings: Mapping[str, Any],
+    seed: int,
+    device: str,
+) -> dict[str, Any]:
+    """Write `context.ply`, `completed.ply`, `images/` and `summary.json`; returns the summary.
+
+    Raises:
+        InputError: where a file cannot be written.
+    """
+    context_images = [compare(completion, v.camera, v.image, renderer) for v in views]
+    target_images = [compare(completion, t.camera, t.photograph, renderer) for t in targets]
+    summary = summarize(
+        completion, views, targets, context_images, target_images, settings, seed, device
+    )
+    save_ply(folder / "context.ply", completion.context)
+    save_ply(folder / "completed.ply", completion.scene)
+    (folder / "images").mkdir()
+    for number, (result, images) in enumerate(zip(completion.targets, target_images, strict=True)):
+        for name, image in pictures(result, images).items():
+            write_image(folder / "images" / f"target{number + 1}_{name}.png", image)
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    return summary
+
+
+def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:
+    """The pictures of one target by name: colour [h, w, 3], or a mask [h, w]."""
+    found = {"before": images.before, "after": images.after, "hole_mask": result.hole_mask.float()}
+    if result.reference is not None:
+        found["reference"] = result.reference.image
+    if images.truth is not None:
+        found["truth"] = images.truth
+    return found
+
+
+def strip(pictures: Sequence[Float[Tensor, "h _w 3"]], gap: int = 4) -> Float[Tensor, "h wide 3"]:
+    """Pictures of one height side by side on white."""
+    white = torch.ones((pictures[0].shape[0], gap, 3))
+    parts = [part for picture in pictures for part in (white, picture.cpu().clamp(0, 1))]
+    return torch.cat(parts[1:], dim=1)

@@ -1,0 +1,162 @@
+"""The command `complete`: a scene folder in, a completed scene and its report out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from gscompleter.completer import GSCompleter
+from gscompleter.config import CompleterConfig, load_config
+from gscompleter.errors import InputError
+from gscompleter.generators import load_generator
+from gscompleter.io.files import check_output, output_folder
+from gscompleter.io.ply import load_ply
+from gscompleter.io.scene import SceneIndex, load_cameras, load_views
+from gscompleter.options import CompleteOptions
+from gscompleter.progress import shown_on
+from gscompleter.reconstructors import load_reconstructor
+from gscompleter.render import choose_device, load_renderer
+from gscompleter.report import Target, write_report
+from gscompleter.types import Completion, View
+
+
+def run_completion(options: CompleteOptions) -> None:
+    """Complete the scene of `options.folder` and write `options.out`.
+
+    Raises:
+        InputError: anything about the input that the user can mend; nothing is written then.
+    """
+    console = Console(stderr=True, quiet=options.quiet)
+    check_output(options.out, options.overwrite)
+    device = choose_device(options.device)
+    renderer = load_renderer(device)
+    config = load_config(options.config)
+    check_context(options)
+    views = [view.to(device) for view in read_views(options, options.context)]
+    targets = read_targets(options)
+    scene = None
+    if options.scene is not None:
+        scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite).to(device)
+
+    photographs = [
+        View(target.photograph, target.camera, target.frame)
+        for target in targets
+        if target.photograph is not None
+    ]
+    completer = GSCompleter(
+        load_reconstructor(options.reconstructor),
+        load_generator(options.generator, options.seed, photographs),
+        renderer,
+        config,
+        options.seed,
+    )
+    with output_folder(options.out, options.overwrite) as folder:
+        with shown_on(None if options.quiet else console):
+            completion = completer(views, [t.camera.to(device) for t in targets], scene)
+        settings = settings_of(options, config)
+        summary = write_report(
+            folder, completion, views, targets, renderer, settings, options.seed, device
+        )
+    if not options.quiet:
+        tell(summary, completion, options.out)
+
+
+def check_context(options: CompleteOptions) -> None:
+    """Refuse too few context frames, and the same one twice."""
+    needed = 2 if options.scene is None else 1
+    if len(options.context) < needed:
+        raise InputError(
+            f"--context names {len(options.context)} frame(s), and stereo needs at least {needed}; "
+            "name more, as in --context 0 4."
+        )
+    if len(set(options.context)) < len(options.context):
+        raise InputError(
+            f"--context names a frame twice ({' '.join(map(str, options.context))}), which gives "
+            "identical cameras and no baseline; name different frames."
+        )
+    if not options.target:
+        raise InputError("--target names no frame; name at least one, as in --target 8.")
+
+
+def read_views(options: CompleteOptions, frames: Sequence[int]) -> list[View]:
+    """The photographs of `frames` as the options want them."""
+    return load_views(
+        options.folder, list(frames), options.resolution, near=options.near, far=options.far
+    )
+
+
+def read_targets(options: CompleteOptions) -> list[Target]:
+    """The target cameras in the order of the command line, with photographs where there are any."""
+    index = SceneIndex.read(options.folder)
+    targets = []
+    for word in options.target:
+        if not is_whole_number(word):
+            cameras = load_cameras(
+                Path(word), options.resolution, near=options.near, far=options.far
+            )
+            targets += [Target(camera) for camera in cameras]
+            continue
+        frame = int(word)
+        if index.has_photograph(frame):
+            (view,) = read_views(options, [frame])
+            targets.append(Target(view.camera, frame, view.image))
+        else:
+            camera = index.camera(frame, options.resolution, near=options.near, far=options.far)
+            targets.append(Target(camera, frame))
+    return targets
+
+
+def is_whole_number(word: str) -> bool:
+    return word.lstrip("-").isdigit()
+
+
+def settings_of(options: CompleteOptions, config: CompleterConfig) -> dict[str, Any]:
+    """Everything that decided the result, for `summary.json`."""
+    return {
+        "folder": str(options.folder),
+        "context": list(options.context),
+        "target": list(options.target),
+        "scene": None if options.scene is None else str(options.scene),
+        "reconstructor": options.reconstructor,
+        "generator": options.generator,
+        "uses_target_photographs": options.generator == "oracle",
+        "resolution": None if options.resolution is None else list(options.resolution),
+        "near": options.near,
+        "far": options.far,
+        "config": asdict(config),
+    }
+
+
+def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
+    """Say what was done: a row per camera, and where it lies."""
+
+    def cell(value: float | None) -> str:
+        return "–" if value is None else f"{value:.2f}"
+
+    table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
+    for row in summary["context"]:
+        name = f"context {row['frame']}"
+        table.add_row(name, "", cell(row["psnr_before"]), cell(row["psnr_after"]), "")
+    for row, target in zip(summary["targets"], completion.targets, strict=True):
+        name = "target" if row["frame"] is None else f"target {row['frame']}"
+        hole = f"{100 * row['hole_fraction']:.1f} %"
+        scores = cell(row["psnr_before"]), cell(row["psnr_after"])
+        table.add_row(name, hole, *scores, f"{len(target.added):,}")
+    console = Console()
+    console.print(table)
+    for target in completion.targets:
+        for note in target.notes:
+            console.print(note, highlight=False)
+    counts = summary["gaussians"]
+    seconds = summary["seconds"]["total"]
+    console.print(
+        f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
+        f"{out / 'completed.ply'}",
+        highlight=False,
+        soft_wrap=True,
+    )

@@ -1,0 +1,126 @@
+"""Stage 3, coarse: one affine depth correction for all that was lifted (paper, Sec. III-E)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.types import DepthAffine, DepthMap, Lift, Render
+
+
+@dataclass(frozen=True)
+class AffineConfig:
+    bridge: Literal["anchor", "target", "none"] = "anchor"
+    """View through which depths are compared. `target` and `none` are ablations of the paper."""
+    max_trials: int = 512
+    """Two-point hypotheses, all scored at once."""
+    max_pixels: int = 8192
+    """Pixels the hypotheses are scored on, drawn at random where there are more."""
+    residual_threshold: float = 0.05
+    """Largest residual of an inlier, relative to the context depth."""
+    min_inliers: float = 0.3
+    """Smallest share of inliers that makes a fit trustworthy."""
+    min_pixels: int = 64
+    """Fewest comparable pixels; under it there is nothing to fit."""
+    min_depth_spread: float = 0.05
+    """Smallest spread of the predicted depths ((p95 - p5) / median) that tells scale and shift
+    apart; under it only a scale is fitted."""
+
+
+def fit_affine(
+    predicted: DepthMap,
+    context: DepthMap,
+    generator: torch.Generator,
+    config: AffineConfig = AffineConfig(),
+) -> DepthAffine:
+    """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 7).
+
+    Where RANSAC cannot be trusted (few pixels, hardly any range of depth, few inliers) the median
+    ratio with shift 0 takes its place, and the identity where there is nothing to compare; which
+    of them was used is part of the result.
+    """
+    comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
+    x, y = predicted.depth[comparable].double(), context.depth[comparable].double()
+    if len(x) < config.min_pixels:
+        return DepthAffine()
+    if len(x) > config.max_pixels:
+        drawn = torch.randperm(len(x), generator=generator)[: config.max_pixels].to(x.device)
+        x, y = x[drawn], y[drawn]
+
+    if depth_spread(x) >= config.min_depth_spread:
+        scale, shift = ransac_line(x, y, generator, config)
+        inliers = affine_inliers(x, y, scale, shift, config).double().mean().item()
+        if scale > 0 and inliers >= config.min_inliers:
+            return DepthAffine(scale, shift, inliers, "ransac")
+
+    scale = (y / x).median().item()
+    inliers = affine_inliers(x, y, scale, 0.0, config).double().mean().item()
+    return DepthAffine(scale, 0.0, inliers, "median")
+
+
+def depth_spread(depth: Float[Tensor, "n"]) -> float:
+    """(p95 - p5) / median: how much range of depth there is to fit a line through."""
+    low, median, high = depth.quantile(depth.new_tensor([0.05, 0.5, 0.95])).tolist()
+    return (high - low) / median
+
+
+def affine_inliers(
+    x: Float[Tensor, "n"], y: Float[Tensor, "n"], scale: float, shift: float, config: AffineConfig
+) -> Bool[Tensor, "n"]:
+    return (scale * x + shift - y).abs() < config.residual_threshold * y
+
+
+def ransac_line(
+    x: Float[Tensor, "n"],
+    y: Float[Tensor, "n"],
+    generator: torch.Generator,
+    config: AffineConfig,
+) -> tuple[float, float]:
+    """Scale and shift with the most inliers among two-point hypotheses, refitted on its inliers.
+
+    Residuals count relative to depth, so that the far end of the scene does not outvote the near
+    one, and the refit weighs them alike. (0, 0) where no hypothesis has a positive scale.
+    """
+    i, j = torch.randint(len(x), (2, config.max_trials), generator=generator).to(x.device)
+    scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
+    shifts = y[i] - scales * x[i]
+    residuals = (scales[:, None] * x + shifts[:, None] - y).abs()
+    counts = (residuals < config.residual_threshold * y).sum(dim=1)
+    best = counts.where(scales > 0, -1).argmax()
+    if scales[best] <= 0:
+        return 0.0, 0.0
+
+    scale, shift = scales[best].item(), shifts[best].item()
+    for _ in range(3):
+        agree = affine_inliers(x, y, scale, shift, config)
+        weight = 1 / y[agree]
+        design = torch.stack([x[agree], torch.ones_like(x[agree])], dim=-1) * weight[:, None]
+        # The normal equations have a closed form on any device, which lstsq has not.
+        normal = design.T @ design
+        if torch.linalg.cond(normal) > 1e12:
+            break
+        scale, shift = torch.linalg.solve(normal, design.T @ (y[agree] * weight)).tolist()
+    return scale, shift
+
+
+def fit_bridge(
+    lift: Lift,
+    at_target: Render,
+    at_anchor: Render,
+    generator: torch.Generator,
+    config: AffineConfig = AffineConfig(),
+) -> DepthAffine:
+    """The affine that brings the lifted depths to the scene's, compared in the bridge view.
+
+    The anchor is the paper's bridge: the scene is dense there, while at the target it has the very
+    holes that are to be filled.
+    """
+    if config.bridge == "none":
+        return DepthAffine()
+    if config.bridge == "target":
+        return fit_affine(lift.reference_depth, at_target.depth_map(), generator, config)
+    return fit_affine(lift.anchor_depth, at_anchor.depth_map(), generator, config)

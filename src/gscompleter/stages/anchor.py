@@ -1,0 +1,94 @@
+"""Stage 2: synthesize the target image, select the stereo anchor, lift the pair to Gaussians
+(paper, Sec. III-D)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from gscompleter.generators import Generator
+from gscompleter.geometry import baseline_between, inside, project, rotation_between
+from gscompleter.reconstructors import Reconstructor
+from gscompleter.types import Camera, Lift, SceneContext, View
+
+
+@dataclass(frozen=True)
+class AnchorConfig:
+    max_rotation: float = 45.0
+    """Largest turn away from the target, in degrees, that still leaves overlap."""
+    selection: Literal["widest", "nearest"] = "widest"
+    """`widest` baseline is the paper's rule; `nearest` view is its ablation without it."""
+
+
+@dataclass(frozen=True)
+class AnchorChoice:
+    """Which context view forms the stereo pair with the target."""
+
+    index: int
+    """Index among the context views."""
+    fallback: bool
+    """True where every view was turned too far and the least-turned one was taken."""
+
+
+def nearest_view(target: Camera, views: Sequence[View]) -> int:
+    """Index of the view taken closest to `target`; of equals, the one turned least."""
+    return min(
+        range(len(views)),
+        key=lambda i: (
+            baseline_between(target, views[i].camera),
+            rotation_between(target, views[i].camera),
+        ),
+    )
+
+
+def select_anchor(
+    target: Camera, views: Sequence[View], config: AnchorConfig = AnchorConfig()
+) -> AnchorChoice:
+    """Choose the observed view that makes the best stereo pair with `target`.
+
+    Among views turned by less than `max_rotation`, the one farthest away wins, because a wide
+    baseline makes triangulation precise. When every view is turned further than that, overlap
+    matters more than precision, and the least-turned view wins (paper, Fig. 3).
+    """
+    if not views:
+        raise ValueError("select_anchor needs at least one observed view, got none")
+    if config.selection == "nearest":
+        return AnchorChoice(nearest_view(target, views), fallback=False)
+
+    rotations = [rotation_between(target, view.camera) for view in views]
+    baselines = [baseline_between(target, view.camera) for view in views]
+    overlapping = [i for i in range(len(views)) if rotations[i] < config.max_rotation]
+    if not overlapping:
+        return AnchorChoice(min(range(len(views)), key=rotations.__getitem__), fallback=True)
+    return AnchorChoice(max(overlapping, key=baselines.__getitem__), fallback=False)
+
+
+def synthesize(generator: Generator, target: Camera, context: SceneContext) -> View:
+    """`Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 5)."""
+    nearest = context.views[nearest_view(target, context.views)]
+    image = generator(nearest, target, context)
+    expected = (target.height, target.width, 3)
+    if tuple(image.shape) != expected or not torch.isfinite(image).all():
+        raise ValueError(
+            f"the generator must return a finite image of shape {expected}, "
+            f"got {tuple(image.shape)}"
+        )
+    return View(image, target)
+
+
+def lift(reconstructor: Reconstructor, reference: View, anchor: View) -> Lift:
+    """`Ψ((Ĩ_t, P_t), (I_s, P_s))`, of which the target's Gaussians are kept (paper, Eq. 6).
+
+    A pixel-aligned Ψ says which Gaussians are the reference's. Of another Ψ all those are taken
+    that the target camera sees.
+    """
+    pair = reconstructor([reference, anchor])
+    reference_depth, anchor_depth = pair.depths
+    if pair.view_index is None or pair.pixel_index is None:
+        seen = inside(*project(pair.gaussians.means, reference.camera), reference.camera)
+        return Lift(pair.gaussians[seen], reference_depth, anchor_depth, None)
+    own = pair.view_index == 0
+    return Lift(pair.gaussians[own], reference_depth, anchor_depth, pair.pixel_index[own])

@@ -1,0 +1,52 @@
+"""Stage 1: observed views -> a scene in metric scale (paper, Sec. III-C)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from gscompleter.errors import InputError
+from gscompleter.reconstructors import Reconstructor
+from gscompleter.render import Renderer
+from gscompleter.types import Camera, Gaussians, View
+
+
+def init_context(reconstructor: Reconstructor, views: Sequence[View]) -> Gaussians:
+    """`G_ctx = Ψ(views)`: the Gaussians of the observed regions (paper, Eq. 4)."""
+    return reconstructor(views).gaussians
+
+
+def depth_range_of_scene(
+    scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer
+) -> tuple[float, float]:
+    """Near and far plane, in scene units, that enclose what `cameras` see of a given scene.
+
+    Half of the nearest and twice the farthest percentile of the rendered depths leave room for
+    what the scene lacks. The Gaussians' own z-depths tell the unit to render in.
+
+    Raises:
+        InputError: where none of the cameras sees the scene.
+    """
+    depths = []
+    for camera in cameras:
+        z = (scene.means - camera.center) @ camera.forward
+        if not (z > 0).any():
+            continue
+        unit = z[z > 0].median().item()
+        seen = renderer.render(scene, replace(camera, near=0.1 * unit)).depth_map()
+        depths.append(seen.depth[seen.valid])
+    if not depths or sum(d.numel() for d in depths) == 0:
+        raise InputError(
+            "No context camera sees the scene that was given; check that the .ply and the "
+            "photographs share one world frame and one unit."
+        )
+    low, high = percentiles(torch.cat(depths), 0.01, 0.99)
+    return 0.5 * low, 2.0 * high
+
+
+def percentiles(values: torch.Tensor, *shares: float) -> list[float]:
+    """Percentiles of any number of values (torch.quantile stops at 16 million)."""
+    ordered = values.flatten().sort().values
+    return [ordered[round(share * (len(ordered) - 1))].item() for share in shares]

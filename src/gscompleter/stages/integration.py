@@ -1,0 +1,182 @@
+"""Stage 4: keep what lies in the holes and refine its opacities, and nothing else
+(paper, Sec. III-F)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gscompleter.geometry import inside, project
+from gscompleter.progress import track
+from gscompleter.render import FrozenView, OpacityRender
+from gscompleter.types import Camera, Gaussians, Render, View
+
+
+@dataclass(frozen=True)
+class HoleConfig:
+    max_alpha: float = 0.5
+    """τ of Eq. 10: a pixel that the scene covers by less is a hole."""
+    dilation: int = 3
+    """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
+
+
+def hole_mask(render: Render, config: HoleConfig = HoleConfig()) -> Bool[Tensor, "h w"]:
+    """Where the scene has a hole, before dilation (paper, Eq. 10)."""
+    return render.alpha < config.max_alpha
+
+
+def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
+    """`mask` grown by `radius` pixels on every side (max-pool of 2 radius + 1)."""
+    pooled = torch.nn.functional.max_pool2d(
+        mask[None, None].float(), 2 * radius + 1, stride=1, padding=radius
+    )
+    return pooled[0, 0] > 0
+
+
+def keep_in_holes(
+    registered: Gaussians,
+    pixel_index: Int[Tensor, "n"] | None,
+    mask: Bool[Tensor, "h w"],
+    target: Camera,
+) -> Gaussians:
+    """The Gaussians that fall within `mask`: by their pixel where it is known, else projected."""
+    if pixel_index is not None:
+        return registered[mask.flatten()[pixel_index]]
+    pixels, z = project(registered.means, target)
+    seen = inside(pixels, z, target)
+    x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
+    return registered[seen & mask[y, x]]
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    iterations: int = 30
+    """Steps of Adam; 0 leaves the opacities as they were lifted (the paper's ablation w/o MV)."""
+    learning_rate: float = 0.08
+    """Step of Adam, on what `parametrization` names."""
+    parametrization: Literal["logit", "linear"] = "logit"
+    """What Adam moves: the logit, as 3DGS stores it, or the opacity itself, clamped to [0, 1]."""
+    target_weight: float = 0.1
+    """λ of Eq. 11, on the synthesized image."""
+    num_views: int = 2
+    """How many of the nearest context views take part."""
+
+
+def refine_opacities(
+    added: Gaussians,
+    at_target: FrozenView,
+    reference: View,
+    at_views: Sequence[FrozenView],
+    views: Sequence[View],
+    config: RefineConfig = RefineConfig(),
+) -> tuple[Gaussians, tuple[float, ...]]:
+    """`added` with opacities that minimise Eq. 11, and the loss of each iteration.
+
+    Everything else of them, and all of the scene, stays as it is: what was good cannot be
+    forgotten.
+    """
+    if config.iterations == 0 or len(added) == 0:
+        return added, ()
+    plans = [(at_target.plan(added), reference.image, config.target_weight)]
+    plans += [
+        (frozen.plan(added), view.image, 1.0) for frozen, view in zip(at_views, views, strict=True)
+    ]
+
+    logit = config.parametrization == "logit"
+    start = added.opacities.logit(eps=1e-4) if logit else added.opacities
+    parameters = start.clone().requires_grad_()
+    optimizer = torch.optim.Adam([parameters], lr=config.learning_rate)
+
+    def opacities() -> Float[Tensor, "n"]:
+        return parameters.sigmoid() if logit else parameters.clamp(0, 1)
+
+    losses = []
+    for _ in track(range(config.iterations), "Refining"):
+        current = opacities()
+        terms = [
+            weight * (plan(current).image - image).abs().mean() for plan, image, weight in plans
+        ]
+        loss = torch.stack(terms).sum()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    return replace(added, opacities=opacities().detach(), encoded=None), tuple(losses)
+
+
+@dataclass(frozen=True)
+class HarmConfig:
+    tolerance: float | None = 0.05
+    """Largest loss of PSNR, in dB, that any context view may suffer; None checks nothing, as in
+    the paper."""
+    max_trials: int = 8
+    """How often harmful Gaussians lose half of their opacity before they lose all of it."""
+
+
+def do_no_harm(
+    added: Gaussians,
+    at_views: Sequence[FrozenView],
+    views: Sequence[View],
+    allowed_errors: Sequence[float],
+    config: HarmConfig = HarmConfig(),
+) -> Gaussians:
+    """`added` with opacities lowered until no photograph is matched worse than allowed.
+
+    In a view that got worse, a Gaussian is harmful where less opacity would bring the view nearer
+    to its photograph. Harmful opacities are halved; a view that still does not hold after
+    `max_trials` loses every generated Gaussian that it sees, which restores it.
+
+    Args:
+        added: Generated Gaussians.
+        at_views: The scene frozen at each context camera.
+        views: The photographs.
+        allowed_errors: Largest mean squared error allowed in each view.
+        config: How it is checked.
+    """
+    if config.tolerance is None or len(added) == 0:
+        return added
+    checks = [
+        (frozen.plan(added), view.image, allowed)
+        for frozen, view, allowed in zip(at_views, views, allowed_errors, strict=True)
+    ]
+    opacities = added.opacities
+    for trial in range(config.max_trials + 1):
+        factor = 0.5 if trial < config.max_trials else 0.0
+        slopes = [error_slope(plan, image, opacities) for plan, image, _ in checks]
+        broken = [
+            slope
+            for (error, slope), (_, _, allowed) in zip(slopes, checks, strict=True)
+            if error > allowed
+        ]
+        if not broken:
+            break
+        last = trial == config.max_trials
+        lowered = torch.stack([slope != 0 if last else slope > 0 for slope in broken]).any(dim=0)
+        opacities = torch.where(lowered, factor * opacities, opacities)
+    return replace(added, opacities=opacities, encoded=None)
+
+
+def error_slope(
+    plan: OpacityRender, photograph: Float[Tensor, "h w 3"], opacities: Float[Tensor, "n"]
+) -> tuple[float, Float[Tensor, "n"]]:
+    """Error against the photograph, and how it grows with each opacity."""
+    with torch.enable_grad():
+        variable = opacities.detach().clone().requires_grad_()
+        image = plan(variable).image
+        (slope,) = torch.autograd.grad((image - photograph).square().mean(), variable)
+    return squared_error(image.detach(), photograph).item(), slope
+
+
+def squared_error(image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]) -> Tensor:
+    """Mean squared error of the image as it is shown, clipped to [0, 1]."""
+    return (image.clamp(0, 1) - photograph).square().mean()
+
+
+def error_with_loss(error: float, decibel: float) -> float:
+    """The mean squared error whose PSNR is `decibel` lower than that of `error`."""
+    return error * 10 ** (decibel / 10)

@@ -1,0 +1,215 @@
+"""Stage 3, fine: each Gaussian slides along its own camera ray until it agrees with the scene
+(paper, Sec. III-E)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.progress import track
+from gscompleter.render import FrozenView, Renderer
+from gscompleter.stages.alignment import AffineConfig, fit_bridge
+from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    affine: AffineConfig = AffineConfig()
+    """Settings of the coarse fit."""
+    iterations: int = 50
+    """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
+    learning_rate: float = 0.01
+    """Step of Adam, in the unit that `step` names."""
+    step: Literal["relative", "literal"] = "relative"
+    """`relative`: of each primitive's own distance, so that the unit of the scene does not
+    matter; depth losses are then relative to the median context depth. `literal`: in scene units,
+    as in the paper."""
+    degrees_of_freedom: Literal[1, 3] = 1
+    """1 slides along the camera ray; 3 moves freely (ablation of the paper)."""
+    depth_weight: float = 1.0
+    """λ_d of Eq. 9."""
+    stereo_weight: float = 1.0
+    """λ_s of Eq. 9."""
+    rgb_weight: float = 0.1
+    """λ_c of Eq. 9."""
+    footprint: Literal["constant", "fixed"] = "constant"
+    """`constant`: sizes scale with distance, so that the image at the target stays as it is.
+    `fixed`: sizes stay what they were, as in the paper."""
+    mask_occluded: bool = True
+    """Leave out of the stereo loss what the anchor cannot see: a new surface that lies behind the
+    context there. The paper's literal loss pulls it forward onto the context."""
+    occlusion_tolerance: float = 0.05
+    """How far behind the context, relative to depth, still counts as the same surface."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Candidates in their place."""
+
+    gaussians: Gaussians
+    affine: DepthAffine
+    losses: tuple[float, ...]
+    """Value of Eq. 9 at each iteration."""
+
+
+def register(
+    lift: Lift,
+    at_target: FrozenView,
+    at_anchor: Render,
+    reference: View,
+    anchor: Camera,
+    renderer: Renderer,
+    generator: torch.Generator,
+    config: RegistrationConfig = RegistrationConfig(),
+) -> Registration:
+    """Bring the lifted Gaussians to the scene: first all by one affine, then each along its ray.
+
+    Args:
+        lift: Candidates and the depth maps predicted together with them.
+        at_target: The scene frozen at the target camera.
+        at_anchor: The scene rendered at the anchor camera.
+        reference: The synthesized image and the target camera.
+        anchor: Camera of the anchor.
+        renderer: Draws the candidates under the anchor camera.
+        generator: Randomness of RANSAC.
+        config: Weights, steps and choices.
+    """
+    affine = fit_bridge(lift, at_target.context, at_anchor, generator, config.affine)
+    coarse = apply_affine(lift.gaussians, affine, reference.camera, config.footprint)
+    if config.iterations == 0 or len(coarse) == 0:
+        return Registration(coarse, affine, ())
+    registered, losses = register_along_rays(
+        coarse, at_target, at_anchor, reference, anchor, renderer, config
+    )
+    return Registration(registered, affine, losses)
+
+
+def apply_affine(
+    gaussians: Gaussians,
+    affine: DepthAffine,
+    camera: Camera,
+    footprint: Literal["constant", "fixed"],
+) -> Gaussians:
+    """`gaussians` at corrected z-depth `scale * z + shift`, each on its own ray of `camera`.
+
+    The distance along the ray follows from the means themselves, d' = d z'/z, which is the
+    paper's Eq. 8 for z-depth models and holds for models of ray distance too. A shift must not
+    push anything through the camera: a tenth of its depth is the least that remains.
+    """
+    z = (gaussians.means - camera.center) @ camera.forward
+    ratio = ((affine.scale * z + affine.shift) / z).clamp_min(0.1)
+    return slide(gaussians, camera, ratio, footprint)
+
+
+def slide(
+    gaussians: Gaussians,
+    camera: Camera,
+    ratio: Float[Tensor, "n"],
+    footprint: Literal["constant", "fixed"],
+) -> Gaussians:
+    """`gaussians` at `ratio` times their distance from the centre of `camera`.
+
+    With a constant footprint sizes follow: a similarity about the camera centre, under which the
+    image in that camera is exactly what it was.
+    """
+    means = camera.center + ratio[:, None] * (gaussians.means - camera.center)
+    scales = gaussians.scales * ratio[:, None] if footprint == "constant" else gaussians.scales
+    return replace(gaussians, means=means, scales=scales, encoded=None)
+
+
+def register_along_rays(
+    coarse: Gaussians,
+    at_target: FrozenView,
+    at_anchor: Render,
+    reference: View,
+    anchor: Camera,
+    renderer: Renderer,
+    config: RegistrationConfig,
+) -> tuple[Gaussians, tuple[float, ...]]:
+    """Minimise Eq. 9 over one distance per Gaussian; also returns the loss of each iteration."""
+    objective = Objective.of(at_target.context, at_anchor, reference, config)
+    parameters = torch.zeros(
+        (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
+    )
+    optimizer = torch.optim.Adam([parameters], lr=config.learning_rate)
+    losses = []
+    for _ in track(range(config.iterations), "Registering"):
+        moved = displace(coarse, parameters, reference.camera, config)
+        loss = objective(at_target.composite(moved), renderer.render(moved, anchor))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    with torch.no_grad():
+        return displace(coarse, parameters.detach(), reference.camera, config), tuple(losses)
+
+
+def displace(
+    coarse: Gaussians,
+    parameters: Float[Tensor, "n dof"],
+    camera: Camera,
+    config: RegistrationConfig,
+) -> Gaussians:
+    """`coarse` moved by the optimised parameters: along the rays (Eq. 8), or freely in 3-DoF."""
+    offsets = coarse.means - camera.center
+    distances = offsets.norm(dim=1, keepdim=True)
+    unit = distances if config.step == "relative" else torch.ones_like(distances)
+    if config.degrees_of_freedom == 3:
+        return replace(coarse, means=coarse.means + unit * parameters, encoded=None)
+    ratio = 1 + (unit * parameters / distances)[:, 0]
+    return slide(coarse, camera, ratio.clamp_min(0.1), config.footprint)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Eq. 9: `λ_d L_depth + λ_s L_stereo + λ_c L_rgb`, each a mean over its pixels."""
+
+    target_depth: DepthMap
+    anchor_depth: DepthMap
+    image: Float[Tensor, "h w 3"]
+    unit: float
+    """Depth residuals are divided by it, in scene units."""
+    config: RegistrationConfig
+
+    @staticmethod
+    def of(
+        at_target: Render, at_anchor: Render, reference: View, config: RegistrationConfig
+    ) -> Objective:
+        """The objective that draws the candidates to the scene as both cameras see it."""
+        anchor_depth = at_anchor.depth_map()
+        seen = anchor_depth.depth[anchor_depth.valid]
+        relative = config.step == "relative" and len(seen) > 0
+        unit = seen.median().item() if relative else 1.0
+        return Objective(at_target.depth_map(), anchor_depth, reference.image, unit, config)
+
+    def __call__(self, at_target: Render, at_anchor: Render) -> Float[Tensor, ""]:
+        """The loss of scene and candidates at the target, and the candidates at the anchor."""
+        depth = masked_mean(
+            (at_target.depth - self.target_depth.depth).abs() / self.unit, self.target_depth.valid
+        )
+        stereo = masked_mean(
+            (at_anchor.depth - self.anchor_depth.depth).abs() / self.unit,
+            self.comparable(at_anchor),
+        )
+        rgb = (at_target.image - self.image).abs().mean()
+        c = self.config
+        return c.depth_weight * depth + c.stereo_weight * stereo + c.rgb_weight * rgb
+
+    def comparable(self, at_anchor: Render) -> Tensor:
+        """Where the anchor sees both the scene and the candidates [h, w]."""
+        seen = self.anchor_depth.valid & (at_anchor.alpha.detach() >= 0.5)
+        if not self.config.mask_occluded:
+            return seen
+        behind = at_anchor.depth.detach() > self.anchor_depth.depth * (
+            1 + self.config.occlusion_tolerance
+        )
+        return seen & ~behind
+
+
+def masked_mean(values: Float[Tensor, "h w"], mask: Tensor) -> Float[Tensor, ""]:
+    """Sum over `mask` per pixel of the image, so that few pixels do not weigh like many."""
+    return torch.where(mask, values, 0.0).mean()

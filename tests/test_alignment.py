@@ -1,0 +1,79 @@
+"""Stage 3, coarse: the affine is found, and its fallbacks say so."""
+
+import pytest
+import torch
+
+from gscompleter.stages.alignment import AffineConfig, fit_affine
+from gscompleter.types import DepthMap
+
+
+def depths(low: float = 2.0, high: float = 6.0, size: int = 64) -> torch.Tensor:
+    return low + (high - low) * torch.rand(size, size, generator=torch.Generator().manual_seed(1))
+
+
+def everywhere(depth: torch.Tensor) -> DepthMap:
+    return DepthMap(depth, torch.ones_like(depth, dtype=torch.bool))
+
+
+def fit(predicted: DepthMap, context: DepthMap, config: AffineConfig = AffineConfig()):
+    return fit_affine(predicted, context, torch.Generator().manual_seed(0), config)
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1.3, -0.4), (0.7, 0.9), (1.0, 0.0)])
+def test_a_known_affine_is_recovered_under_40_percent_outliers(scale, shift):
+    predicted = depths()
+    context = scale * predicted + shift
+    wrong = torch.rand(64, 64, generator=torch.Generator().manual_seed(2)) < 0.4
+    context = torch.where(wrong, depths(1, 20), context)
+    affine = fit(everywhere(predicted), everywhere(context))
+    assert affine.method == "ransac"
+    assert affine.scale == pytest.approx(scale, rel=0.01)
+    assert affine.shift == pytest.approx(shift, abs=0.03)
+    assert affine.inliers == pytest.approx(1 - wrong.float().mean().item(), abs=0.06)
+
+
+def test_noise_averages_out_in_the_refit():
+    predicted = depths()
+    noise = 0.01 * torch.randn(64, 64, generator=torch.Generator().manual_seed(3))
+    affine = fit(everywhere(predicted), everywhere((1.1 * predicted + 0.2) * (1 + noise)))
+    assert affine.scale == pytest.approx(1.1, abs=2e-3)
+    assert affine.shift == pytest.approx(0.2, abs=1e-2)
+
+
+@pytest.mark.parametrize("unit", [0.001, 1.0, 1000.0])
+def test_the_unit_of_the_scene_scales_the_shift_and_nothing_else(unit):
+    predicted = depths() * unit
+    affine = fit(everywhere(predicted), everywhere(1.2 * predicted + 0.5 * unit))
+    assert affine.scale == pytest.approx(1.2, rel=1e-4)
+    assert affine.shift == pytest.approx(0.5 * unit, rel=1e-3)
+
+
+def test_a_wall_without_depth_range_gets_a_scale_and_no_shift():
+    wall = 3.0 + 0.01 * depths(0, 1)
+    affine = fit(everywhere(wall), everywhere(1.5 * wall))
+    assert affine.method == "median"
+    assert (affine.scale, affine.shift) == (pytest.approx(1.5, rel=1e-5), 0.0)
+
+
+def test_depths_that_agree_on_no_line_get_the_median_ratio():
+    affine = fit(everywhere(depths(1, 9)), everywhere(depths(1, 90).flip(0)))
+    assert affine.method == "median"
+    assert affine.shift == 0.0
+    assert affine.scale > 0
+
+
+def test_depth_that_runs_the_wrong_way_is_not_fitted_with_a_negative_scale():
+    predicted = depths()
+    affine = fit(everywhere(predicted), everywhere(10 - predicted))
+    assert affine.scale > 0
+
+
+def test_with_nothing_to_compare_the_identity_is_left():
+    nowhere = DepthMap(depths(), torch.zeros(64, 64, dtype=torch.bool))
+    affine = fit(nowhere, everywhere(depths()))
+    assert (affine.scale, affine.shift, affine.inliers, affine.method) == (1, 0, 0, "identity")
+
+
+def test_the_same_seed_gives_the_same_fit():
+    predicted, context = everywhere(depths(size=128)), everywhere(depths(1, 9, size=128))
+    assert fit(predicted, context) == fit(predicted, context)

@@ -1,0 +1,79 @@
+"""Rays and projection undo each other, and cameras know how they lie to each other."""
+
+import pytest
+import torch
+
+from gscompleter.geometry import (
+    baseline_between,
+    distance_from_depth,
+    inside,
+    project,
+    rotation_between,
+    same_camera,
+    sample,
+    unproject,
+)
+from scenes import Room, camera_at, cast
+
+
+def test_a_point_behind_a_pixel_projects_to_that_pixels_centre():
+    camera = camera_at(0.4, -0.2, 0.1, yaw=20, size=16)
+    depth = torch.rand(16, 16) + 2
+    pixels, z = project(unproject(depth, camera), camera)
+    centre = torch.arange(16) + 0.5
+    assert torch.allclose(pixels[..., 0], centre.expand(16, 16), atol=1e-4)
+    assert torch.allclose(pixels[..., 1], centre[:, None].expand(16, 16), atol=1e-4)
+    assert torch.allclose(z, depth, atol=1e-5)
+
+
+def test_the_optical_axis_points_along_z_and_the_top_left_ray_up_and_left():
+    camera = camera_at(size=2, focal=0.5)  # pixel centres half a focal length off the axis
+    assert camera.z_rays()[0, 0].tolist() == [-0.5, -0.5, 1.0]
+    assert torch.allclose(camera.forward, torch.tensor([0.0, 0.0, 1.0]))
+
+
+def test_distance_is_depth_over_the_cosine_to_the_axis():
+    camera = camera_at(size=2, focal=0.5)
+    distance = distance_from_depth(torch.full((2, 2), 4.0), camera)
+    assert torch.allclose(distance, torch.full((2, 2), 4.0 * 1.5**0.5))
+
+
+def test_points_behind_the_camera_are_not_inside_its_image():
+    camera = camera_at()
+    pixels, z = project(torch.tensor([[0.0, 0, 3], [0, 0, -3], [9, 0, 3]]), camera)
+    assert inside(pixels, z, camera).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 44.9, 90.0, 179.0])
+def test_rotation_is_the_full_angle_in_degrees(angle):
+    assert rotation_between(camera_at(), camera_at(yaw=angle)) == pytest.approx(angle, abs=1e-4)
+
+
+def test_baseline_is_the_distance_of_the_centres():
+    assert baseline_between(camera_at(x=1), camera_at(x=4, y=4, yaw=30)) == pytest.approx(5)
+
+
+def test_the_same_camera_is_recognised_in_any_unit():
+    for unit in (0.001, 1.0, 1000.0):
+        camera = camera_at(0.3, 0, 0, yaw=10, unit=unit)
+        assert same_camera(camera, camera_at(0.3, 0, 0, yaw=10, unit=unit))
+        assert not same_camera(camera, camera_at(0.301, 0, 0, yaw=10, unit=unit))
+        assert not same_camera(camera, camera_at(0.3, 0, 0, yaw=10.1, unit=unit))
+
+
+def test_sampling_at_pixel_centres_returns_the_pixels():
+    values = torch.rand(3, 5, 2)
+    x, y = torch.meshgrid(torch.arange(5) + 0.5, torch.arange(3) + 0.5, indexing="xy")
+    assert torch.allclose(sample(values, torch.stack([x, y], dim=-1)), values, atol=1e-6)
+
+
+def test_the_synthetic_room_shows_the_same_colour_from_everywhere():
+    room, a, b = Room(), camera_at(-0.3, size=64), camera_at(0.3, size=64)
+    image_a, depth_a = cast(room, a)
+    image_b, depth_b = cast(room, b)
+    pixels, z = project(unproject(depth_a, a), b)
+    seen = inside(pixels, z, b)
+    agrees = seen & ((sample(depth_b[..., None], pixels)[..., 0] - z).abs() < 0.02 * z)
+    difference = (sample(image_b, pixels) - image_a).abs().mean(-1)[agrees]
+    assert agrees.float().mean() > 0.5
+    assert difference.median() < 0.02
