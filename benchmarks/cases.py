@@ -86,6 +86,7 @@ def main(
     """
     completer = GSCompleter(generator=load_generator(generator), config=load_config(config))
     table = Table("case", *(name for name, _ in COLUMNS), box=None)
+    rows: list[CaseScores] = []
     scores = []
     for case in read_cases(cases):
         if only not in case.name:
@@ -94,6 +95,7 @@ def main(
         (result,) = completion.targets
         reference = result.reference
         row_reference = None if reference is None else psnr(reference.image, target.image)
+        rows.append(row)
         scores.append({**asdict(row), "reference_psnr": row_reference})
         table.add_row(row.name, *(cell(value(row)) for _, value in COLUMNS))
         print(row.name, " ".join(cell(value(row)) for _, value in COLUMNS), flush=True)
@@ -101,7 +103,6 @@ def main(
             pictures.mkdir(parents=True, exist_ok=True)
             name = row.name.replace(" ", "_").replace(">", "-")
             write_image(pictures / f"{name}.png", picture(completion, target))
-        rows = [*rows, row] if scores[1:] else [row]
     table.add_section()
     table.add_row("mean", *(cell(mean(value(row) for row in rows)) for _, value in COLUMNS))
     Console(width=200).print(table)

@@ -14,7 +14,7 @@ from gscompleter.errors import InputError
 from gscompleter.generators import Generator, load_generator
 from gscompleter.geometry import same_camera
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.reconstructors.depth_range import estimate_depth_range
+from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_range
 from gscompleter.render import FrozenView, Renderer, load_renderer
 from gscompleter.stages.anchor import lift, select_anchor, synthesize
 from gscompleter.stages.context import depth_range_of_scene, init_context

@@ -41,7 +41,11 @@ class CompleterConfig:
         Gaussian slides, no occlusion mask in the stereo loss, nothing checked afterwards."""
         return CompleterConfig(
             registration=RegistrationConfig(
-                learning_rate=0.01, step="literal", footprint="fixed", mask_occluded=False
+                learning_rate=0.01,
+                step="literal",
+                footprint="fixed",
+                mask_occluded=False,
+                carry_into_holes=False,
             ),
             harm=HarmConfig(tolerance=None),
         )

@@ -1,18 +1,15 @@
 """The command `demo`: complete a real stereo pair that scikit-image carries.
 
-The Middlebury 2014 motorcycle pair, downsampled by four, with its calibration and the true
-disparity of the left image (Scharstein et al., GCPR 2014). The completion sees both photographs
-and is asked for a view beyond each of them, where neither camera has looked.
+The Middlebury 2014 motorcycle pair, downsampled by four, with its calibration (Scharstein et al.,
+GCPR 2014). The completion sees both photographs and is asked for a view beyond each of them,
+where neither camera has looked.
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
 from rich.console import Console
 from skimage.data import stereo_motorcycle
@@ -59,25 +56,16 @@ def moved(camera: Camera, x: float) -> Camera:
 
 
 def write_motorcycle_scene(folder: Path) -> None:
-    """Write the pair as a scene folder with true depth, and `targets.json` beyond its cameras."""
-    left_image, right_image, disparity = stereo_motorcycle()
-    height, width = disparity.shape
+    """Write the pair as a scene folder and `targets.json` beyond its cameras."""
+    left_image, right_image, _ = stereo_motorcycle()
+    height, width = left_image.shape[:2]
     left, right = motorcycle_cameras(width, height)
     (folder / "images").mkdir(parents=True)
-    (folder / "depth").mkdir()
     for name, image in (("left", left_image), ("right", right_image)):
         write_image(folder / "images" / f"{name}.png", torch.from_numpy(image / 255).float())
-    with np.errstate(invalid="ignore"):
-        depth_mm = 1000 * FOCAL_PX * BASELINE_M / (disparity + PRINCIPAL_POINT_DX_PX)
-    known = np.isfinite(disparity)
-    depth_png = np.where(known, np.nan_to_num(depth_mm), 0).round().astype(np.uint16)
-    cv2.imwrite(str(folder / "depth" / "left.png"), depth_png)
-
-    write_cameras(folder / "transforms.json", [left, right])
-    content = json.loads((folder / "transforms.json").read_text())
-    content["frames"][0] |= {"file_path": "images/left.png", "depth_file_path": "depth/left.png"}
-    content["frames"][1] |= {"file_path": "images/right.png"}
-    (folder / "transforms.json").write_text(json.dumps(content, indent=2) + "\n")
+    write_cameras(
+        folder / "transforms.json", [left, right], ["images/left.png", "images/right.png"]
+    )
     beyond = [moved(left, -BEYOND * BASELINE_M), moved(right, BEYOND * BASELINE_M)]
     write_cameras(folder / "targets.json", beyond)
 

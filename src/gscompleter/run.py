@@ -16,7 +16,7 @@ from gscompleter.errors import InputError
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.ply import load_ply
-from gscompleter.io.scene import SceneIndex, load_cameras, load_views
+from gscompleter.io.scene import load_camera, load_cameras, load_views, read_index
 from gscompleter.options import CompleteOptions
 from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
@@ -92,22 +92,19 @@ def read_views(options: CompleteOptions, frames: Sequence[int]) -> list[View]:
 
 def read_targets(options: CompleteOptions) -> list[Target]:
     """The target cameras in the order of the command line, with photographs where there are any."""
-    index = SceneIndex.read(options.folder)
+    index = read_index(options.folder)
+    resolution, near, far = options.resolution, options.near, options.far
     targets = []
     for word in options.target:
         if not is_whole_number(word):
-            cameras = load_cameras(
-                Path(word), options.resolution, near=options.near, far=options.far
-            )
+            cameras = load_cameras(word, resolution, near, far)
             targets += [Target(camera) for camera in cameras]
-            continue
-        frame = int(word)
-        if index.has_photograph(frame):
-            (view,) = read_views(options, [frame])
-            targets.append(Target(view.camera, frame, view.image))
+        elif index.frame(int(word)).photograph is not None:
+            (view,) = read_views(options, [int(word)])
+            targets.append(Target(view.camera, view.frame, view.image))
         else:
-            camera = index.camera(frame, options.resolution, near=options.near, far=options.far)
-            targets.append(Target(camera, frame))
+            camera = load_camera(options.folder, int(word), resolution, near, far)
+            targets.append(Target(camera, int(word)))
     return targets
 
 

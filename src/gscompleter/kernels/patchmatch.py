@@ -7,8 +7,6 @@ hash, so that the result does not depend on the number of threads.
 import numpy as np
 from numba import njit, prange
 
-INFINITE = np.float32(1e30)
-
 
 @njit(cache=True, inline="always")
 def _hash(value):
@@ -20,7 +18,7 @@ def _hash(value):
 
 @njit(cache=True, fastmath=True)
 def _patch_cost(
-    image, weight, y, x, source, sy, sx, radius, max_bias, bias_penalty, limit, bias
+    image, weight, y, x, source, sy, sx, radius, max_bias, bias_penalty, bias
 ):
     """Mean squared difference of two patches after the best small shift of each colour channel.
 
@@ -51,11 +49,10 @@ def _patch_cost(
     b0 = min(max(d0, -max_bias), max_bias)
     b1 = min(max(d1, -max_bias), max_bias)
     b2 = min(max(d2, -max_bias), max_bias)
-    keep = np.float32(1) - bias_penalty
     cost -= np.float32(2) * (b0 * d0 + b1 * d1 + b2 * d2) - (b0 * b0 + b1 * b1 + b2 * b2)
     cost += bias_penalty * (b0 * b0 + b1 * b1 + b2 * b2)
     bias[0], bias[1], bias[2] = b0, b1, b2
-    return cost if keep >= np.float32(-1e30) else limit
+    return cost
 
 
 @njit(cache=True, fastmath=True)
@@ -113,7 +110,7 @@ def search(
         s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
         away = np.float32(np.sqrt(float((sy - y) ** 2 + (sx - x) ** 2)))
         cost[i] = _patch_cost(
-            image, weight, y, x, sources[s], sy, sx, radius, max_bias, bias_penalty, INFINITE, bias
+            image, weight, y, x, sources[s], sy, sx, radius, max_bias, bias_penalty, bias
         ) + _prior(
             log_depth[s, sy, sx], expected[i], away, diagonal, depth_penalty, distance_penalty
         )
@@ -184,7 +181,6 @@ def search(
                     radius,
                     max_bias,
                     bias_penalty,
-                    INFINITE,
                     bias,
                 )
                 if proposed < best:

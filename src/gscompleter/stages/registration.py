@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from gscompleter.interpolation import fill_smoothly
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, Renderer
 from gscompleter.stages.alignment import AffineConfig, fit_bridge
@@ -44,6 +45,9 @@ class RegistrationConfig:
     context there. The paper's literal loss pulls it forward onto the context."""
     occlusion_tolerance: float = 0.05
     """How far behind the context, relative to depth, still counts as the same surface."""
+    carry_into_holes: bool = True
+    """Let pixels in a hole, where the scene has no depth to agree with, move like the observed
+    ones around them, so that no step remains at the border. The paper leaves them to the affine."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,35 @@ def register(
     registered, losses = register_along_rays(
         coarse, at_target, at_anchor, reference, anchor, renderer, config
     )
+    if config.carry_into_holes and config.degrees_of_freedom == 1 and lift.pixel_index is not None:
+        observed = at_target.context.depth_map().valid
+        registered = carry_into_holes(
+            coarse, registered, lift.pixel_index, observed, reference.camera, config.footprint
+        )
     return Registration(registered, affine, losses)
+
+
+def carry_into_holes(
+    coarse: Gaussians,
+    registered: Gaussians,
+    pixel_index: Int[Tensor, "n"],
+    observed: Bool[Tensor, "h w"],
+    camera: Camera,
+    footprint: Literal["constant", "fixed"],
+) -> Gaussians:
+    """`registered` with the shifts of the observed pixels continued smoothly into the holes.
+
+    What is continued is the logarithm of d' / d, the correction each ray received.
+    """
+    distance = (coarse.means - camera.center).norm(dim=1)
+    correction = ((registered.means - camera.center).norm(dim=1) / distance).log()
+    grid = correction.new_zeros(observed.numel())
+    grid[pixel_index] = correction
+    has_primitive = torch.zeros_like(grid, dtype=torch.bool)
+    has_primitive[pixel_index] = True
+    known = observed & has_primitive.view_as(observed)
+    filled = fill_smoothly(grid.view_as(observed), known)
+    return slide(coarse, camera, filled.flatten()[pixel_index].exp(), footprint)
 
 
 def apply_affine(

@@ -1,0 +1,341 @@
+"""The command line: contracts on the output folder, exit codes and sentences."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gscompleter import load_ply, save_ply
+from gscompleter.cli import main
+from gscompleter.io.image import write_image
+from gscompleter.io.scene import write_cameras
+from scenes import Room, camera_at, view_of
+
+SIZE = 64
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """A synthetic room photographed from three places; frame 2 sees what 0 and 1 do not."""
+    folder = tmp_path_factory.mktemp("room")
+    cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
+    names = [f"{i}.png" for i in range(3)]
+    for name, camera in zip(names, cameras, strict=True):
+        write_image(folder / name, view_of(Room(), camera).image)
+    write_cameras(folder / "transforms.json", cameras, names)
+    return folder
+
+
+def run(monkeypatch, *arguments) -> int:
+    """Run the command in this process; returns its exit code."""
+    monkeypatch.setattr(sys, "argv", ["gscompleter", *map(str, arguments)])
+    try:
+        main()
+    except SystemExit as stop:
+        return stop.code or 0
+    return 0
+
+
+def complete(scene, out, *more, context=(0, 1), target=(2,)) -> list:
+    return ["complete", scene, "--context", *context, "--target", *target, "--out", out, *more]
+
+
+@pytest.fixture(scope="module")
+def completed(scene, tmp_path_factory) -> Path:
+    """The output of one plain run."""
+    out = tmp_path_factory.mktemp("runs") / "out"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        assert run(monkeypatch, *complete(scene, out, "--near", 0.5, "--far", 20, "--quiet")) == 0
+    return out
+
+
+def test_out_holds_all_that_the_contract_names(completed):
+    assert {p.name for p in completed.iterdir()} == {
+        "completed.ply",
+        "context.ply",
+        "images",
+        "summary.json",
+    }
+    names = ("before", "after", "reference", "hole_mask", "truth")
+    assert {p.name for p in (completed / "images").iterdir()} == {
+        f"target1_{name}.png" for name in names
+    }
+
+
+def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(completed):
+    summary = json.loads((completed / "summary.json").read_text())
+    assert set(summary) >= {"version", "settings", "seed", "device", "context", "targets"}
+    scores = {"psnr_before", "psnr_after", "ssim_before", "ssim_after"}
+    assert [row["frame"] for row in summary["context"]] == [0, 1]
+    assert all(set(row) == {"frame", *scores} for row in summary["context"])
+    (target,) = summary["targets"]
+    assert set(target) >= {"frame", "anchor", "anchor_fallback", "hole_fraction", "affine", *scores}
+    assert (target["frame"], target["anchor"], target["anchor_fallback"]) == (2, 0, False)
+    assert set(target["affine"]) == {"scale", "shift", "inliers", "method"}
+    assert target["hole_fraction"] > 0.1
+    assert target["psnr_after"] > target["psnr_before"] + 1
+    for row in summary["context"]:
+        assert row["psnr_after"] >= row["psnr_before"] - 0.05
+    stages = {"context", "generate", "lift", "register", "integrate", "total"}
+    assert set(summary["seconds"]) == stages
+    context, whole = load_ply(completed / "context.ply"), load_ply(completed / "completed.ply")
+    assert summary["gaussians"] == {"context": len(context), "added": len(whole) - len(context)}
+    assert (whole.generated[: len(context)] == 0).all()
+    assert (whole.generated[len(context) :] == 1).all()
+
+
+def test_the_same_command_gives_the_same_bytes(scene, completed, tmp_path, monkeypatch):
+    arguments = complete(scene, tmp_path / "out", "--near", 0.5, "--far", 20, "--quiet")
+    assert run(monkeypatch, *arguments) == 0
+    for name in ("completed.ply", "context.ply", "images/target1_after.png"):
+        assert (tmp_path / "out" / name).read_bytes() == (completed / name).read_bytes(), name
+
+
+def test_a_given_ply_is_kept_bit_for_bit(scene, completed, tmp_path, monkeypatch):
+    given = completed / "context.ply"
+    out = tmp_path / "out"
+    assert run(monkeypatch, *complete(scene, out, "--scene", given, "--quiet")) == 0
+    assert (out / "context.ply").read_bytes() == given.read_bytes()
+    mine, whole = load_ply(given), load_ply(out / "completed.ply")
+    assert len(whole) > len(mine)
+    for name in ("means", "quats", "scales", "opacities", "sh", "encoded"):
+        assert torch.equal(getattr(whole, name)[: len(mine)], getattr(mine, name)), name
+
+
+def test_cameras_from_a_file_are_completed_without_scores(scene, tmp_path, monkeypatch):
+    file = tmp_path / "targets.json"
+    write_cameras(file, [camera_at(0.7, yaw=12, size=SIZE), camera_at(-0.9, yaw=-12, size=SIZE)])
+    out = tmp_path / "out"
+    assert run(monkeypatch, *complete(scene, out, "--quiet", target=(file,))) == 0
+    rows = json.loads((out / "summary.json").read_text())["targets"]
+    assert [(row["frame"], row["psnr_after"]) for row in rows] == [(None, None), (None, None)]
+    assert set(load_ply(out / "completed.ply").generated.tolist()) == {0, 1, 2}
+
+
+def test_a_target_that_is_a_context_frame_says_there_is_nothing_to_complete(
+    scene, tmp_path, monkeypatch, capsys
+):
+    assert run(monkeypatch, *complete(scene, tmp_path / "out", target=(1,))) == 0
+    assert "nothing to complete" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["gaussians"]["added"] == 0
+
+
+def test_the_oracle_looks_at_the_photograph_and_says_so(scene, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    assert run(monkeypatch, *complete(scene, out, "--generator", "oracle", "--quiet")) == 0
+    assert json.loads((out / "summary.json").read_text())["settings"]["uses_target_photographs"]
+    images = out / "images"
+    assert (images / "target1_reference.png").read_bytes() == (
+        images / "target1_truth.png"
+    ).read_bytes()
+
+
+def broken_scene(scene: Path, folder: Path, change) -> Path:
+    """A copy of the scene whose transforms.json was changed."""
+    folder.mkdir()
+    for image in scene.glob("*.png"):
+        (folder / image.name).write_bytes(image.read_bytes())
+    content = json.loads((scene / "transforms.json").read_text())
+    change(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
+    """The command exits with 2, says one sentence and writes nothing."""
+    assert run(monkeypatch, *arguments) == 2
+    said = capsys.readouterr().err
+    assert sentence in said
+    assert said.startswith("gscompleter: ")
+    assert said.count("\n") == 1
+    assert "Traceback" not in said
+    assert not out.exists()
+    assert [p.name for p in out.parent.iterdir() if p.name.startswith(".gscompleter")] == []
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ({"context": (0,)}, "at least 2"),
+        ({"context": ()}, "at least 2"),
+        ({"context": (1, 1)}, "identical cameras"),
+        ({"context": (0, 9)}, "no frame 9"),
+        ({"target": (9,)}, "no frame 9"),
+        ({"target": (-1,)}, "-1"),
+        ({"target": ()}, "at least one"),
+        ({"target": ("nowhere.json",)}, "nowhere.json"),
+    ],
+)
+def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, sentence):
+    out = tmp_path / "out"
+    refused(monkeypatch, capsys, out, complete(scene, out, **more), sentence)
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (("--near", 5, "--far", 1), "near"),
+        (("--near", 0), "near"),
+        (("--near", -1), "near"),
+        (("--far", "nan"), "far"),
+        (("--resolution", 0, 64), "resolution"),
+        (("--config", "papper"), "no config 'papper'"),
+        (("--generator", "dall-e"), "no generator 'dall-e'"),
+        (("--reconstructor", "nerf"), "no reconstructor 'nerf'"),
+        (("--scene", "nowhere.ply"), "nowhere.ply"),
+    ],
+)
+def test_wrong_options_are_refused(scene, tmp_path, monkeypatch, capsys, more, sentence):
+    out = tmp_path / "out"
+    refused(monkeypatch, capsys, out, complete(scene, out, *more), sentence)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_refused(scene, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    refused(monkeypatch, capsys, out, complete(scene, out, "--device", "cuda"), "--device cpu")
+
+
+def test_a_missing_folder_is_refused(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    refused(monkeypatch, capsys, out, complete(tmp_path / "nowhere", out), "nowhere")
+
+
+def _without_baseline(content: dict) -> None:
+    content["frames"][1]["transform_matrix"] = content["frames"][0]["transform_matrix"]
+
+
+def _mirrored(content: dict) -> None:
+    pose = np.array(content["frames"][0]["transform_matrix"])
+    pose[:3, 0] *= -1
+    content["frames"][0]["transform_matrix"] = pose.tolist()
+
+
+def _sheared(content: dict) -> None:
+    content["frames"][0]["transform_matrix"][0][1] = 0.5
+
+
+def _nan(content: dict) -> None:
+    content["frames"][0]["transform_matrix"][0][3] = float("nan")
+
+
+def _without_frames(content: dict) -> None:
+    content["frames"] = []
+
+
+def _without_focal(content: dict) -> None:
+    for entry in (content, *content["frames"]):
+        for key in ("fl_x", "fl_y"):
+            if key in entry:
+                entry[key] = -1.0
+
+
+def _missing_image(content: dict) -> None:
+    content["frames"][0]["file_path"] = "00_gone.png"
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (_without_baseline, "baseline"),
+        (_mirrored, "reflection"),
+        (_sheared, "rigid"),
+        (_nan, "NaN"),
+        (_without_frames, "frames"),
+        (_without_focal, "fl_x"),
+        (_missing_image, "00_gone.png"),
+    ],
+)
+def test_a_wrong_scene_is_refused(scene, tmp_path, monkeypatch, capsys, change, sentence):
+    out = tmp_path / "out"
+    folder = broken_scene(scene, tmp_path / "scene", change)
+    refused(monkeypatch, capsys, out, complete(folder, out), sentence)
+
+
+@pytest.mark.parametrize("content", [b"", b"no image at all", None])
+def test_a_damaged_photograph_is_refused(scene, tmp_path, monkeypatch, capsys, content):
+    folder = broken_scene(scene, tmp_path / "scene", lambda content: None)
+    whole = (folder / "0.png").read_bytes()
+    (folder / "0.png").write_bytes(whole[: len(whole) // 2] if content is None else content)
+    out = tmp_path / "out"
+    refused(monkeypatch, capsys, out, complete(folder, out), "0.png")
+
+
+def test_a_ply_with_nan_is_refused_with_a_count_unless_they_are_dropped(
+    scene, completed, tmp_path, monkeypatch, capsys
+):
+    gaussians = load_ply(completed / "context.ply")
+    gaussians.means[:3] = float("nan")
+    damaged, out = tmp_path / "damaged.ply", tmp_path / "out"
+    save_ply(damaged, gaussians)
+    arguments = complete(scene, out, "--quiet", "--scene", damaged)
+    refused(monkeypatch, capsys, out, arguments, "--drop-nonfinite")
+    assert run(monkeypatch, *arguments, "--drop-nonfinite") == 0
+    assert len(load_ply(out / "context.ply")) == len(gaussians) - 3
+
+
+def test_a_folder_with_something_in_it_is_kept_unless_overwritten(
+    scene, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mine.txt").write_text("precious")
+    assert run(monkeypatch, *complete(scene, out)) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert [p.name for p in out.iterdir()] == ["mine.txt"]
+    assert run(monkeypatch, *complete(scene, out, "--overwrite", "--quiet")) == 0
+    assert (out / "completed.ply").exists()
+    assert (out / "mine.txt").read_text() == "precious"
+
+
+def test_quiet_is_quiet(scene, tmp_path, monkeypatch, capsys):
+    assert run(monkeypatch, *complete(scene, tmp_path / "out", "--quiet", target=(1,))) == 0
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "")
+
+
+def gscompleter(*arguments) -> subprocess.Popen:
+    """The command in a process of its own."""
+    command = [sys.executable, "-c", "from gscompleter.cli import main; main()"]
+    return subprocess.Popen(
+        [*command, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def test_help_does_not_wait_for_torch():
+    code = (
+        "import sys; sys.argv = ['gscompleter', '--help']\n"
+        "from gscompleter.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'torch', 'numba', 'cv2', 'skimage', 'numpy'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "complete" in done.stdout
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills with a POSIX signal")
+@pytest.mark.parametrize("delay", [1.0, 2.5, 4.0, 5.5])
+def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, delay):
+    out = tmp_path / "out"
+    process = gscompleter(*complete(scene, out, "--quiet"))
+    time.sleep(delay)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    for name in ("completed.ply", "context.ply"):
+        if (out / name).exists():
+            assert len(load_ply(out / name)) > 0
+    if out.exists():
+        json.loads((out / "summary.json").read_text())

@@ -1,0 +1,138 @@
+"""Stage 4: only what lies in the holes, only its opacities, and no harm."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter.render import load_renderer
+from gscompleter.stages.integration import (
+    HarmConfig,
+    HoleConfig,
+    RefineConfig,
+    dilate,
+    do_no_harm,
+    error_with_loss,
+    hole_mask,
+    keep_in_holes,
+    refine_opacities,
+    squared_error,
+)
+from gscompleter.types import Render, View
+from scenes import Room, camera_at, gaussians_of, view_of
+
+SIZE = 48
+ROOM = Room()
+CAMERA = camera_at(size=SIZE)
+
+
+def test_a_hole_is_where_the_scene_covers_less_than_half_of_the_pixel():
+    alpha = torch.tensor([[0.0, 0.49, 0.5, 1.0]])
+    render = Render(torch.zeros(1, 4, 3), torch.zeros(1, 4), alpha)
+    assert hole_mask(render).tolist() == [[True, True, False, False]]
+    assert hole_mask(render, HoleConfig(max_alpha=0.3)).tolist() == [[True, False, False, False]]
+
+
+def test_dilation_grows_the_mask_by_its_radius_on_every_side():
+    mask = torch.zeros(9, 9, dtype=torch.bool)
+    mask[4, 4] = True
+    assert dilate(mask, 3).sum() == 7 * 7
+    assert dilate(mask, 3)[1:8, 1:8].all()
+    assert torch.equal(dilate(mask, 0), mask)
+
+
+def test_pixel_aligned_gaussians_are_kept_by_their_pixel():
+    view = view_of(ROOM, CAMERA)
+    mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    mask[:, :10] = True
+    kept = keep_in_holes(gaussians_of(view), torch.arange(SIZE * SIZE), mask, CAMERA)
+    assert len(kept) == 10 * SIZE
+
+
+def test_other_gaussians_are_kept_by_where_they_project():
+    view = view_of(ROOM, CAMERA)
+    gaussians = gaussians_of(view)
+    behind = replace(gaussians, means=-gaussians.means)
+    mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    mask[:, :10] = True
+    assert len(keep_in_holes(gaussians, None, mask, CAMERA)) == 10 * SIZE
+    assert len(keep_in_holes(behind, None, mask, CAMERA)) == 0
+
+
+def half_a_room():
+    """A context that lacks the right half of what the camera sees, and the right half."""
+    view = view_of(ROOM, CAMERA)
+    right = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    right[:, SIZE // 2 :] = True
+    gaussians = gaussians_of(view)
+    return view, gaussians[~right.flatten()], gaussians[right.flatten()]
+
+
+@pytest.mark.parametrize("parametrization", ["logit", "linear"])
+def test_opacities_rise_where_the_hole_shows_and_nothing_else_moves(parametrization):
+    view, context, added = half_a_room()
+    faint = replace(added, opacities=torch.full((len(added),), 0.3))
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    config = RefineConfig(parametrization=parametrization)
+    refined, losses = refine_opacities(faint, frozen, view, [frozen], [view], config)
+    assert losses[-1] < 0.8 * losses[0]
+    assert refined.opacities.mean() > 0.5
+    assert ((refined.opacities >= 0) & (refined.opacities <= 1)).all()
+    for name in ("means", "quats", "scales", "sh"):
+        assert torch.equal(getattr(refined, name), getattr(faint, name))
+
+
+def test_a_floater_before_a_photograph_loses_opacity():
+    """The photograph is black where the new Gaussians would show."""
+    view, context, added = half_a_room()
+    photograph = view.image.clone()
+    photograph[:, SIZE // 2 :] = 0
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    dark = View(photograph, CAMERA)
+    refined, _ = refine_opacities(added, frozen, dark, [frozen], [dark])
+    assert (refined.opacities < added.opacities).float().mean() > 0.5
+    assert refined.opacities.mean() < 0.8
+
+
+def test_without_iterations_opacities_stay_as_they_were_lifted():
+    view, context, added = half_a_room()
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    config = RefineConfig(iterations=0)
+    refined, losses = refine_opacities(added, frozen, view, [frozen], [view], config)
+    assert refined is added
+    assert losses == ()
+
+
+@pytest.mark.parametrize("max_trials", [0, 8])
+def test_no_photograph_is_matched_worse_than_allowed(max_trials):
+    """Gaussians of wrong colour stand in front of everything the camera sees."""
+    view = view_of(ROOM, CAMERA)
+    context = gaussians_of(view)
+    harmful = replace(gaussians_of(view, torch.full((SIZE, SIZE), 1.0)), sh=-context.sh)
+    renderer = load_renderer("cpu")
+    frozen = renderer.freeze(context, CAMERA)
+    before = squared_error(frozen.context.image, view.image).item()
+    assert squared_error(frozen.composite(harmful).image, view.image).item() > 10 * before
+
+    allowed = error_with_loss(before, 0.05)
+    config = HarmConfig(max_trials=max_trials)
+    mended = do_no_harm(harmful, [frozen], [view], [allowed], config)
+    assert squared_error(frozen.composite(mended).image, view.image).item() <= allowed
+
+
+def test_what_does_no_harm_keeps_its_opacity():
+    view, context, added = half_a_room()
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    before = squared_error(frozen.context.image, view.image).item()
+    kept = do_no_harm(added, [frozen], [view], [error_with_loss(before, 0.05)])
+    assert torch.equal(kept.opacities, added.opacities)
+
+
+def test_without_a_tolerance_nothing_is_checked():
+    view, context, added = half_a_room()
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    assert do_no_harm(added, [frozen], [view], [0.0], HarmConfig(tolerance=None)) is added
+
+
+def test_half_a_decibel_is_an_error_larger_by_an_eighth():
+    assert error_with_loss(1.0, 0.5) == pytest.approx(1.122, abs=1e-3)

@@ -1,0 +1,183 @@
+"""Stage 3, fine: Gaussians slide along their rays until they agree with the scene."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter.config import CompleterConfig
+from gscompleter.geometry import project
+from gscompleter.render import load_renderer
+from gscompleter.stages.registration import (
+    RegistrationConfig,
+    apply_affine,
+    register,
+    slide,
+)
+from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
+from scenes import Room, camera_at, gaussians_of, scaled, view_of
+
+SIZE = 48
+ROOM = Room()
+TARGET = camera_at(0.2, size=SIZE)
+ANCHOR = camera_at(-0.2, size=SIZE)
+PAPER = CompleterConfig.paper().registration
+
+
+def everywhere(depth: torch.Tensor) -> DepthMap:
+    return DepthMap(depth, torch.ones_like(depth, dtype=torch.bool))
+
+
+def lifted(reference: View, anchor: View, error: torch.Tensor | float) -> Lift:
+    """The truth lifted with its z-depths multiplied by `error`."""
+    assert reference.depth is not None
+    assert anchor.depth is not None
+    depth = reference.depth * error
+    return Lift(
+        gaussians_of(reference, depth),
+        everywhere(depth),
+        everywhere(anchor.depth * (error if isinstance(error, float) else 1.0)),
+        torch.arange(SIZE * SIZE),
+    )
+
+
+def registered(error: torch.Tensor | float, config: RegistrationConfig, unit: float = 1.0):
+    """The room known from two cameras, and the target's Gaussians registered to it."""
+    room = Room(unit=unit)
+    target, anchor = camera_at(0.2, size=SIZE, unit=unit), camera_at(-0.2, size=SIZE, unit=unit)
+    reference, anchor_view = view_of(room, target), view_of(room, anchor)
+    renderer = load_renderer("cpu")
+    others = [view_of(room, camera_at(x, size=SIZE, unit=unit)) for x in (-0.2, 0.0, 0.4)]
+    context = merge([gaussians_of(view) for view in others])
+    result = register(
+        lifted(reference, anchor_view, error),
+        renderer.freeze(context, target),
+        renderer.render(context, anchor),
+        reference,
+        anchor,
+        renderer,
+        torch.Generator().manual_seed(0),
+        config,
+    )
+    return result, reference
+
+
+def depth_error(result, reference: View) -> float:
+    """Median relative error of z-depth against the truth."""
+    _, z = project(result.gaussians.means, reference.camera)
+    truth = reference.depth.flatten()
+    return ((z - truth).abs() / truth).median().item()
+
+
+def bumpy() -> torch.Tensor:
+    """Depth errors of up to 6 % that no affine can mend."""
+    x = torch.linspace(0, 12, SIZE)
+    return 1 + 0.06 * torch.sin(x)[None] * torch.cos(x)[:, None]
+
+
+@pytest.mark.parametrize("config", [RegistrationConfig(), PAPER], ids=["ours", "paper"])
+@pytest.mark.parametrize("error", [0.8, 1.25])
+def test_a_wrong_scale_is_put_right_by_the_affine(config, error):
+    coarse, reference = registered(error, replace(config, iterations=0))
+    assert coarse.affine.method == "ransac"
+    assert coarse.affine.scale == pytest.approx(1 / error, rel=0.02)
+    assert depth_error(coarse, reference) < 0.025
+
+
+@pytest.mark.parametrize("config", [RegistrationConfig(), PAPER], ids=["ours", "paper"])
+def test_errors_that_no_affine_mends_shrink_along_the_rays(config):
+    coarse, reference = registered(bumpy(), replace(config, iterations=0))
+    fine, _ = registered(bumpy(), config)
+    assert depth_error(fine, reference) < 0.6 * depth_error(coarse, reference)
+    assert fine.losses[-1] < fine.losses[0]
+
+
+@pytest.mark.parametrize("config", [RegistrationConfig(), PAPER], ids=["ours", "paper"])
+def test_a_registered_primitive_still_projects_to_its_pixel(config):
+    result, reference = registered(bumpy(), config)
+    pixels, z = project(result.gaussians.means, reference.camera)
+    expected, _ = project(gaussians_of(reference).means, reference.camera)
+    assert (z > 0).all()
+    assert (pixels - expected).abs().max() < 0.01
+
+
+def test_free_motion_leaves_the_pixels():
+    result, reference = registered(bumpy(), replace(RegistrationConfig(), degrees_of_freedom=3))
+    pixels, _ = project(result.gaussians.means, reference.camera)
+    expected, _ = project(gaussians_of(reference).means, reference.camera)
+    assert (pixels - expected).abs().max() > 0.1
+
+
+def test_only_positions_and_sizes_change():
+    result, reference = registered(bumpy(), RegistrationConfig())
+    before = gaussians_of(reference)
+    for name in ("quats", "opacities", "sh"):
+        assert torch.equal(getattr(result.gaussians, name), getattr(before, name))
+
+
+def test_with_a_constant_footprint_the_image_at_the_target_stays():
+    renderer = load_renderer("cpu")
+    gaussians = gaussians_of(view_of(ROOM, TARGET))
+    moved = slide(gaussians, TARGET, torch.full((len(gaussians),), 1.7), "constant")
+    before, after = renderer.render(gaussians, TARGET), renderer.render(moved, TARGET)
+    assert (before.image - after.image).abs().mean() < 1e-3
+    assert (after.depth / before.depth).median() == pytest.approx(1.7, rel=1e-3)
+
+
+def test_with_a_fixed_footprint_sizes_stay():
+    gaussians = gaussians_of(view_of(ROOM, TARGET))
+    moved = slide(gaussians, TARGET, torch.full((len(gaussians),), 1.7), "fixed")
+    assert torch.equal(moved.scales, gaussians.scales)
+
+
+def test_the_affine_acts_on_z_depth_and_a_shift_pushes_nothing_through_the_camera():
+    gaussians = gaussians_of(view_of(ROOM, TARGET))
+    _, z = project(gaussians.means, TARGET)
+    _, moved = project(
+        apply_affine(gaussians, DepthAffine(1.5, 0.25), TARGET, "fixed").means, TARGET
+    )
+    assert torch.allclose(moved, 1.5 * z + 0.25, rtol=1e-4)
+    _, clamped = project(
+        apply_affine(gaussians, DepthAffine(1.0, -100.0), TARGET, "fixed").means, TARGET
+    )
+    assert (clamped > 0).all()
+
+
+@pytest.mark.parametrize("unit", [0.001, 1000.0])
+def test_the_unit_of_the_scene_scales_the_result_and_changes_nothing_else(unit):
+    ours, _ = registered(bumpy(), RegistrationConfig())
+    theirs, _ = registered(bumpy(), RegistrationConfig(), unit=unit)
+    same = scaled(ours.gaussians, unit)
+    # Adam divides by the size of the gradient, so that rounding shows where it is tiny.
+    assert ((theirs.gaussians.means - same.means) / unit).abs().median() < 5e-3
+    assert theirs.affine.scale == pytest.approx(ours.affine.scale, rel=1e-3)
+    assert theirs.losses[-1] == pytest.approx(ours.losses[-1], rel=0.02)
+
+
+def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
+    """A wall 4 m away, of which a panel 1 m before the anchor hides all. The target's candidates
+    lie on the wall; the literal stereo loss drags them to the panel, the masked one does not."""
+    renderer = load_renderer("cpu")
+    wall = torch.full((SIZE, SIZE), 4.0)
+    reference = View(torch.rand(SIZE, SIZE, 3), TARGET, depth=wall)
+    candidates = Lift(gaussians_of(reference), everywhere(wall), everywhere(wall), None)
+    panel = gaussians_of(View(torch.rand(SIZE, SIZE, 3), ANCHOR), torch.full((SIZE, SIZE), 1.0))
+    nothing_else = renderer.freeze(panel[:0], TARGET)
+
+    def moved(mask_occluded: bool) -> float:
+        config = RegistrationConfig(mask_occluded=mask_occluded, rgb_weight=0.0)
+        config = replace(config, affine=replace(config.affine, bridge="none"))
+        result = register(
+            candidates,
+            nothing_else,
+            renderer.render(panel, ANCHOR),
+            reference,
+            ANCHOR,
+            renderer,
+            torch.Generator(),
+            config,
+        )
+        return (result.gaussians.means[:, 2] - 4.0).abs().mean().item()
+
+    assert moved(mask_occluded=False) > 0.2
+    assert moved(mask_occluded=True) < 1e-3
