@@ -15,6 +15,7 @@ from gscompleter.stages.integration import (
     error_with_loss,
     hole_mask,
     keep_in_holes,
+    most_harmful,
     refine_opacities,
     squared_error,
 )
@@ -103,7 +104,7 @@ def test_without_iterations_opacities_stay_as_they_were_lifted():
     assert losses == ()
 
 
-@pytest.mark.parametrize("max_trials", [0, 8])
+@pytest.mark.parametrize("max_trials", [0, 16])
 def test_no_photograph_is_matched_worse_than_allowed(max_trials):
     """Gaussians of wrong colour stand in front of everything the camera sees."""
     view = view_of(ROOM, CAMERA)
@@ -126,6 +127,12 @@ def test_what_does_no_harm_keeps_its_opacity():
     before = squared_error(frozen.context.image, view.image).item()
     kept = do_no_harm(added, [frozen], [view], [error_with_loss(before, 0.05)])
     assert torch.equal(kept.opacities, added.opacities)
+
+
+def test_the_fewest_gaussians_that_suffice_are_lowered():
+    relief = torch.tensor([0.1, 0.5, -1.0, 0.3, 0.2])
+    assert most_harmful(relief, 0.6).tolist() == [False, True, False, True, False]
+    assert most_harmful(relief, 9.0).tolist() == [True, True, False, True, True]
 
 
 def test_without_a_tolerance_nothing_is_checked():

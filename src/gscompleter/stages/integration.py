@@ -114,8 +114,9 @@ class HarmConfig:
     tolerance: float | None = 0.05
     """Largest loss of PSNR, in dB, that any context view may suffer; None checks nothing, as in
     the paper."""
-    max_trials: int = 8
-    """How often harmful Gaussians lose half of their opacity before they lose all of it."""
+    max_trials: int = 16
+    """How often harmful Gaussians lose half of their opacity before a view that still does not
+    hold loses all it sees of them."""
 
 
 def do_no_harm(
@@ -128,8 +129,9 @@ def do_no_harm(
     """`added` with opacities lowered until no photograph is matched worse than allowed.
 
     In a view that got worse, a Gaussian is harmful where less opacity would bring the view nearer
-    to its photograph. Harmful opacities are halved; a view that still does not hold after
-    `max_trials` loses every generated Gaussian that it sees, which restores it.
+    to its photograph. The most harmful ones are halved, no more of them than it takes; a view
+    that still does not hold after `max_trials` loses every generated Gaussian that it sees, which
+    restores it.
 
     Args:
         added: Generated Gaussians.
@@ -146,19 +148,27 @@ def do_no_harm(
     ]
     opacities = added.opacities
     for trial in range(config.max_trials + 1):
-        factor = 0.5 if trial < config.max_trials else 0.0
-        slopes = [error_slope(plan, image, opacities) for plan, image, _ in checks]
-        broken = [
-            slope
-            for (error, slope), (_, _, allowed) in zip(slopes, checks, strict=True)
-            if error > allowed
-        ]
-        if not broken:
+        lowered = torch.zeros_like(opacities, dtype=torch.bool)
+        for plan, photograph, allowed in checks:
+            error, slope = error_slope(plan, photograph, opacities)
+            if error > allowed and trial == config.max_trials:
+                lowered |= slope != 0
+            elif error > allowed:
+                lowered |= most_harmful(slope * opacities / 2, error - allowed)
+        if not lowered.any():
             break
-        last = trial == config.max_trials
-        lowered = torch.stack([slope != 0 if last else slope > 0 for slope in broken]).any(dim=0)
+        factor = 0.5 if trial < config.max_trials else 0.0
         opacities = torch.where(lowered, factor * opacities, opacities)
     return replace(added, opacities=opacities, encoded=None)
+
+
+def most_harmful(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
+    """The fewest entries whose `relief` adds up to `needed`; all positive ones if they do not."""
+    order = relief.argsort(descending=True, stable=True)
+    before = relief[order].cumsum(0) - relief[order]
+    chosen = torch.zeros_like(relief, dtype=torch.bool)
+    chosen[order] = (before < needed) & (relief[order] > 0)
+    return chosen
 
 
 def error_slope(

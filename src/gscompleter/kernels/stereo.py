@@ -1,0 +1,389 @@
+"""Plane-sweep stereo: matching costs, semi-global aggregation, and what neighbouring views say.
+
+Pixels have their centres at +0.5. A 3 x 4 `transform` [A | b] carries a pixel (x, y, 1) of one view
+at inverse depth w to the homogeneous pixel A (x, y, 1) + b w of another, whose third entry is the
+ratio of the two z-depths.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+MATH = {"nnan", "ninf", "nsz", "arcp", "contract", "reassoc"}
+UNSEEN = 255
+"""Cost of a plane at which the pixel falls outside of the other image."""
+BLOCK = 16
+"""Rows that are swept together, so that their part of the cost volume stays in the cache."""
+
+
+@njit(cache=True, fastmath=MATH, inline="always")
+def _clip(value, low, high):
+    return min(max(value, low), high)
+
+
+@njit(cache=True, fastmath=MATH)
+def _box_sums(values, sums, column, rows, width, radius):
+    """Sums over (2 radius + 1)^2 windows of `values` [rows + 2 radius, width + 2 radius]."""
+    for x in range(width + 2 * radius):
+        column[x] = np.float32(0)
+    for y in range(2 * radius):
+        for x in range(width + 2 * radius):
+            column[x] += values[y, x]
+    for y in range(rows):
+        for x in range(width + 2 * radius):
+            column[x] += values[y + 2 * radius, x]
+        for x in range(width):
+            total = np.float32(0)
+            for dx in range(2 * radius + 1):
+                total += column[x + dx]
+            sums[y, x] = total
+        for x in range(width + 2 * radius):
+            column[x] -= values[y, x]
+
+
+@njit(cache=True, parallel=True, fastmath=MATH)
+def matching_costs(reference, source, transform, inverse_depths, radius, noise, detail):
+    """Dissimilarity of every reference pixel to the source at every plane.
+
+    The windows' normalised cross-correlation over all three colours, which a change of exposure
+    does not touch, mixed with the difference of the two pixels from their windows' means, which
+    is sharper at edges.
+
+    Args:
+        reference, source: Images [h, w, 3] and [H, W, 3].
+        transform: From reference to source [3, 4].
+        inverse_depths: Of the planes [d].
+        radius: Of the windows, in pixels.
+        noise: Standard deviation of the images' noise: weaker texture correlates with nothing.
+        detail: Share of the second term.
+
+    Returns:
+        Costs in 0 .. 254, UNSEEN where a plane leaves the source [h, w, d].
+    """
+    h, w = reference.shape[:2]
+    H, W = source.shape[:2]
+    planes = inverse_depths.shape[0]
+    costs = np.empty((h, w, planes), np.uint8)
+    area = np.float32((2 * radius + 1) ** 2)
+    floor = np.float32(3) * area * noise * noise
+    blocks = (h + BLOCK - 1) // BLOCK
+    wide = w + 2 * radius
+    for block in prange(blocks):
+        top = block * BLOCK
+        rows = min(BLOCK, h - top)
+        tall = rows + 2 * radius
+        own = np.empty((3, tall, wide), np.float32)
+        other = np.empty((3, tall, wide), np.float32)
+        product = np.empty((tall, wide), np.float32)
+        own_mean = np.empty((3, rows, w), np.float32)
+        other_mean = np.empty((3, rows, w), np.float32)
+        own_square = np.empty((rows, w), np.float32)
+        other_square = np.empty((rows, w), np.float32)
+        cross = np.empty((rows, w), np.float32)
+        seen = np.empty((tall, wide), np.bool_)
+        column = np.empty(wide, np.float32)
+        line = np.empty((2, wide), np.float32)
+        for y in range(tall):
+            for x in range(wide):
+                yy = _clip(top + y - radius, 0, h - 1)
+                xx = _clip(x - radius, 0, w - 1)
+                total = np.float32(0)
+                for c in range(3):
+                    own[c, y, x] = reference[yy, xx, c]
+                    total += own[c, y, x] * own[c, y, x]
+                product[y, x] = total
+        for c in range(3):
+            _box_sums(own[c], own_mean[c], column, rows, w, radius)
+        _box_sums(product, own_square, column, rows, w, radius)
+        for y in range(rows):
+            for x in range(w):
+                for c in range(3):
+                    own_mean[c, y, x] /= area
+                    own_square[y, x] -= area * own_mean[c, y, x] * own_mean[c, y, x]
+
+        for plane in range(planes):
+            depth = inverse_depths[plane]
+            for y in range(tall):
+                py = np.float32(top + y - radius) + np.float32(0.5)
+                q0 = transform[0, 1] * py + transform[0, 2] + transform[0, 3] * depth
+                q1 = transform[1, 1] * py + transform[1, 2] + transform[1, 3] * depth
+                q2 = transform[2, 1] * py + transform[2, 2] + transform[2, 3] * depth
+                for x in range(wide):
+                    px = np.float32(x - radius) + np.float32(0.5)
+                    ratio = q2 + transform[2, 0] * px
+                    inverse = np.float32(1) / max(ratio, np.float32(1e-3))
+                    sx = (q0 + transform[0, 0] * px) * inverse - np.float32(0.5)
+                    sy = (q1 + transform[1, 0] * px) * inverse - np.float32(0.5)
+                    seen[y, x] = (
+                        (ratio > np.float32(1e-3))
+                        & (sx >= np.float32(-0.5))
+                        & (sx <= np.float32(W) - np.float32(0.5))
+                        & (sy >= np.float32(-0.5))
+                        & (sy <= np.float32(H) - np.float32(0.5))
+                    )
+                    line[0, x] = _clip(sx, np.float32(0), np.float32(W - 1))
+                    line[1, x] = _clip(sy, np.float32(0), np.float32(H - 1))
+                for x in range(wide):
+                    sx, sy = line[0, x], line[1, x]
+                    ix = min(np.int32(sx), W - 2)
+                    iy = min(np.int32(sy), H - 2)
+                    ax, ay = sx - np.float32(ix), sy - np.float32(iy)
+                    w11 = ax * ay
+                    w01 = ax - w11
+                    w10 = ay - w11
+                    w00 = np.float32(1) - ax - w10
+                    for c in range(3):
+                        other[c, y, x] = (
+                            w00 * source[iy, ix, c]
+                            + w01 * source[iy, ix + 1, c]
+                            + w10 * source[iy + 1, ix, c]
+                            + w11 * source[iy + 1, ix + 1, c]
+                        )
+            for c in range(3):
+                _box_sums(other[c], other_mean[c], column, rows, w, radius)
+            for y in range(tall):
+                for x in range(wide):
+                    a, b, c = other[0, y, x], other[1, y, x], other[2, y, x]
+                    product[y, x] = a * a + b * b + c * c
+            _box_sums(product, other_square, column, rows, w, radius)
+            for y in range(tall):
+                for x in range(wide):
+                    product[y, x] = (
+                        other[0, y, x] * own[0, y, x]
+                        + other[1, y, x] * own[1, y, x]
+                        + other[2, y, x] * own[2, y, x]
+                    )
+            _box_sums(product, cross, column, rows, w, radius)
+            for y in range(rows):
+                for x in range(w):
+                    square = other_square[y, x]
+                    covariance = cross[y, x]
+                    difference = np.float32(0)
+                    for c in range(3):
+                        mean = other_mean[c, y, x] / area
+                        square -= area * mean * mean
+                        covariance -= area * mean * own_mean[c, y, x]
+                        difference += abs(
+                            (other[c, y + radius, x + radius] - mean)
+                            - (own[c, y + radius, x + radius] - own_mean[c, y, x])
+                        )
+                    square = max(square, np.float32(0))
+                    energy = max(own_square[y, x], np.float32(0))
+                    correlation = covariance / np.sqrt((square + floor) * (energy + floor))
+                    cost = (np.float32(1) - detail) * (np.float32(1) - correlation) + detail * min(
+                        difference * np.float32(5), np.float32(1)
+                    )
+                    value = np.uint8(min(cost * np.float32(254), np.float32(254)))
+                    if not seen[y + radius, x + radius]:
+                        value = np.uint8(UNSEEN)
+                    costs[top + y, x, plane] = value
+    return costs
+
+
+@njit(cache=True, parallel=True)
+def best_mean(costs, share, unseen_cost):
+    """The mean of the best `share` of the sources' costs [n, h, w, d], per pixel and plane.
+
+    A surface that is hidden from some of the views costs there whatever hides it; the views that
+    see it decide. Where no source sees the plane, it costs `unseen_cost`.
+    """
+    n, h, w, d = costs.shape
+    merged = np.empty((h, w, d), np.uint8)
+    for y in prange(h):
+        ranked = np.empty(n, np.int32)
+        for x in range(w):
+            for k in range(d):
+                seen = 0
+                for i in range(n):
+                    value = np.int32(costs[i, y, x, k])
+                    if value == UNSEEN:
+                        continue
+                    at = seen
+                    while at > 0 and ranked[at - 1] > value:
+                        ranked[at] = ranked[at - 1]
+                        at -= 1
+                    ranked[at] = value
+                    seen += 1
+                if seen == 0:
+                    merged[y, x, k] = unseen_cost
+                    continue
+                count = max(1, np.int32(np.ceil(seen * share)))
+                total = 0
+                for i in range(count):
+                    total += ranked[i]
+                merged[y, x, k] = np.uint8(total // count)
+    return merged
+
+
+@njit(cache=True, fastmath=MATH, inline="always")
+def _step(cost, before, lowest, after, total, small, large):
+    """One step of a path: returns the lowest cost at the new pixel."""
+    planes = cost.shape[0]
+    ceiling = lowest + large
+    best = np.float32(1e9)
+    for k in range(planes):
+        # `before` has a border of one plane on either side.
+        reached = min(min(before[k], before[k + 2]) + small, min(before[k + 1], ceiling))
+        value = np.float32(cost[k]) + reached - lowest
+        after[k + 1] = value
+        total[k] += value
+        best = min(best, value)
+    return best
+
+
+@njit(cache=True, fastmath=MATH)
+def _sweep_half(costs, large_x, large_y, large_d, large_u, small, down, total):
+    """Four of the eight paths: along the row, and from the three neighbours of the row before."""
+    h, w, planes = costs.shape
+    far = np.float32(1e9)
+    rows = np.full((2, 3, w + 2, planes + 2), far, np.float32)
+    lows = np.zeros((2, 3, w + 2), np.float32)
+    rows[:, :, :, 1 : planes + 1] = 0
+    along = np.full((2, planes + 2), far, np.float32)
+    for step in range(h):
+        y = step if down else h - 1 - step
+        now, then = step % 2, 1 - step % 2
+        along[:, 1 : planes + 1] = 0
+        low = np.float32(0)
+        for s in range(w):
+            x = s if down else w - 1 - s
+            back = x - 1 if down else x + 1
+            cost = costs[y, x]
+            out = total[y, x]
+            edge = min(x, back) if s > 0 else 0
+            low = _step(cost, along[s % 2], low, along[1 - s % 2], out, small, large_x[y, edge])
+            # The row before lies at y - 1 on the way down and at y + 1 on the way up.
+            upper = max(y - 1, 0) if down else min(y, h - 2)
+            left = max(x - 1, 0)
+            right = min(x, w - 2)
+            if down:
+                from_left, from_right = large_d[upper, left], large_u[upper, right]
+            else:
+                from_left, from_right = large_u[upper, left], large_d[upper, right]
+            for path in range(3):
+                shift = path - 1
+                large = large_y[upper, x]
+                if shift < 0:
+                    large = from_left
+                elif shift > 0:
+                    large = from_right
+                lows[now, path, x + 1] = _step(
+                    cost,
+                    rows[then, path, x + 1 + shift],
+                    lows[then, path, x + 1 + shift],
+                    rows[now, path, x + 1],
+                    out,
+                    small,
+                    large,
+                )
+
+
+@njit(cache=True, parallel=True, fastmath=MATH)
+def semi_global(costs, large_x, large_y, large_d, large_u, small):
+    """Costs aggregated along eight paths (Hirschmüller 2008).
+
+    Args:
+        costs: [h, w, d], 0 .. 254.
+        large_x, large_y, large_d, large_u: Penalty of a jump between a pixel and its right
+            neighbour [h, w - 1], the one below [h - 1, w], the one below to the right
+            [h - 1, w - 1], and between (y, x + 1) and (y + 1, x) [h - 1, w - 1].
+        small: Penalty of a step by one plane.
+
+    Returns:
+        The sum over the paths [h, w, d], as a mean per path.
+    """
+    h, w, planes = costs.shape
+    # Each half has its own sum, so that two threads can work and order does not matter.
+    total = np.zeros((2, h, w, planes), np.float32)
+    for half in prange(2):
+        _sweep_half(costs, large_x, large_y, large_d, large_u, small, half == 0, total[half])
+    for y in prange(h):
+        for x in range(w):
+            for k in range(planes):
+                total[0, y, x, k] = (total[0, y, x, k] + total[1, y, x, k]) * np.float32(0.125)
+    return total[0]
+
+
+@njit(cache=True, parallel=True, fastmath=MATH)
+def winners(total):
+    """The best plane of every pixel, to a fraction, and how much the second best costs more.
+
+    The second best is the cheapest plane that is no neighbour of the best.
+
+    Returns:
+        Plane indices [h, w] and margins [h, w] in the unit of the costs.
+    """
+    h, w, planes = total.shape
+    index = np.empty((h, w), np.float32)
+    margin = np.empty((h, w), np.float32)
+    for y in prange(h):
+        for x in range(w):
+            best = 0
+            for k in range(planes):
+                if total[y, x, k] < total[y, x, best]:
+                    best = k
+            second = np.float32(1e9)
+            for k in range(planes):
+                if abs(k - best) > 2:
+                    second = min(second, total[y, x, k])
+            margin[y, x] = second - total[y, x, best]
+            at = np.float32(best)
+            if 0 < best < planes - 1:
+                # Two lines of equal and opposite slope: less drawn to whole planes than a parabola.
+                before = total[y, x, best - 1] - total[y, x, best]
+                after = total[y, x, best + 1] - total[y, x, best]
+                steeper = max(before, after)
+                if steeper > 0:
+                    at += np.float32(0.5) * (before - after) / steeper
+            index[y, x] = at
+    return index, margin
+
+
+@njit(cache=True, parallel=True, fastmath=MATH)
+def reproject(depth, other, there, back):
+    """Carry every pixel to another view and back by the two views' inverse depths.
+
+    Args:
+        depth, other: Inverse depths [h, w] and [H, W].
+        there, back: Transforms from this view to the other and from the other to this [3, 4].
+
+    Returns:
+        How far from itself each pixel comes back, in pixels, negative where it falls outside of
+        the other image [h, w]; and its z-depth in the other view over the other's own [h, w].
+    """
+    h, w = depth.shape
+    H, W = other.shape
+    error = np.full((h, w), np.float32(-1), np.float32)
+    ratio = np.ones((h, w), np.float32)
+    for y in prange(h):
+        for x in range(w):
+            px, py, own = np.float32(x + 0.5), np.float32(y + 0.5), depth[y, x]
+            q2 = there[2, 0] * px + there[2, 1] * py + there[2, 2] + there[2, 3] * own
+            if q2 <= np.float32(1e-3):
+                continue
+            sx = there[0, 0] * px + there[0, 1] * py + there[0, 2] + there[0, 3] * own
+            sy = there[1, 0] * px + there[1, 1] * py + there[1, 2] + there[1, 3] * own
+            sx /= q2
+            sy /= q2
+            if not (sx >= 0 and sx < W and sy >= 0 and sy < H):
+                continue
+            # The corners around may lie on two surfaces: the one that agrees best counts.
+            best = np.float32(1e9)
+            expected = own / q2
+            value = other[int(sy), int(sx)]
+            x0, y0 = int(np.floor(sx - 0.5)), int(np.floor(sy - 0.5))
+            for k in range(4):
+                xx = min(max(x0 + k % 2, 0), W - 1)
+                yy = min(max(y0 + k // 2, 0), H - 1)
+                if abs(other[yy, xx] - expected) < best:
+                    best = abs(other[yy, xx] - expected)
+                    value = other[yy, xx]
+            r2 = back[2, 0] * sx + back[2, 1] * sy + back[2, 2] + back[2, 3] * value
+            if r2 <= np.float32(1e-3):
+                continue
+            rx = back[0, 0] * sx + back[0, 1] * sy + back[0, 2] + back[0, 3] * value
+            ry = back[1, 0] * sx + back[1, 1] * sy + back[1, 2] + back[1, 3] * value
+            rx = rx / r2 - px
+            ry = ry / r2 - py
+            error[y, x] = np.sqrt(rx * rx + ry * ry)
+            ratio[y, x] = value / max(expected, np.float32(1e-12))
+    return error, ratio

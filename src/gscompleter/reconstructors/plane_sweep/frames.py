@@ -1,0 +1,76 @@
+"""Views as the kernels want them: arrays, and lengths in units of the widest baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.errors import InputError
+from gscompleter.types import View
+
+Image = Float[np.ndarray, "h w 3"]
+Map = Float[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """An image and its camera; lengths are in units of the widest baseline."""
+
+    image: Float[np.ndarray, "h w 3"]
+    K: Float[np.ndarray, "3 3"]
+    rotation: Float[np.ndarray, "3 3"]
+    """Camera axes to world axes."""
+    center: Float[np.ndarray, "3"]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.image.shape[0], self.image.shape[1]
+
+
+def frames_of(views: Sequence[View]) -> tuple[list[Frame], float]:
+    """`views` in units of their widest baseline, and that unit in scene units.
+
+    Offsets are rounded to 2^-16 of the baseline, which no image can tell apart, so that a scene
+    whose float32 poses were multiplied by any factor gives the very same frames.
+
+    Raises:
+        InputError: with fewer than two views, or where all of them stand in one place.
+    """
+    if len(views) < 2:
+        raise InputError(
+            f"Stereo needs at least two views and got {len(views)}; give it another photograph."
+        )
+    centers = np.stack([view.camera.center.detach().cpu().double().numpy() for view in views])
+    unit = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
+    if unit <= 2e-7 * float(np.linalg.norm(centers, axis=-1).max()):
+        raise InputError(
+            f"All {len(views)} cameras stand in one place, and depth needs a baseline between "
+            "them; give photographs taken from different positions."
+        )
+    offsets = np.round((centers - centers[0]) / unit * 2**16) / 2**16
+    return [_frame(view, offset) for view, offset in zip(views, offsets, strict=True)], unit
+
+
+def _frame(view: View, center: Float[np.ndarray, "3"]) -> Frame:
+    camera = view.camera
+    return Frame(
+        np.ascontiguousarray(view.image.detach().cpu().float().numpy()),
+        camera.K.detach().cpu().double().numpy(),
+        camera.c2w[:3, :3].detach().cpu().double().numpy(),
+        center,
+    )
+
+
+def transform_between(reference: Frame, source: Frame) -> Float[np.ndarray, "3 4"]:
+    """[A | b]: a pixel (x, y, 1) of `reference` at inverse depth w lies at A (x, y, 1) + b w.
+
+    The result is a homogeneous pixel of `source`; its third entry is the ratio of the z-depths.
+    """
+    source_from_reference = source.rotation.T @ reference.rotation
+    homography = source.K @ source_from_reference @ np.linalg.inv(reference.K)
+    shift = source.K @ source.rotation.T @ (reference.center - source.center)
+    return np.concatenate([homography, shift[:, None]], axis=1).astype(np.float32)

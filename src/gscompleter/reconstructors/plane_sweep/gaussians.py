@@ -1,0 +1,119 @@
+"""One disc per pixel, sized and turned like the surface it lies on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gscompleter.types import Gaussians, View, observed, sh_from_rgb
+
+
+@dataclass(frozen=True)
+class DiscConfig:
+    sigma: float = 0.45
+    """Standard deviation across the line of sight, in pixels."""
+    thickness: float = 0.15
+    """Standard deviation along the surface's normal, relative to that across the line of sight."""
+    max_stretch: float = 3.0
+    """Longest a disc on a slanted surface may get, relative to a frontal one."""
+    opacity: float = 0.98
+    """Of a pixel whose depth is trusted."""
+
+
+def discs(
+    view: View,
+    depth: Float[Tensor, "h w"],
+    normals: Float[Tensor, "h w 3"],
+    opacity: Float[Tensor, "h w"],
+    config: DiscConfig,
+) -> Gaussians:
+    """A Gaussian for every pixel of `view`, row by row, at its z-depth.
+
+    Args:
+        view: Colours and camera.
+        depth: z-depth in scene units.
+        normals: Of the surface, in camera axes and towards the camera.
+        opacity: In [0, 1].
+        config: Sizes.
+    """
+    camera = view.camera
+    rays = camera.z_rays()
+    means = (camera.center + depth[..., None] * rays).reshape(-1, 3)
+    pixel = depth.reshape(-1) * 2 / (camera.K[0, 0] + camera.K[1, 1])
+
+    normal = normals.reshape(-1, 3) @ camera.c2w[:3, :3].T
+    towards = -torch.nn.functional.normalize(rays, dim=-1).reshape(-1, 3)
+    cosine = (normal * towards).sum(-1, keepdim=True).clamp_min(1 / config.max_stretch)
+    # Along the slope the disc spans as much of the ray's width as across it.
+    across = torch.linalg.cross(normal, towards)
+    flat = across.norm(dim=-1, keepdim=True) < 1e-3
+    across = torch.where(flat, camera.c2w[:3, 0].expand_as(across), across)
+    across = across - (across * normal).sum(-1, keepdim=True) * normal
+    across = torch.nn.functional.normalize(across, dim=-1)
+    along = torch.linalg.cross(normal, across)
+    axes = torch.stack([across, along, normal], dim=-1)
+    sizes = torch.cat(
+        [torch.ones_like(cosine), 1 / cosine, torch.full_like(cosine, config.thickness)], dim=-1
+    )
+    return observed(
+        means=means,
+        quats=quaternions(axes),
+        scales=sizes * (config.sigma * pixel)[:, None],
+        opacities=opacity.reshape(-1),
+        sh=sh_from_rgb(view.image.reshape(-1, 3)),
+    )
+
+
+def quaternions(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
+    """wxyz quaternions of rotation matrices, by the largest of the four components."""
+    r = rotations
+    squares = torch.stack(
+        [
+            1 + r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2],
+            1 + r[:, 0, 0] - r[:, 1, 1] - r[:, 2, 2],
+            1 - r[:, 0, 0] + r[:, 1, 1] - r[:, 2, 2],
+            1 - r[:, 0, 0] - r[:, 1, 1] + r[:, 2, 2],
+        ],
+        dim=-1,
+    )
+    a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
+    d, e, f = r[:, 1, 0] + r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 2, 1] + r[:, 1, 2]
+    w, x, y, z = squares.unbind(-1)
+    candidates = torch.stack(
+        [
+            torch.stack([w, a, b, c], -1),
+            torch.stack([a, x, d, e], -1),
+            torch.stack([b, d, y, f], -1),
+            torch.stack([c, e, f, z], -1),
+        ],
+        dim=1,
+    )
+    best = candidates[torch.arange(len(r)), squares.argmax(-1)]
+    return torch.nn.functional.normalize(best, dim=-1)
+
+
+def normals_of(
+    depth: Float[Tensor, "h w"], view: View
+) -> Float[Tensor, "h w 3"]:
+    """Surface normals in camera axes, towards the camera, from the nearer of two differences."""
+    camera = view.camera
+    rays = camera.z_rays() @ camera.c2w[:3, :3]
+    points = rays * depth[..., None]
+
+    def slope(p: Float[Tensor, "a b 3"]) -> Float[Tensor, "a b 3"]:
+        step = p[:, 1:] - p[:, :-1]
+        after = torch.cat([step, step[:, -1:]], 1)
+        before = torch.cat([step[:, :1], step], 1)
+        nearer = before[..., 2:].abs() < after[..., 2:].abs()
+        return torch.where(nearer, before, after)
+
+    dx = slope(points)
+    dy = slope(points.transpose(0, 1)).transpose(0, 1)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(dy, dx), dim=-1)
+    facing = (normal * rays).sum(-1, keepdim=True) < 0
+    return torch.where(facing, normal, -normal)

@@ -1,0 +1,178 @@
+"""The image formation in plain PyTorch: slow, short, differentiable by autograd, in any dtype.
+
+The fast renderers are tested against it, values and gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from gscompleter.render import OpacityRender
+from gscompleter.render.spherical_harmonics import colours_from
+from gscompleter.types import Camera, Gaussians, Render, merge
+
+BLUR = 0.3
+"""Added to the 2D variances, in px²: a low-pass of about a pixel."""
+TANGENT_MARGIN = 0.15
+"""Share of the image size beyond its border at which the perspective Jacobian is clamped."""
+MIN_ALPHA = 1 / 255
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class ReferenceRenderer:
+    """Draws on any device and in the dtype of the Gaussians."""
+
+    max_elements: int = 1 << 22
+    """Gaussians times pixels that are held in memory at once."""
+
+    def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        splats = project(gaussians, camera)
+        camera = camera.to(gaussians.means.device)
+        x = torch.arange(camera.width, device=camera.K.device) + 0.5
+        y = torch.arange(camera.height, device=camera.K.device) + 0.5
+        grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+        pixels = grid.reshape(-1, 2).to(gaussians.means.dtype)
+        per_chunk = max(1, self.max_elements // max(1, len(splats.depths)))
+        # Checkpoints keep the backward pass within the same bound as the forward pass.
+        chunks = [
+            checkpoint(composite, splats, chunk, use_reentrant=False)
+            for chunk in pixels.split(per_chunk)
+        ]
+        size = (camera.height, camera.width)
+        colour, weighted_depth, alpha = (torch.cat(parts) for parts in zip(*chunks, strict=True))
+        seen = alpha > 0
+        depth = torch.where(seen, weighted_depth / torch.where(seen, alpha, 1), 0)
+        return Render(colour.view(*size, 3), depth.view(size), alpha.view(size))
+
+    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceView:
+        return ReferenceView(self, context, camera)
+
+
+@dataclass(frozen=True)
+class ReferenceView:
+    """Renders context and new Gaussians together, every time from scratch."""
+
+    renderer: ReferenceRenderer
+    scene: Gaussians
+    camera: Camera
+
+    @cached_property
+    def context(self) -> Render:
+        return self.renderer.render(self.scene, self.camera)
+
+    def composite(self, new: Gaussians) -> Render:
+        return self.renderer.render(merge([self.scene, new]), self.camera)
+
+    def plan(self, new: Gaussians) -> OpacityRender:
+        fixed = replace(
+            new,
+            means=new.means.detach(),
+            quats=new.quats.detach(),
+            scales=new.scales.detach(),
+            sh=new.sh.detach(),
+        )
+        return lambda opacities: self.composite(replace(fixed, opacities=opacities))
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Gaussians projected to the image, front to back."""
+
+    centers: Float[Tensor, "m 2"]
+    """In pixels."""
+    precisions: Float[Tensor, "m 2 2"]
+    """Inverse covariances, in px⁻²."""
+    depths: Float[Tensor, "m"]
+    opacities: Float[Tensor, "m"]
+    colours: Float[Tensor, "m 3"]
+
+
+def project(gaussians: Gaussians, camera: Camera) -> Splats:
+    """The Gaussians behind the near plane, sorted by z, by the affine approximation of EWA."""
+    dtype, device = gaussians.means.dtype, gaussians.means.device
+    c2w, K = camera.c2w.to(device, dtype), camera.K.to(device, dtype)
+    camera_from_world = torch.linalg.inv(c2w[:3, :3])
+    points = (gaussians.means - c2w[:3, 3]) @ camera_from_world.T
+
+    z = points[:, 2].detach()
+    order = torch.argsort(z, stable=True)
+    order = order[z[order] > max(camera.near_plane, 0.0)]
+    gaussians, points = gaussians[order], points[order]
+
+    axes = rotations_from(gaussians.quats) * gaussians.scales[:, None, :]
+    flat = jacobians(points, K, camera.width, camera.height) @ camera_from_world @ axes
+    covariances = flat @ flat.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype, device=device)
+    return Splats(
+        centers=points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2],
+        precisions=inverses(covariances),
+        depths=points[:, 2],
+        opacities=gaussians.opacities,
+        colours=colours_from(gaussians.sh, gaussians.means, c2w[:3, 3]),
+    )
+
+
+def rotations_from(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
+    """Rotation matrices of wxyz quaternions of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=-1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=-1),
+    ]
+    return torch.stack(rows, dim=1)
+
+
+def jacobians(
+    points: Float[Tensor, "n 3"], K: Float[Tensor, "3 3"], width: int, height: int
+) -> Float[Tensor, "n 2 3"]:
+    """Derivative of the pixel with respect to the point in the camera.
+
+    Far outside of the image the affine approximation fails; the tangents are clamped there.
+    """
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    x, y, z = points.unbind(-1)
+    tan_x = (x / z).clamp(
+        -(cx + TANGENT_MARGIN * width) / fx, (width - cx + TANGENT_MARGIN * width) / fx
+    )
+    tan_y = (y / z).clamp(
+        -(cy + TANGENT_MARGIN * height) / fy, (height - cy + TANGENT_MARGIN * height) / fy
+    )
+    zero = torch.zeros_like(z)
+    rows = [
+        torch.stack([fx / z, zero, -fx * tan_x / z], dim=-1),
+        torch.stack([zero, fy / z, -fy * tan_y / z], dim=-1),
+    ]
+    return torch.stack(rows, dim=1)
+
+
+def inverses(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
+    """Inverses of symmetric matrices."""
+    a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+    adjugates = torch.stack([c, -b, -b, a], dim=-1).view(-1, 2, 2)
+    return adjugates / (a * c - b * b)[:, None, None]
+
+
+def composite(
+    splats: Splats, pixels: Float[Tensor, "p 2"]
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"], Float[Tensor, "p"]]:
+    """Sums over the splats of weight times colour, weight times depth, and weight."""
+    offsets = pixels - splats.centers[:, None]
+    sigma = 0.5 * torch.einsum("mpi,mij,mpj->mp", offsets, splats.precisions, offsets)
+    alpha = (splats.opacities[:, None] * torch.exp(-sigma)).clamp(max=MAX_ALPHA)
+    alpha = torch.where((alpha >= MIN_ALPHA) & (sigma >= 0), alpha, 0)
+
+    # Transmittance falls monotonically, so that what comes after the stop is masked as well.
+    alive = torch.cumprod(1 - alpha.detach(), dim=0) > MIN_TRANSMITTANCE
+    alpha = torch.where(alive, alpha, 0)
+    behind = torch.cumprod(1 - alpha, dim=0)
+    before = torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
+    weights = alpha * before
+    return weights.T @ splats.colours, weights.T @ splats.depths, weights.sum(dim=0)
