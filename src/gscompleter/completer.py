@@ -12,7 +12,7 @@ import torch
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, load_generator
-from gscompleter.geometry import same_camera
+from gscompleter.geometry import same_camera, widened
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_range
 from gscompleter.render import FrozenView, Renderer, load_renderer
@@ -120,16 +120,17 @@ class GSCompleter:
     ) -> TargetCompletion:
         """Stages 2 to 4 for one target: what it adds to `scene`, and how it came about."""
         random = torch.Generator().manual_seed(self.seed)
+        wide, left, top = widened(target, self.config.margin)
         with clock("context"):
-            at_target = self.renderer.freeze(scene, target)
-            holes = hole_mask(at_target.context, self.config.holes)
+            at_target = self.renderer.freeze(scene, wide)
+            before = at_target.context.cropped(left, top, target.width, target.height)
             choice = select_anchor(target, views, self.config.anchor)
             anchor = views[choice.index]
         nothing = TargetCompletion(
             target=target,
-            before=at_target.context,
-            after=at_target.context,
-            hole_mask=holes,
+            before=before,
+            after=before,
+            hole_mask=hole_mask(before, self.config.holes),
             reference=None,
             anchor=choice.index,
             anchor_fallback=choice.fallback,
@@ -138,14 +139,14 @@ class GSCompleter:
         )
         if any(same_camera(target, view.camera) for view in views):
             return replace(nothing, notes=("The target is a context view: nothing to complete.",))
-        if not holes.any():
+        if not nothing.hole_mask.any():
             return replace(nothing, notes=("The scene has no hole here: nothing to complete.",))
 
         with clock("generate"):
             at_views = [self.renderer.freeze(scene, view.camera) for view in views]
             renders = tuple(frozen.context for frozen in at_views)
             known = SceneContext(tuple(views), renders, at_target.context)
-            reference = synthesize(self.generator, target, known)
+            reference = synthesize(self.generator, wide, known)
 
         with clock("lift"):
             lifted = lift(self.reconstructor, reference, anchor)
@@ -163,17 +164,20 @@ class GSCompleter:
             )
 
         with clock("integrate"):
-            mask = dilate(holes, self.config.holes.dilation)
-            kept = keep_in_holes(registration.gaussians, lifted.pixel_index, mask, target)
+            mask = dilate(
+                hole_mask(at_target.context, self.config.holes), self.config.holes.dilation
+            )
+            kept = keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide)
             kept = replace(kept, generated=torch.full_like(kept.generated, number))
             refined, refine_losses = self.refine(kept, at_target, reference, at_views, views)
             added = do_no_harm(refined, at_views, views, allowed_errors, self.config.harm)
             after = self.renderer.render(merge([scene, added]), target)
 
+        rows, columns = slice(top, top + target.height), slice(left, left + target.width)
         return replace(
             nothing,
             after=after,
-            reference=reference,
+            reference=View(reference.image[rows, columns], target),
             affine=registration.affine,
             added=added,
             losses={"register": registration.losses, "refine": refine_losses},

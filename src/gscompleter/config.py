@@ -24,6 +24,10 @@ class CompleterConfig:
     """Settings of the four stages. The defaults are ours, wherever measurement shows better than
     the paper's; `docs/design.md` has the table."""
 
+    margin: float = 0.25
+    """Share of its size by which the target image is extended on every side while it is completed,
+    so that a camera that moves on from the target does not meet the next hole at its border. The
+    paper completes what the target itself sees."""
     anchor: AnchorConfig = AnchorConfig()
     """Which photograph forms the stereo pair with the synthesized image."""
     registration: RegistrationConfig = RegistrationConfig()
@@ -40,9 +44,11 @@ class CompleterConfig:
         """The paper to the letter: steps in scene units, sizes that stay what they were when a
         Gaussian slides, no occlusion mask in the stereo loss, nothing checked afterwards."""
         return CompleterConfig(
+            margin=0.0,
             registration=RegistrationConfig(
                 learning_rate=0.01,
                 step="literal",
+                depth_of="composite",
                 footprint="fixed",
                 mask_occluded=False,
                 carry_into_holes=False,

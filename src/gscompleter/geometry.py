@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -74,6 +76,20 @@ def rotation_between(a: Camera, b: Camera) -> float:
 def baseline_between(a: Camera, b: Camera) -> float:
     """Distance between the camera centres, in scene units."""
     return (a.center - b.center).norm().item()
+
+
+def widened(camera: Camera, margin: float) -> tuple[Camera, int, int]:
+    """`camera` with its image extended on every side by a share `margin` of its width and height.
+
+    Rays through the old pixels stay the same. Also returns how many pixels were added on the left
+    (and right) and at the top (and bottom).
+    """
+    left, top = round(margin * camera.width), round(margin * camera.height)
+    K = camera.K.clone()
+    K[0, 2] += left
+    K[1, 2] += top
+    wide = replace(camera, K=K, width=camera.width + 2 * left, height=camera.height + 2 * top)
+    return wide, left, top
 
 
 def same_camera(a: Camera, b: Camera) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,8 @@ def run_completion(options: CompleteOptions) -> None:
     device = choose_device(options.device)
     renderer = load_renderer(device)
     config = load_config(options.config)
+    if options.generator == "oracle":  # a photograph ends where the target's image ends
+        config = replace(config, margin=0.0)
     check_context(options)
     views = [view.to(device) for view in read_views(options, options.context)]
     targets = read_targets(options)

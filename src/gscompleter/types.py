@@ -209,6 +209,13 @@ class Render:
     alpha: Float[Tensor, "h w"]
     """Accumulated opacity, sum(w)."""
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Render:
+        """The window of `width` x `height` pixels whose top-left pixel is (left, top)."""
+        rows, columns = slice(top, top + height), slice(left, left + width)
+        return Render(
+            self.image[rows, columns], self.depth[rows, columns], self.alpha[rows, columns]
+        )
+
     def depth_map(self, min_alpha: float = 0.5) -> DepthMap:
         """The depth, valid where the Gaussians cover at least `min_alpha` of the pixel."""
         return DepthMap(self.depth, self.alpha >= min_alpha)

@@ -387,3 +387,404 @@ def reproject(depth, other, there, back):
             error[y, x] = np.sqrt(rx * rx + ry * ry)
             ratio[y, x] = value / max(expected, np.float32(1e-12))
     return error, ratio
+
+
+@njit(cache=True, parallel=True, fastmath=MATH)
+def fit_planes(inverse, weight, image, radius, stride, contrast, tolerance):
+    """Weighted least squares of a plane through the inverse depths around every pixel.
+
+    Inverse depth is linear in the pixel on any plane of the scene. Neighbours count by their own
+    weight, by their likeness in colour and by their nearness in depth, so that no fit crosses an
+    edge.
+
+    Args:
+        inverse, weight: Inverse depths and how much each is trusted [h, w].
+        image: Colours [h, w, 3].
+        radius, stride: Of the window: (2 radius + 1)^2 pixels, `stride` apart.
+        contrast: Difference of colour at which a neighbour's weight has fallen to exp(-1).
+        tolerance: Difference of inverse depth at which it has [h, w].
+
+    Returns:
+        Planes (inverse depth, and its change per pixel in x and y) [h, w, 3] and the total weight
+        of each fit [h, w].
+    """
+    h, w = inverse.shape
+    planes = np.zeros((h, w, 3), np.float32)
+    support = np.zeros((h, w), np.float32)
+    for y in prange(h):
+        for x in range(w):
+            s = np.float32(1e-6)
+            sx = np.float32(0)
+            sy = np.float32(0)
+            sz = np.float32(0)
+            sxx = np.float32(0)
+            sxy = np.float32(0)
+            syy = np.float32(0)
+            sxz = np.float32(0)
+            syz = np.float32(0)
+            own = inverse[y, x]
+            width = tolerance[y, x]
+            for j in range(-radius, radius + 1):
+                yy = y + j * stride
+                if yy < 0 or yy >= h:
+                    continue
+                for i in range(-radius, radius + 1):
+                    xx = x + i * stride
+                    if xx < 0 or xx >= w or weight[yy, xx] <= 0:
+                        continue
+                    # Slanted surfaces differ more the farther away: the tolerance grows.
+                    z = inverse[yy, xx] - own
+                    far = np.float32(max(abs(i), abs(j)))
+                    u = z / (width * (np.float32(1) + np.float32(0.5) * far))
+                    difference = (
+                        abs(image[yy, xx, 0] - image[y, x, 0])
+                        + abs(image[yy, xx, 1] - image[y, x, 1])
+                        + abs(image[yy, xx, 2] - image[y, x, 2])
+                    )
+                    v = difference / (np.float32(3) * contrast)
+                    exponent = u * u + v + np.float32(i * i + j * j) / np.float32(radius * radius)
+                    if exponent > np.float32(9):
+                        continue
+                    a = weight[yy, xx] * np.exp(-exponent)
+                    dx, dy = np.float32(i * stride), np.float32(j * stride)
+                    s += a
+                    sx += a * dx
+                    sy += a * dy
+                    sz += a * z
+                    sxx += a * dx * dx
+                    sxy += a * dx * dy
+                    syy += a * dy * dy
+                    sxz += a * dx * z
+                    syz += a * dy * z
+            sx /= s
+            sy /= s
+            sz /= s
+            # A ridge keeps slopes level where the support is a mere line.
+            ridge = np.float32(0.3)
+            cxx = sxx / s - sx * sx + ridge
+            cyy = syy / s - sy * sy + ridge
+            cxy = sxy / s - sx * sy
+            cxz = sxz / s - sx * sz
+            cyz = syz / s - sy * sz
+            determinant = cxx * cyy - cxy * cxy
+            gx = (cxz * cyy - cyz * cxy) / determinant
+            gy = (cyz * cxx - cxz * cxy) / determinant
+            planes[y, x, 0] = own + sz - gx * sx - gy * sy
+            planes[y, x, 1] = gx
+            planes[y, x, 2] = gy
+            support[y, x] = s
+    return planes, support
+
+
+@njit(cache=True, fastmath=MATH)
+def _window(image, y, x, radius, contrast, weight, own, place):
+    """Gather the window around a pixel: weights that sum to one, colours less their mean.
+
+    Returns:
+        The number of its pixels and the variance of its colours.
+    """
+    h, w = image.shape[:2]
+    used = 0
+    total = np.float32(0)
+    m0 = np.float32(0)
+    m1 = np.float32(0)
+    m2 = np.float32(0)
+    for j in range(max(-radius, -y), min(radius, h - 1 - y) + 1):
+        for i in range(max(-radius, -x), min(radius, w - 1 - x) + 1):
+            difference = np.float32(0)
+            for c in range(3):
+                own[used, c] = image[y + j, x + i, c]
+                difference += abs(own[used, c] - image[y, x, c])
+            a = np.exp(-difference / (np.float32(3) * contrast))
+            weight[used] = a
+            place[used, 0] = i
+            place[used, 1] = j
+            total += a
+            m0 += a * own[used, 0]
+            m1 += a * own[used, 1]
+            m2 += a * own[used, 2]
+            used += 1
+    energy = np.float32(0)
+    for k in range(used):
+        weight[k] /= total
+        own[k, 0] -= m0 / total
+        own[k, 1] -= m1 / total
+        own[k, 2] -= m2 / total
+        energy += weight[k] * (own[k, 0] ** 2 + own[k, 1] ** 2 + own[k, 2] ** 2)
+    return used, energy
+
+
+@njit(cache=True, fastmath=MATH)
+def _window_cost(
+    source, transform, px, py, depth, gx, gy, used, weight, own, place, energy, floor
+):
+    """One minus the correlation of a window with the source, on a plane; negative off the image."""
+    H, W = source.shape[:2]
+    ratio = transform[2, 0] * px + transform[2, 1] * py + transform[2, 2]
+    ratio += transform[2, 3] * depth
+    if ratio <= np.float32(1e-3):
+        return np.float32(-1)
+    cx = transform[0, 0] * px + transform[0, 1] * py + transform[0, 2] + transform[0, 3] * depth
+    cy = transform[1, 0] * px + transform[1, 1] * py + transform[1, 2] + transform[1, 3] * depth
+    if not (cx >= 0 and cx <= W * ratio and cy >= 0 and cy <= H * ratio):
+        return np.float32(-1)
+    s0 = np.float32(0)
+    s1 = np.float32(0)
+    s2 = np.float32(0)
+    square = np.float32(0)
+    cross = np.float32(0)
+    for k in range(used):
+        dx, dy = place[k, 0], place[k, 1]
+        at = depth + gx * dx + gy * dy
+        qx, qy = px + dx, py + dy
+        q2 = transform[2, 0] * qx + transform[2, 1] * qy + transform[2, 2] + transform[2, 3] * at
+        q0 = transform[0, 0] * qx + transform[0, 1] * qy + transform[0, 2] + transform[0, 3] * at
+        q1 = transform[1, 0] * qx + transform[1, 1] * qy + transform[1, 2] + transform[1, 3] * at
+        inverse = np.float32(1) / max(q2, np.float32(1e-3))
+        sx = _clip(q0 * inverse - np.float32(0.5), np.float32(0), np.float32(W - 1))
+        sy = _clip(q1 * inverse - np.float32(0.5), np.float32(0), np.float32(H - 1))
+        ix = min(np.int32(sx), W - 2)
+        iy = min(np.int32(sy), H - 2)
+        ax, ay = sx - np.float32(ix), sy - np.float32(iy)
+        w11 = ax * ay
+        w01 = ax - w11
+        w10 = ay - w11
+        w00 = np.float32(1) - ax - w10
+        a = weight[k]
+        mean = np.float32(0)
+        for c in range(3):
+            value = (
+                w00 * source[iy, ix, c]
+                + w01 * source[iy, ix + 1, c]
+                + w10 * source[iy + 1, ix, c]
+                + w11 * source[iy + 1, ix + 1, c]
+            )
+            square += a * value * value
+            cross += a * value * own[k, c]
+            if c == 0:
+                s0 += a * value
+            elif c == 1:
+                s1 += a * value
+            else:
+                s2 += a * value
+    square = max(square - s0 * s0 - s1 * s1 - s2 * s2, np.float32(0))
+    return max(
+        np.float32(1) - cross / np.sqrt((square + floor) * (energy + floor)), np.float32(0)
+    )
+
+
+@njit(cache=True, fastmath=MATH)
+def _slanted_row(
+    reference, source, transform, planes, step, half, radius, contrast, noise, y, costs
+):
+    """The costs of one row, see `slanted_costs`."""
+    size = (2 * radius + 1) ** 2
+    weight = np.empty(size, np.float32)
+    own = np.empty((size, 3), np.float32)
+    place = np.empty((size, 2), np.float32)
+    floor = np.float32(3) * noise * noise
+    for x in range(reference.shape[1]):
+        used, energy = _window(reference, y, x, radius, contrast, weight, own, place)
+        for n in range(2 * half + 1):
+            costs[x, n] = _window_cost(
+                source,
+                transform,
+                np.float32(x + 0.5),
+                np.float32(y + 0.5),
+                planes[y, x, 0] + np.float32(n - half) * step[y, x],
+                planes[y, x, 1],
+                planes[y, x, 2],
+                used,
+                weight,
+                own,
+                place,
+                energy,
+                floor,
+            )
+
+
+@njit(cache=True, parallel=True, fastmath=MATH)
+def slanted_costs(reference, source, transform, planes, step, half, radius, contrast, noise):
+    """One minus the correlation of windows that lie on each pixel's plane, at several depths.
+
+    Args:
+        reference, source: Images [h, w, 3] and [H, W, 3].
+        transform: From reference to source [3, 4].
+        planes: Inverse depth and its slopes [h, w, 3].
+        step: Of inverse depth between the depths that are tried, per pixel [h, w].
+        half: How many of them lie on either side.
+        radius: Of the windows, in pixels.
+        contrast: Difference of colour at which a neighbour's weight has fallen to exp(-1).
+        noise: Standard deviation of the images' noise.
+
+    Returns:
+        Costs [h, w, 2 half + 1], negative where the window's centre leaves the source.
+    """
+    h, w = reference.shape[:2]
+    costs = np.empty((h, w, 2 * half + 1), np.float32)
+    for y in prange(h):
+        # numba counts prange in unsigned numbers, of which the negative is a large one.
+        row = np.int64(y)
+        _slanted_row(
+            reference, source, transform, planes, step, half, radius, contrast, noise, row, costs[y]
+        )
+    return costs
+
+
+@njit(cache=True, fastmath=MATH)
+def _violation(px, py, depth, transform, other, trusted, tolerance):
+    """Whether a point would stand in front of what another view is sure to see there."""
+    H, W = other.shape
+    q2 = transform[2, 0] * px + transform[2, 1] * py + transform[2, 2] + transform[2, 3] * depth
+    if q2 <= np.float32(1e-3):
+        return False
+    sx = transform[0, 0] * px + transform[0, 1] * py + transform[0, 2] + transform[0, 3] * depth
+    sy = transform[1, 0] * px + transform[1, 1] * py + transform[1, 2] + transform[1, 3] * depth
+    sx /= q2
+    sy /= q2
+    if not (sx >= 0 and sx < W and sy >= 0 and sy < H):
+        return False
+    x, y = int(sx), int(sy)
+    if not trusted[y, x]:
+        return False
+    return depth / q2 > other[y, x] * (np.float32(1) + tolerance)
+
+
+@njit(cache=True, fastmath=MATH)
+def _continue_row(
+    y, inverse, known, planes, image, transforms, others, trusted, settings, low, high, filled
+):
+    """Continue the depths of one row, see `continue_depths`."""
+    tolerance, distance_scale, contrast_weight, reach, hidden_weight = settings
+    h, w = inverse.shape
+    count = 16
+    value = np.empty(count, np.float32)
+    price = np.empty(count, np.float32)
+    for x in range(w):
+        if known[y, x]:
+            filled[y, x] = inverse[y, x]
+            continue
+        found = 0
+        for k in range(count):
+            angle = np.float32(2 * np.pi / count) * np.float32(k)
+            dx, dy = np.cos(angle), np.sin(angle)
+            longest = max(abs(dx), abs(dy))
+            dx /= longest
+            dy /= longest
+            length = np.sqrt(dx * dx + dy * dy)
+            path = np.float32(0)
+            before_y, before_x = y, x
+            for step in range(1, max(h, w)):
+                xx = int(np.floor(np.float32(x) + dx * step + np.float32(0.5)))
+                yy = int(np.floor(np.float32(y) + dy * step + np.float32(0.5)))
+                if xx < 0 or xx >= w or yy < 0 or yy >= h:
+                    break
+                path += contrast_weight * (
+                    abs(image[yy, xx, 0] - image[before_y, before_x, 0])
+                    + abs(image[yy, xx, 1] - image[before_y, before_x, 1])
+                    + abs(image[yy, xx, 2] - image[before_y, before_x, 2])
+                )
+                before_y, before_x = yy, xx
+                if not known[yy, xx]:
+                    continue
+                # The slope of the seed fades with distance: far continuations turn level.
+                away = length * step
+                fade = reach * np.tanh(away / reach) / away
+                slope = planes[yy, xx, 1] * (x - xx) + planes[yy, xx, 2] * (y - yy)
+                depth = planes[yy, xx, 0] + fade * slope
+                depth = _clip(
+                    depth, np.float32(0.5) * inverse[yy, xx], np.float32(2) * inverse[yy, xx]
+                )
+                value[found] = _clip(depth, low, high)
+                price[found] = path + away / distance_scale
+                found += 1
+                break
+        if found == 0:
+            filled[y, x] = inverse[y, x]
+            continue
+        for k in range(found):
+            for n in range(len(others)):
+                if _violation(
+                    np.float32(x + 0.5),
+                    np.float32(y + 0.5),
+                    value[k],
+                    transforms[n],
+                    others[n],
+                    trusted[n],
+                    tolerance,
+                ):
+                    price[k] += hidden_weight
+        best = 0
+        for k in range(found):
+            if price[k] < price[best]:
+                best = k
+        total = np.float32(0)
+        mean = np.float32(0)
+        for k in range(found):
+            if abs(value[k] - value[best]) <= np.float32(2) * tolerance * value[best]:
+                a = np.exp(price[best] - price[k])
+                total += a
+                mean += a * value[k]
+        filled[y, x] = mean / total
+
+
+@njit(cache=True, parallel=True, fastmath=MATH)
+def continue_depths(
+    inverse, known, planes, image, transforms, others, trusted, settings, low, high
+):
+    """Continue known surfaces into unknown pixels.
+
+    In sixteen directions the nearest known pixel proposes its plane. A proposal costs its distance
+    and the colour edges on the way, and dearly if it would stand in front of what another view
+    sees; the cheapest wins, averaged with those that agree.
+
+    Args:
+        inverse, known: Inverse depths and where they are known [h, w].
+        planes: Inverse depth and its slopes around each known pixel [h, w, 3].
+        image: Colours [h, w, 3].
+        transforms, others, trusted: Of the other views, as tuples: transform to it [3, 4], its
+            inverse depths and where they are trusted [H, W].
+        settings: Relative tolerance of depth, pixels that cost 1, cost per difference of colour,
+            pixels over which slopes fade, cost of standing in front of what another view sees.
+        low, high: Bounds of inverse depth.
+
+    Returns:
+        Inverse depths everywhere [h, w].
+    """
+    h, w = inverse.shape
+    filled = np.empty((h, w), np.float32)
+    for y in prange(h):
+        _continue_row(
+            np.int64(y),
+            inverse,
+            known,
+            planes,
+            image,
+            transforms,
+            others,
+            trusted,
+            settings,
+            low,
+            high,
+            filled,
+        )
+    return filled
+
+
+@njit(cache=True, parallel=True, fastmath=MATH)
+def stands_in_front(inverse, transform, other, trusted, tolerance):
+    """Where a pixel's point would stand in front of what another view is sure to see [h, w]."""
+    h, w = inverse.shape
+    result = np.zeros((h, w), np.bool_)
+    for y in prange(h):
+        for x in range(w):
+            result[y, x] = _violation(
+                np.float32(x + 0.5),
+                np.float32(y + 0.5),
+                inverse[y, x],
+                transform,
+                other,
+                trusted,
+                tolerance,
+            )
+    return result

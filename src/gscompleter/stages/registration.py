@@ -23,7 +23,7 @@ class RegistrationConfig:
     """Settings of the coarse fit."""
     iterations: int = 50
     """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
-    learning_rate: float = 0.01
+    learning_rate: float = 0.002
     """Step of Adam, in the unit that `step` names."""
     step: Literal["relative", "literal"] = "relative"
     """`relative`: of each primitive's own distance, so that the unit of the scene does not
@@ -37,6 +37,9 @@ class RegistrationConfig:
     """λ_s of Eq. 9."""
     rgb_weight: float = 0.1
     """λ_c of Eq. 9."""
+    depth_of: Literal["candidates", "composite"] = "candidates"
+    """What L_depth renders: the candidates alone, each of which then feels its own error; or, as
+    in the paper, the scene with them, where those behind the context are hidden and stay wrong."""
     footprint: Literal["constant", "fixed"] = "constant"
     """`constant`: sizes scale with distance, so that the image at the target stays as it is.
     `fixed`: sizes stay what they were, as in the paper."""
@@ -171,7 +174,9 @@ def register_along_rays(
     losses = []
     for _ in track(range(config.iterations), "Registering"):
         moved = displace(coarse, parameters, reference.camera, config)
-        loss = objective(at_target.composite(moved), renderer.render(moved, anchor))
+        image = at_target.composite(moved)
+        depth = renderer.render(moved, reference.camera) if config.depth_of == "candidates" else image
+        loss = objective(image, depth, renderer.render(moved, anchor))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -218,8 +223,11 @@ class Objective:
         unit = seen.median().item() if relative else 1.0
         return Objective(at_target.depth_map(), anchor_depth, reference.image, unit, config)
 
-    def __call__(self, at_target: Render, at_anchor: Render) -> Float[Tensor, ""]:
-        """The loss of scene and candidates at the target, and the candidates at the anchor."""
+    def __call__(
+        self, composite: Render, at_target: Render, at_anchor: Render
+    ) -> Float[Tensor, ""]:
+        """The loss, given the composite at the target and what stands for the new depth in both
+        cameras."""
         depth = masked_mean(
             (at_target.depth - self.target_depth.depth).abs() / self.unit, self.target_depth.valid
         )
@@ -227,7 +235,7 @@ class Objective:
             (at_anchor.depth - self.anchor_depth.depth).abs() / self.unit,
             self.comparable(at_anchor),
         )
-        rgb = (at_target.image - self.image).abs().mean()
+        rgb = (composite.image - self.image).abs().mean()
         c = self.config
         return c.depth_weight * depth + c.stereo_weight * stereo + c.rgb_weight * rgb
 

@@ -14,21 +14,21 @@ from gscompleter.reconstructors.plane_sweep.frames import Frame, transform_betwe
 
 @dataclass(frozen=True)
 class MatchingConfig:
-    step: float = 0.8
+    step: float = 0.6
     """Pixels by which neighbouring planes move in the other image, at most pixels."""
     min_planes: int = 48
     """Fewest planes."""
-    max_planes: int = 192
+    max_planes: int = 256
     """Most planes."""
     radius: int = 2
     """Of the windows that are correlated, in pixels."""
-    noise: float = 0.01
+    noise: float = 0.004
     """Standard deviation of noise in colour; weaker texture correlates with nothing."""
-    detail: float = 0.3
+    detail: float = 0.4
     """Share of the pixels' own difference in the cost; the rest is correlation of windows."""
     best_share: float = 0.5
     """Share of the sources, the best ones, whose mean cost counts."""
-    unseen_cost: int = 100
+    unseen_cost: int = 140
     """Cost (0 to 254) of a plane at which no other view sees the pixel."""
 
 

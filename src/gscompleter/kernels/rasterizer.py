@@ -1,0 +1,1188 @@
+"""Compiled tile rasteriser of 3D Gaussians, forward and backward, for CPUs.
+
+The image is cut into tiles of 16 × 16 pixels. Gaussians are projected to splats, sorted by depth
+once for the whole image, and binned stably, so that the list of every tile is in depth order. A
+tile walks its list; a splat touches the rows of its bounding box; a row of 16 pixels is one vector.
+LLVM does not find these vectors by itself, so the loop over the rows is written in its own language
+(the intrinsics below); it turns them into whatever the processor has.
+
+Two lists are walked at once, merged by depth: `context`, which is frozen and gets no gradient, and
+`new`, which does. Drawing a single scene leaves the context empty.
+
+Every kernel works on a range (begin, end) of its elements, writes to its own part of the outputs
+and releases the interpreter lock: the caller shares ranges among threads, and the result does not
+depend on how.
+
+A splat's falloff is `alpha = opacity * exp(-(s² + t²))` with whitened coordinates
+`s = u dx + v dy`, `t = w dy` of the offset (dx, dy) from its centre. `U = [[u, v], [0, w]]` obeys
+`UᵀU = ½ Σ⁻¹` for the 2D covariance Σ. Unlike the quadratic form of Σ⁻¹ it does not cancel for thin
+oblique splats.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+TILE = 16
+"""Side of a tile in pixels, and the number of pixels that one vector holds."""
+TILE_SHIFT = 4
+"""Its logarithm: pixels shifted right by so many bits are tiles."""
+
+BLUR = np.float32(0.3)
+TANGENT_MARGIN = np.float32(0.15)
+MIN_ALPHA = np.float32(1 / 255)
+MAX_ALPHA = np.float32(0.999)
+MIN_TRANSMITTANCE = np.float32(1e-4)
+
+X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
+"""Columns of the splats."""
+NUM_SPLAT_COLUMNS = 9
+
+SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
+"""Columns of the gradients of an entry; green and blue follow red. SUM is the sum over pixels of
+`q = alpha dL/dalpha`, and the next five those of q times s, t, s², s t and t²."""
+NUM_GRADIENT_COLUMNS = 10
+
+
+class Pinhole(NamedTuple):
+    """A camera, as the kernels want it."""
+
+    rotation: np.ndarray
+    """Camera from world [3, 3], float32."""
+    center: np.ndarray
+    """Camera centre in the world [3], float32."""
+    intrinsics: np.ndarray
+    """fx, fy, cx, cy in pixels [4], float32."""
+    near: np.float32
+    """Smallest z that is drawn."""
+    width: int
+    height: int
+
+
+class GaussianArrays(NamedTuple):
+    """Gaussians, or their gradients, all float32. See `gscompleter.types.Gaussians`."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    sh: np.ndarray
+
+
+class Layer(NamedTuple):
+    """Splats and, for each tile, the list of those that touch it, front to back."""
+
+    splats: np.ndarray
+    """[n, 9] float32, columns X to BLUE."""
+    opacities: np.ndarray
+    """[n] float32."""
+    boxes: np.ndarray
+    """Pixels that a splat may touch, x from, x to, y from, y to (excluded) [n, 4] int32."""
+    tile_start: np.ndarray
+    """Where the list of each tile starts [tiles + 1] int64."""
+    entries: np.ndarray
+    """Index of the splat [entries] int32."""
+
+
+class Frame(NamedTuple):
+    """An image, and what the backward pass needs of how it came about."""
+
+    image: np.ndarray
+    """[h, w, 3] float32."""
+    depth: np.ndarray
+    """z-depth [h, w] float32, 0 where nothing is seen."""
+    alpha: np.ndarray
+    """[h, w] float32."""
+    transmittance: np.ndarray
+    """What passes behind the last contribution [h, w] float32."""
+    last: np.ndarray
+    """Position of the last contribution in the merged list of its tile, or -1 [h, w] int32."""
+    used: np.ndarray
+    """How much of the two lists was walked until the tile was full [tiles, 2] int32."""
+    full: np.ndarray
+    """Whether no pixel of the tile lets anything more pass [tiles] bool."""
+
+
+# ---- Vectors of 16 pixels in LLVM's intermediate representation ------------------------------
+
+_FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+_FLOATS, _INTS = ir.VectorType(_FLOAT, TILE), ir.VectorType(_INT, TILE)
+
+# Least squares polynomial of 2**x on [-1, 0], highest power first: relative error 2e-7.
+_EXP2 = (0.000938116473, 0.00918687438, 0.055278135, 0.240171588, 0.693142171, 0.999999923)
+_LOG2_E = 1.4426950408889634
+
+
+class _Lanes:
+    """Sixteen float32 values of a function under construction."""
+
+    def __init__(self, builder, value):
+        self.builder, self.value = builder, value
+
+    def _value_of(self, other):
+        return other.value if isinstance(other, _Lanes) else _constant(other)
+
+    def __add__(self, other):
+        return _Lanes(self.builder, self.builder.fadd(self.value, self._value_of(other)))
+
+    def __sub__(self, other):
+        return _Lanes(self.builder, self.builder.fsub(self.value, self._value_of(other)))
+
+    def __mul__(self, other):
+        return _Lanes(self.builder, self.builder.fmul(self.value, self._value_of(other)))
+
+    def __rtruediv__(self, other):
+        return _Lanes(self.builder, self.builder.fdiv(self._value_of(other), self.value))
+
+    def __rsub__(self, other):
+        return _Lanes(self.builder, self.builder.fsub(self._value_of(other), self.value))
+
+    def times(self, factor, plus):
+        """self * factor + plus, rounded once where the processor can do that.
+
+        The rounding is asked for here and not left to the optimiser, so that the backward pass
+        arrives at the very alphas of the forward pass.
+        """
+        multiply_add = cgutils.get_or_insert_function(
+            self.builder.module,
+            ir.FunctionType(_FLOATS, [_FLOATS, _FLOATS, _FLOATS]),
+            f"llvm.fmuladd.v{TILE}f32",
+        )
+        arguments = [self.value, self._value_of(factor), self._value_of(plus)]
+        return _Lanes(self.builder, self.builder.call(multiply_add, arguments))
+
+    def compare(self, relation, other):
+        """Mask of the lanes where the relation holds; it never holds for NaN."""
+        return self.builder.fcmp_ordered(relation, self.value, self._value_of(other))
+
+    def where(self, mask, otherwise):
+        value = self.builder.select(mask, self.value, self._value_of(otherwise))
+        return _Lanes(self.builder, value)
+
+
+def _sums_of_lanes(builder, vectors):
+    """One vector whose lane k is the sum of the lanes of the k-th of up to sixteen vectors.
+
+    Two vectors are added into one, half of whose lanes stand for each, until one is left.
+    """
+    values = [vector.value for vector in vectors]
+    undefined = ir.Constant(_FLOATS, ir.Undefined)
+    width = TILE
+    while width > 1:
+        half = width // 2
+        low = [lane for lane in range(2 * TILE) if lane % width < half]
+        high = [lane for lane in range(2 * TILE) if lane % width >= half]
+        values += [undefined] * (len(values) % 2)
+        values = [
+            builder.fadd(
+                builder.shuffle_vector(first, second, ir.Constant(_INTS, low)),
+                builder.shuffle_vector(first, second, ir.Constant(_INTS, high)),
+            )
+            for first, second in zip(values[::2], values[1::2], strict=True)
+        ]
+        width = half
+    return values[0]
+
+
+def _constant(value):
+    return ir.Constant(_FLOATS, [float(np.float32(value))] * TILE)
+
+
+def _broadcast(builder, scalar, vector_type=_FLOATS):
+    undefined = ir.Constant(vector_type, ir.Undefined)
+    first = builder.insert_element(undefined, scalar, ir.Constant(_INT, 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(_INTS, [0] * TILE))
+
+
+def _exp_of_negative(values):
+    """exp(-values) for values >= 0; everything beyond 80 is as good as 0."""
+    builder = values.builder
+    power = values * -_LOG2_E
+    power = power.where(power.compare(">", -120.0), -120.0)
+    whole = builder.fptosi(power.value, _INTS)
+    fraction = power - _Lanes(builder, builder.sitofp(whole, _FLOATS))
+    polynomial = fraction.times(_EXP2[0], _EXP2[1])
+    for coefficient in _EXP2[2:]:
+        polynomial = polynomial.times(fraction, coefficient)
+    # The exponent of a float starts at bit 23 and is 127 for 2**0.
+    exponent = builder.add(whole, ir.Constant(_INTS, [127] * TILE))
+    scale = builder.shl(exponent, ir.Constant(_INTS, [23] * TILE))
+    return polynomial * _Lanes(builder, builder.bitcast(scale, _FLOATS))
+
+
+class _Rows:
+    """Rows of a tile's arrays, each row some vectors one after the other."""
+
+    def __init__(self, context, builder, array_type, array, vector_type, vectors_per_row):
+        self.builder, self.vector_type = builder, vector_type
+        self.data = context.make_array(array_type)(context, builder, array).data
+        self.stride = vectors_per_row * TILE
+
+    def _pointer(self, row, index):
+        offset = self.builder.mul(row, ir.Constant(_LONG, self.stride))
+        offset = self.builder.add(offset, ir.Constant(_LONG, index * TILE))
+        pointer = self.builder.gep(self.data, [offset])
+        return self.builder.bitcast(pointer, self.vector_type.as_pointer())
+
+    def load(self, row, index):
+        return self.builder.load(self._pointer(row, index), align=4)
+
+    def store(self, row, index, value):
+        self.builder.store(value, self._pointer(row, index), align=4)
+
+
+class _Splat:
+    """A splat and the tile it is drawn to, as the intrinsics receive them."""
+
+    def __init__(self, builder, x, y, u, v, w, opacity, red, green, blue, depth):
+        self.builder = builder
+        self.y, self.v, self.w = y, v, w
+        self.channels = [
+            _Lanes(builder, _broadcast(builder, value)) for value in (red, green, blue, depth)
+        ]
+        lane_numbers = ir.Constant(_FLOATS, [float(lane) for lane in range(TILE)])
+        self.dx = _Lanes(builder, builder.fsub(lane_numbers, _broadcast(builder, x)))
+        self.u_dx = self.dx * _Lanes(builder, _broadcast(builder, u))
+        self.opacity = _Lanes(builder, _broadcast(builder, opacity))
+
+    def falloff(self, row):
+        """dy of the row, and of its pixels alpha before it is capped, capped, and its mask."""
+        builder = self.builder
+        dy = builder.fsub(builder.sitofp(row, _FLOAT), self.y)
+        s = self.u_dx + _Lanes(builder, _broadcast(builder, builder.fmul(self.v, dy)))
+        t = builder.fmul(self.w, dy)
+        sigma = s.times(s, plus=_Lanes(builder, _broadcast(builder, builder.fmul(t, t))))
+        raw = self.opacity * _exp_of_negative(sigma)
+        capped = raw.where(raw.compare("<=", MAX_ALPHA), MAX_ALPHA)
+        return dy, raw, capped, raw.compare(">=", MIN_ALPHA)
+
+
+def _for_each_row(builder, rows, position, row_limit, body):
+    """Run `body(row)` for the rows in question for which `position` lies within `row_limit`."""
+    begin, end = rows
+    with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
+        limit = builder.load(builder.gep(row_limit, [loop.index]))
+        with builder.if_then(builder.icmp_signed("<=", position, limit)):
+            body(loop.index)
+
+
+@intrinsic
+def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
+    """Composite a splat over the rows begin..end of a tile; returns how many of them it filled.
+
+    state: [16, 5, 16] float32, per row the transmittance and the sums of red, green, blue and
+        depth. A pixel that lets nothing more pass carries its transmittance with a minus.
+    last: [16, 16] int32, position of the last contribution.
+    row_limit: [16] int32, set to -1 where a row is full.
+    splat: x and y relative to the centre of the tile's first pixel, u, v, w, opacity, red, green,
+        blue and depth.
+    """
+    signature = types.int64(
+        types.int64, types.int64, types.int32, state, last, row_limit, splat
+    )
+
+    def generate(context, builder, signature, arguments):
+        begin, end, position, state, last, row_limit, splat = arguments
+        splat = _Splat(builder, *cgutils.unpack_tuple(builder, splat))
+        state = _Rows(context, builder, signature.args[3], state, _FLOATS, 5)
+        last = _Rows(context, builder, signature.args[4], last, _INTS, 1)
+        limits = context.make_array(signature.args[5])(context, builder, row_limit).data
+        positions = _broadcast(builder, position, _INTS)
+        filled = cgutils.alloca_once_value(builder, ir.Constant(_LONG, 0))
+
+        def draw(row):
+            _, _, alpha, visible = splat.falloff(row)
+            alpha = alpha.where(visible, 0.0)
+            before = _Lanes(builder, state.load(row, 0))
+            after = alpha.times(0.0 - before, plus=before)
+            passing = after.compare(">", MIN_TRANSMITTANCE)
+            weight = (alpha * before).where(passing, 0.0)
+            closed = before.where(before.compare("<", 0.0), 0.0 - before)
+            state.store(row, 0, after.where(passing, closed).value)
+            for index, channel in enumerate(splat.channels, start=1):
+                total = weight.times(channel, plus=_Lanes(builder, state.load(row, index)))
+                state.store(row, index, total.value)
+            contributes = builder.and_(visible, passing)
+            last.store(row, 0, builder.select(contributes, positions, last.load(row, 0)))
+
+            any_passing = builder.bitcast(passing, ir.IntType(TILE))
+            none = builder.icmp_unsigned("==", any_passing, ir.Constant(ir.IntType(TILE), 0))
+            with builder.if_then(none, likely=False):
+                builder.store(ir.Constant(_INT, -1), builder.gep(limits, [row]))
+                builder.store(builder.add(builder.load(filled), ir.Constant(_LONG, 1)), filled)
+
+        _for_each_row(builder, (begin, end), position, limits, draw)
+        return builder.load(filled)
+
+    return signature, generate
+
+
+def _undraw(wanted):
+    """An intrinsic that takes a splat off a tile again, back to front.
+
+    `wanted` names what it sums up for the gradients: "nothing", "opacity" or "all".
+    """
+
+    @intrinsic
+    def undraw_rows(typing, begin, end, position, state, last, row_limit, sums, splat):
+        """Walk back over the rows begin..end of a splat.
+
+        state: [16, 7, 16] float32, per row the transmittance behind the splat, the sum behind it
+            of weight times gradient, and dL/d of red, green, blue, depth sum and alpha.
+        last, row_limit: as filled by the forward pass; a row's limit is the largest of its last.
+        sums: [16] float32, the first ten of which receive the sums over the pixels of q, q dx,
+            q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha) and of weight times dL/d depth, red,
+            green and blue.
+        """
+        signature = types.void(
+            types.int64,
+            types.int64,
+            types.int32,
+            state,
+            last,
+            row_limit,
+            sums,
+            splat,
+        )
+
+        def generate(context, builder, signature, arguments):
+            begin, end, position, state, last, row_limit, sums, splat = arguments
+            splat = _Splat(builder, *cgutils.unpack_tuple(builder, splat))
+            state = _Rows(context, builder, signature.args[3], state, _FLOATS, 7)
+            last = _Rows(context, builder, signature.args[4], last, _INTS, 1)
+            limits = context.make_array(signature.args[5])(context, builder, row_limit).data
+            positions = _broadcast(builder, position, _INTS)
+            count = {"nothing": 0, "opacity": 1, "all": 7}[wanted]
+            totals = [
+                cgutils.alloca_once_value(builder, ir.Constant(_FLOATS, [0.0] * TILE))
+                for _ in range(count)
+            ]
+
+            def undraw(row):
+                dy, raw, alpha, visible = splat.falloff(row)
+                reached = builder.icmp_signed("<=", positions, last.load(row, 0))
+                contributes = builder.and_(visible, reached)
+                alpha = alpha.where(contributes, 0.0)
+                slopes = [_Lanes(builder, state.load(row, index)) for index in range(2, 7)]
+                behind = _Lanes(builder, state.load(row, 1))
+
+                opening = 1.0 / (1.0 - alpha)
+                before = _Lanes(builder, state.load(row, 0)) * opening
+                weight = alpha * before
+                value = slopes[4]
+                for channel, slope in zip(splat.channels, slopes[:4], strict=True):
+                    value = channel.times(slope, plus=value)
+                state.store(row, 0, before.value)
+                state.store(row, 1, weight.times(value, plus=behind).value)
+                if wanted == "nothing":
+                    return
+
+                q = (before * value - behind * opening) * alpha
+                q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
+                terms = [q]
+                if wanted == "all":
+                    dys = _Lanes(builder, _broadcast(builder, dy))
+                    terms += [q * dys, q * dys * dys]
+                    terms += [weight * slopes[index] for index in (3, 0, 1, 2)]
+                for total, term in zip(totals, terms, strict=True):
+                    value = _Lanes(builder, builder.load(total)) + term
+                    builder.store(value.value, total)
+
+            _for_each_row(builder, (begin, end), position, limits, undraw)
+
+            columns = [_Lanes(builder, builder.load(total)) for total in totals]
+            if wanted == "all":
+                q, q_dy, q_dy2 = columns[:3]
+                moments = [q, q * splat.dx, q_dy, q * splat.dx * splat.dx, q_dy * splat.dx, q_dy2]
+                columns = moments + columns[3:]
+            if wanted != "nothing":
+                out = _Rows(context, builder, signature.args[6], sums, _FLOATS, 1)
+                out.store(ir.Constant(_LONG, 0), 0, _sums_of_lanes(builder, columns))
+            return context.get_dummy_value()
+
+        return signature, generate
+
+    return undraw_rows
+
+
+_pass_rows = _undraw("nothing")
+_undraw_rows_for_opacity = _undraw("opacity")
+_undraw_rows = _undraw("all")
+
+
+@intrinsic
+def _bits_of(typing, value):
+    """The bits of a float32 as an unsigned integer; for positive numbers they sort alike."""
+    return types.uint32(types.float32), lambda context, builder, signature, arguments: (
+        builder.bitcast(arguments[0], _INT)
+    )
+
+
+# ---- 3 × 3 matrices as tuples of nine, row by row ---------------------------------------------
+
+
+@njit(cache=True, fastmath={"contract"})
+def _product(a, b):
+    return (
+        a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
+        a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
+        a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
+        a[3] * b[0] + a[4] * b[3] + a[5] * b[6],
+        a[3] * b[1] + a[4] * b[4] + a[5] * b[7],
+        a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
+        a[6] * b[0] + a[7] * b[3] + a[8] * b[6],
+        a[6] * b[1] + a[7] * b[4] + a[8] * b[7],
+        a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
+    )
+
+
+@njit(cache=True, fastmath={"contract"})
+def _transposed(a):
+    return (a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8])
+
+
+@njit(cache=True, fastmath={"contract"})
+def _applied(a, x, y, z):
+    return (
+        a[0] * x + a[1] * y + a[2] * z,
+        a[3] * x + a[4] * y + a[5] * z,
+        a[6] * x + a[7] * y + a[8] * z,
+    )
+
+
+@njit(cache=True)
+def _matrix(array):
+    return (
+        array[0, 0],
+        array[0, 1],
+        array[0, 2],
+        array[1, 0],
+        array[1, 1],
+        array[1, 2],
+        array[2, 0],
+        array[2, 1],
+        array[2, 2],
+    )
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _unit(quats, i):
+    """Quaternion i brought to length 1, and the factor that did it."""
+    w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+    factor = np.float32(1) / math.sqrt(w * w + x * x + y * y + z * z)
+    return w * factor, x * factor, y * factor, z * factor, factor
+
+
+@njit(cache=True, fastmath={"contract"})
+def _rotation(w, x, y, z):
+    one, two = np.float32(1), np.float32(2)
+    return (
+        one - two * (y * y + z * z),
+        two * (x * y - w * z),
+        two * (x * z + w * y),
+        two * (x * y + w * z),
+        one - two * (x * x + z * z),
+        two * (y * z - w * x),
+        two * (x * z - w * y),
+        two * (y * z + w * x),
+        one - two * (x * x + y * y),
+    )
+
+
+@njit(cache=True, fastmath={"contract"})
+def _rotation_backward(w, x, y, z, d):
+    """Gradient of the unit quaternion from that of its rotation matrix."""
+    two = np.float32(2)
+    return (
+        two * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
+        two * (y * (d[1] + d[3]) + z * (d[2] + d[6]) + w * (d[7] - d[5]) - two * x * (d[4] + d[8])),
+        two * (x * (d[1] + d[3]) + z * (d[5] + d[7]) + w * (d[2] - d[6]) - two * y * (d[0] + d[8])),
+        two * (x * (d[2] + d[6]) + y * (d[5] + d[7]) + w * (d[3] - d[1]) - two * z * (d[0] + d[4])),
+    )
+
+
+@njit(cache=True, fastmath={"contract"})
+def _scaled_columns(a, x, y, z):
+    return (
+        a[0] * x,
+        a[1] * y,
+        a[2] * z,
+        a[3] * x,
+        a[4] * y,
+        a[5] * z,
+        a[6] * x,
+        a[7] * y,
+        a[8] * z,
+    )
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _tangent_limits(pinhole):
+    """Least and largest x/z, and the same of y/z, that the Jacobian is evaluated at."""
+    fx, fy, cx, cy = pinhole.intrinsics
+    width, height = np.float32(pinhole.width), np.float32(pinhole.height)
+    margin_x, margin_y = TANGENT_MARGIN * width, TANGENT_MARGIN * height
+    return (
+        -(cx + margin_x) / fx,
+        (width - cx + margin_x) / fx,
+        -(cy + margin_y) / fy,
+        (height - cy + margin_y) / fy,
+    )
+
+
+@njit(cache=True, fastmath={"contract"})
+def _flattened(axes, jacobian):
+    """The Gaussian's axes (columns, in the camera) seen in the image: a 2 × 3 matrix, by rows.
+
+    jacobian: d pixel x / dx, d pixel x / dz, d pixel y / dy, d pixel y / dz.
+    """
+    xx, xz, yy, yz = jacobian
+    return (
+        xx * axes[0] + xz * axes[6],
+        xx * axes[1] + xz * axes[7],
+        xx * axes[2] + xz * axes[8],
+        yy * axes[3] + yz * axes[6],
+        yy * axes[4] + yz * axes[7],
+        yy * axes[5] + yz * axes[8],
+    )
+
+
+# ---- View-dependent colour -----------------------------------------------------------------------
+
+# Spherical harmonics in the basis and with the signs of 3DGS, see render/spherical_harmonics.py.
+_C0, _C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
+_C2XY, _C2Z, _C2XX = (
+    np.float32(value) for value in (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+)
+_C3A, _C3XYZ, _C3B, _C3Z, _C3XX = (
+    np.float32(value)
+    for value in (
+        0.5900435899266435,
+        2.890611442640554,
+        0.4570457994644658,
+        0.3731763325901154,
+        1.445305721320277,
+    )
+)
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _direction(center, means, i):
+    """Unit vector from the camera centre to the mean, and their inverse distance."""
+    x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
+    inverse = np.float32(1) / math.sqrt(x * x + y * y + z * z)
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
+@njit(cache=True, fastmath={"contract"})
+def _evaluate_basis(x, y, z, basis):
+    """Fill `basis`, of length 1, 4, 9 or 16, for a unit direction."""
+    two, three, four = np.float32(2), np.float32(3), np.float32(4)
+    xx, yy, zz = x * x, y * y, z * z
+    basis[0] = _C0
+    if len(basis) >= 4:
+        basis[1], basis[2], basis[3] = -_C1 * y, _C1 * z, -_C1 * x
+    if len(basis) >= 9:
+        basis[4] = _C2XY * x * y
+        basis[5] = -_C2XY * y * z
+        basis[6] = _C2Z * (two * zz - xx - yy)
+        basis[7] = -_C2XY * x * z
+        basis[8] = _C2XX * (xx - yy)
+    if len(basis) >= 16:
+        basis[9] = -_C3A * y * (three * xx - yy)
+        basis[10] = _C3XYZ * x * y * z
+        basis[11] = -_C3B * y * (four * zz - xx - yy)
+        basis[12] = _C3Z * z * (two * zz - three * xx - three * yy)
+        basis[13] = -_C3B * x * (four * zz - xx - yy)
+        basis[14] = _C3XX * z * (xx - yy)
+        basis[15] = -_C3A * x * (xx - three * yy)
+
+
+@njit(cache=True, fastmath={"contract"})
+def _basis_slope(x, y, z, g):
+    """Gradient with respect to the direction of the sum of g[k] times basis function k."""
+    two, three, four = np.float32(2), np.float32(3), np.float32(4)
+    six, eight = np.float32(6), np.float32(8)
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    dx = dy = dz = np.float32(0)
+    if len(g) >= 4:
+        dx -= _C1 * g[3]
+        dy -= _C1 * g[1]
+        dz += _C1 * g[2]
+    if len(g) >= 9:
+        dx += _C2XY * (y * g[4] - z * g[7]) + two * x * (_C2XX * g[8] - _C2Z * g[6])
+        dy += _C2XY * (x * g[4] - z * g[5]) - two * y * (_C2XX * g[8] + _C2Z * g[6])
+        dz += four * _C2Z * z * g[6] - _C2XY * (y * g[5] + x * g[7])
+    if len(g) >= 16:
+        dx += _C3XYZ * yz * g[10] - six * _C3Z * xz * g[12] + two * _C3XX * xz * g[14]
+        dx += _C3B * (two * xy * g[11] - (four * zz - three * xx - yy) * g[13])
+        dx -= _C3A * (six * xy * g[9] + three * (xx - yy) * g[15])
+        dy += _C3XYZ * xz * g[10] - six * _C3Z * yz * g[12] - two * _C3XX * yz * g[14]
+        dy += _C3B * (two * xy * g[13] - (four * zz - xx - three * yy) * g[11])
+        dy += _C3A * (six * xy * g[15] - three * (xx - yy) * g[9])
+        dz += _C3XYZ * xy * g[10] + three * _C3Z * (two * zz - xx - yy) * g[12]
+        dz += _C3XX * (xx - yy) * g[14] - eight * _C3B * (yz * g[11] + xz * g[13])
+    return dx, dy, dz
+
+
+# ---- From Gaussians to lists of splats ----------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def project(begin, end, gaussians, pinhole, splats, boxes):
+    """Project the Gaussians begin..end; those that cannot be seen get an empty box.
+
+    gaussians: GaussianArrays of n. splats [n, 9] float32 and boxes [n, 4] int32 are written. The
+    box encloses the pixels where the alpha of a splat of this opacity reaches 1/255.
+    """
+    means, quats, scales, opacities, sh = gaussians
+    center, near = pinhole.center, pinhole.near
+    view = _matrix(pinhole.rotation)
+    fx, fy, cx, cy = pinhole.intrinsics
+    least_x, largest_x, least_y, largest_y = _tangent_limits(pinhole)
+    width, height = np.float32(pinhole.width), np.float32(pinhole.height)
+    basis = np.empty(sh.shape[1], np.float32)
+    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    root_half = np.float32(math.sqrt(0.5))
+    for i in range(begin, end):
+        boxes[i, 0] = boxes[i, 1] = boxes[i, 2] = boxes[i, 3] = 0
+        x, y, z = _applied(
+            view,
+            means[i, 0] - center[0],
+            means[i, 1] - center[1],
+            means[i, 2] - center[2],
+        )
+        # Conditions are written so that NaN fails them.
+        if not (z > near and z < np.inf and opacities[i] >= MIN_ALPHA):
+            continue
+        inverse_z = one / z
+        tan_x, tan_y = x * inverse_z, y * inverse_z
+        slope_x, slope_y = fx * inverse_z, fy * inverse_z
+        clamped_x = min(max(tan_x, least_x), largest_x)
+        clamped_y = min(max(tan_y, least_y), largest_y)
+        qw, qx, qy, qz, _ = _unit(quats, i)
+        axes = _scaled_columns(
+            _product(view, _rotation(qw, qx, qy, qz)), scales[i, 0], scales[i, 1], scales[i, 2]
+        )
+        flat = _flattened(axes, (slope_x, -slope_x * clamped_x, slope_y, -slope_y * clamped_y))
+
+        # The determinant of F Fᵀ + blur is summed from squares: nothing cancels, however thin
+        # the splat is. In double precision nothing overflows either.
+        a0, a1, a2 = np.float64(flat[0]), np.float64(flat[1]), np.float64(flat[2])
+        b0, b1, b2 = np.float64(flat[3]), np.float64(flat[4]), np.float64(flat[5])
+        aa = a0 * a0 + a1 * a1 + a2 * a2
+        bb = b0 * b0 + b1 * b1 + b2 * b2
+        ab = a0 * b0 + a1 * b1 + a2 * b2
+        c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+        determinant = c0 * c0 + c1 * c1 + c2 * c2 + BLUR * (aa + bb) + BLUR * BLUR
+        if not determinant < np.inf:
+            continue
+        deviation_x = np.float32(math.sqrt(aa + BLUR))
+        deviation_y = np.float32(math.sqrt(bb + BLUR))
+
+        center_x, center_y = fx * tan_x + cx, fy * tan_y + cy
+        sigmas = math.sqrt(np.float32(2) * math.log(opacities[i] / MIN_ALPHA)) + np.float32(1e-3)
+        radius_x, radius_y = sigmas * deviation_x, sigmas * deviation_y
+        left = max(math.ceil(center_x - radius_x - half), zero)
+        right = min(math.floor(center_x + radius_x + half), width)
+        top = max(math.ceil(center_y - radius_y - half), zero)
+        bottom = min(math.floor(center_y + radius_y + half), height)
+        if not (left < right and top < bottom):
+            continue
+        boxes[i, 0], boxes[i, 1] = np.int32(left), np.int32(right)
+        boxes[i, 2], boxes[i, 3] = np.int32(top), np.int32(bottom)
+        u = root_half * deviation_y / np.float32(math.sqrt(determinant))
+        splats[i, X], splats[i, Y] = center_x, center_y
+        splats[i, U] = u
+        splats[i, V] = -u * np.float32(ab / (bb + BLUR))
+        splats[i, W] = root_half / deviation_y
+        splats[i, DEPTH] = z
+
+        direction_x, direction_y, direction_z, _ = _direction(center, means, i)
+        _evaluate_basis(direction_x, direction_y, direction_z, basis)
+        for channel in range(3):
+            colour = half
+            for k in range(len(basis)):
+                colour += basis[k] * sh[i, k, channel]
+            splats[i, RED + channel] = max(colour, zero)
+
+
+@njit(cache=True, nogil=True)
+def depth_order(splats, boxes):
+    """The splats with a box, front to back; of equals the first comes first.
+
+    A radix sort of the depths' bits, 11 at a time. The near plane keeps depths positive.
+    Returns their indices [m] int32 and their depths [m] float32.
+    """
+    digits, mask = 2048, np.uint32(2047)
+    visible = 0
+    for i in range(len(boxes)):
+        if boxes[i, 0] < boxes[i, 1]:
+            visible += 1
+    order = np.empty(visible, np.int32)
+    keys = np.empty(visible, np.uint32)
+    histograms = np.zeros((3, digits), np.int64)
+    count = 0
+    for i in range(len(boxes)):
+        if boxes[i, 0] < boxes[i, 1]:
+            key = _bits_of(splats[i, DEPTH])
+            order[count], keys[count] = i, key
+            count += 1
+            for step in range(3):
+                histograms[step, (key >> np.uint32(11 * step)) & mask] += 1
+
+    other_order, other_keys = np.empty_like(order), np.empty_like(keys)
+    for step in range(3):
+        shift = np.uint32(11 * step)
+        start = 0
+        for digit in range(digits):
+            size = histograms[step, digit]
+            histograms[step, digit] = start
+            start += size
+        for i in range(visible):
+            key = keys[i]
+            digit = (key >> shift) & mask
+            place = histograms[step, digit]
+            histograms[step, digit] = place + 1
+            other_order[place], other_keys[place] = order[i], key
+        order, other_order = other_order, order
+        keys, other_keys = other_keys, keys
+    return order, keys.view(np.float32)
+
+
+@njit(cache=True, nogil=True)
+def count_entries(
+    begin, end, order, depths, boxes, depth_limits, tiles_x, rectangles, sizes, counts
+):
+    """Count how many of the splats order[begin:end] touch each tile, and vice versa.
+
+    order [m], depths [m]: as `depth_order` returns them. boxes [n, 4].
+    depth_limits [tiles] float32: behind it, nothing is seen in the tile.
+    rectangles [m, 4] int16 receives the tiles of each splat: x from, x to, y from, y to
+        (excluded). sizes [n] int32 receives the number of lists each splat gets into.
+    counts [tiles] int32 is added to.
+    """
+    for rank in range(begin, end):
+        i = order[rank]
+        left, right = boxes[i, 0] >> TILE_SHIFT, ((boxes[i, 1] - 1) >> TILE_SHIFT) + 1
+        top, bottom = boxes[i, 2] >> TILE_SHIFT, ((boxes[i, 3] - 1) >> TILE_SHIFT) + 1
+        rectangles[rank, 0], rectangles[rank, 1] = left, right
+        rectangles[rank, 2], rectangles[rank, 3] = top, bottom
+        size = 0
+        for tile_y in range(top, bottom):
+            for tile in range(tile_y * tiles_x + left, tile_y * tiles_x + right):
+                if depths[rank] <= depth_limits[tile]:
+                    counts[tile] += 1
+                    size += 1
+        sizes[i] = size
+
+
+@njit(cache=True, nogil=True)
+def places_of(counts):
+    """Turn counts into places: `counts` [chunks, tiles] becomes where each chunk's part of each
+    list starts; returns where the lists start [tiles + 1] int64."""
+    chunks, tiles = counts.shape
+    tile_start = np.empty(tiles + 1, np.int64)
+    place = 0
+    for tile in range(tiles):
+        tile_start[tile] = place
+        for chunk in range(chunks):
+            size = counts[chunk, tile]
+            counts[chunk, tile] = place
+            place += size
+    tile_start[tiles] = place
+    return tile_start
+
+
+@njit(cache=True, nogil=True)
+def fill_entries(
+    begin, end, order, depths, depth_limits, tiles_x, rectangles, slot_start, places, entries, slots
+):
+    """Enter the splats order[begin:end] into the lists of the tiles they touch.
+
+    order, depths, depth_limits and rectangles as in `count_entries`.
+    slot_start [n + 1] int64: slots number the entries splat by splat, so that the gradients of a
+        splat lie together whatever tiles they come from.
+    places [tiles] int32: where the next entry of each tile goes; counted up.
+    entries [e] int32 receives the index of the splat, and slots [e] int32 its slot.
+    """
+    for rank in range(begin, end):
+        slot = slot_start[order[rank]]
+        left, right = rectangles[rank, 0], rectangles[rank, 1]
+        for tile_y in range(rectangles[rank, 2], rectangles[rank, 3]):
+            for tile in range(tile_y * tiles_x + left, tile_y * tiles_x + right):
+                if depths[rank] <= depth_limits[tile]:
+                    place = places[tile]
+                    places[tile] = place + 1
+                    entries[place] = order[rank]
+                    slots[place] = slot
+                    slot += 1
+
+
+@njit(cache=True, nogil=True)
+def truncated(layer, used, full):
+    """The lists of a layer as far as they were walked, and how far each tile can be seen.
+
+    What was not reached without anything in front of it is not reached with something in front.
+    Returns tile_start [tiles + 1] int64, entries [e] int32 and depth limits [tiles] float32.
+    """
+    splats, _, _, old_start, old_entries = layer
+    tiles = len(used)
+    tile_start = np.empty(tiles + 1, np.int64)
+    tile_start[0] = 0
+    for tile in range(tiles):
+        tile_start[tile + 1] = tile_start[tile] + used[tile]
+    entries = np.empty(tile_start[tiles], np.int32)
+    depth_limits = np.full(tiles, np.inf, np.float32)
+    for tile in range(tiles):
+        start, source = tile_start[tile], old_start[tile]
+        for k in range(used[tile]):
+            entries[start + k] = old_entries[source + k]
+        if full[tile] and used[tile] > 0:
+            depth_limits[tile] = splats[entries[start + used[tile] - 1], DEPTH]
+    return tile_start, entries, depth_limits
+
+
+# ---- Compositing ---------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def _aligned(size):
+    """An array of float32 that starts at a cache line, so that no vector straddles two."""
+    buffer = np.empty(size + TILE, np.float32)
+    start = (-buffer.ctypes.data % 64) // 4
+    return buffer[start : start + size]
+
+
+@njit(cache=True, fastmath={"contract"})
+def _placed(splats, opacities, boxes, i, left, top):
+    """Rows of the tile at (left, top) that splat i touches, and the splat relative to the tile."""
+    half = np.float32(0.5)
+    return (
+        max(np.int64(boxes[i, 2]) - top, 0),
+        min(np.int64(boxes[i, 3]) - top, TILE),
+        (
+            splats[i, X] - np.float32(left) - half,
+            splats[i, Y] - np.float32(top) - half,
+            splats[i, U],
+            splats[i, V],
+            splats[i, W],
+            opacities[i],
+            splats[i, RED],
+            splats[i, GREEN],
+            splats[i, BLUE],
+            splats[i, DEPTH],
+        ),
+    )
+
+
+@njit(cache=True)
+def _depth_at(splats, entries, place, begin, end, beyond):
+    """Depth of an entry, or `beyond` where the place lies outside of begin..end."""
+    if place < begin or place >= end:
+        return beyond
+    return splats[entries[place], DEPTH]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def composite(begin, end, context, new, frame):
+    """Draw the tiles begin..end of two layers merged by depth; of equals the context is in front.
+
+    context, new: Layer. frame: Frame, of which these tiles are written.
+    """
+    # Taking an array out of a tuple counts references, which must not happen in the loops.
+    c_splats, c_opacities, c_boxes, c_start, c_entries = context
+    n_splats, n_opacities, n_boxes, n_start, n_entries = new
+    image, depths, alphas, transmittances, lasts, used, full = frame
+    height, width = alphas.shape
+    tiles_x = (width + TILE - 1) // TILE
+    state = _aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
+    last = np.empty((TILE, TILE), np.int32)
+    row_limit = np.empty(TILE, np.int32)
+    infinity = np.float32(np.inf)
+    for tile in range(begin, end):
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        rows, columns = min(TILE, height - top), min(TILE, width - left)
+        state[:] = 0
+        state[:, 0, :columns] = 1
+        # Pixels beyond the border of the image are full from the start.
+        state[:, 0, columns:] = -1
+        last[:] = -1
+        row_limit[:] = np.iinfo(np.int32).max
+        open_rows = rows
+
+        c_begin, c_end = c_start[tile], c_start[tile + 1]
+        n_begin, n_end = n_start[tile], n_start[tile + 1]
+        c, n = c_begin, n_begin
+        c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
+        n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+        while open_rows > 0 and (c < c_end or n < n_end):
+            position = np.int32(c - c_begin + n - n_begin)
+            if c_depth <= n_depth:
+                first, stop, splat = _placed(
+                    c_splats, c_opacities, c_boxes, c_entries[c], left, top
+                )
+                c += 1
+                c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
+            else:
+                first, stop, splat = _placed(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+                n += 1
+                n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+            open_rows -= _draw_rows(first, stop, position, state, last, row_limit, splat)
+
+        used[tile, 0], used[tile, 1] = c - c_begin, n - n_begin
+        full[tile] = open_rows == 0
+        for row in range(rows):
+            for column in range(columns):
+                transmittance = abs(state[row, 0, column])
+                alpha = np.float32(1) - transmittance
+                y, x = top + row, left + column
+                for channel in range(3):
+                    image[y, x, channel] = state[row, 1 + channel, column]
+                depths[y, x] = state[row, 4, column] / alpha if alpha > 0 else np.float32(0)
+                alphas[y, x] = alpha
+                transmittances[y, x] = transmittance
+                lasts[y, x] = last[row, column]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def composite_backward(
+    begin,
+    end,
+    context,
+    new,
+    frame,
+    d_image,
+    d_depth,
+    d_alpha,
+    slots,
+    opacity_only,
+    gradients,
+    written,
+):
+    """Walk the tiles begin..end back to front and sum up the gradients of the new layer's entries.
+
+    d_image [h, w, 3], d_depth [h, w], d_alpha [h, w]: gradients of the frame.
+    slots [e] int32: slot of each entry of `new`.
+    gradients [slots, 10] float32, or [slots, 1] where `opacity_only`: columns SUM to SUM_RED + 2.
+    written [slots] bool: set for the slots, and only those, that receive a gradient.
+    """
+    c_splats, c_opacities, c_boxes, c_start, c_entries = context
+    n_splats, n_opacities, n_boxes, n_start, n_entries = new
+    _, depths, alphas, transmittances, lasts, used, _ = frame
+    height, width = alphas.shape
+    tiles_x = (width + TILE - 1) // TILE
+    state = _aligned(TILE * 7 * TILE).reshape((TILE, 7, TILE))
+    last = np.empty((TILE, TILE), np.int32)
+    row_limit = np.empty(TILE, np.int32)
+    sums = np.zeros(TILE, np.float32)
+    nothing = np.float32(-np.inf)
+    for tile in range(begin, end):
+        n_begin = n_start[tile]
+        n = n_begin + used[tile, 1]
+        if n == n_begin:
+            continue
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        rows, columns = min(TILE, height - top), min(TILE, width - left)
+        state[:] = 0
+        last[:] = -1
+        row_limit[:] = -1
+        for row in range(rows):
+            for column in range(columns):
+                y, x = top + row, left + column
+                alpha = alphas[y, x]
+                d_depth_sum = d_depth[y, x] / alpha if alpha > 0 else np.float32(0)
+                state[row, 0, column] = transmittances[y, x]
+                for channel in range(3):
+                    state[row, 2 + channel, column] = d_image[y, x, channel]
+                state[row, 5, column] = d_depth_sum
+                state[row, 6, column] = d_alpha[y, x] - d_depth_sum * depths[y, x]
+                last[row, column] = lasts[y, x]
+                row_limit[row] = max(row_limit[row], last[row, column])
+
+        c_begin = c_start[tile]
+        c = c_begin + used[tile, 0]
+        c_depth = _depth_at(c_splats, c_entries, c - 1, c_begin, c, nothing)
+        n_depth = _depth_at(n_splats, n_entries, n - 1, n_begin, n, nothing)
+        while n > n_begin:
+            position = np.int32(c - c_begin + n - n_begin - 1)
+            if c_depth > n_depth:
+                c -= 1
+                first, stop, splat = _placed(
+                    c_splats, c_opacities, c_boxes, c_entries[c], left, top
+                )
+                c_depth = _depth_at(c_splats, c_entries, c - 1, c_begin, c, nothing)
+                _pass_rows(first, stop, position, state, last, row_limit, sums, splat)
+                continue
+            n -= 1
+            first, stop, splat = _placed(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+            n_depth = _depth_at(n_splats, n_entries, n - 1, n_begin, n, nothing)
+            slot = slots[n]
+            written[slot] = True
+            if opacity_only:
+                _undraw_rows_for_opacity(first, stop, position, state, last, row_limit, sums, splat)
+                gradients[slot, SUM] = sums[0]
+                continue
+            _undraw_rows(first, stop, position, state, last, row_limit, sums, splat)
+            u, v, w = splat[2], splat[3], splat[4]
+            x, y, xx, xy, yy = sums[1], sums[2], sums[3], sums[4], sums[5]
+            gradients[slot, SUM] = sums[0]
+            gradients[slot, SUM_S] = u * x + v * y
+            gradients[slot, SUM_T] = w * y
+            gradients[slot, SUM_SS] = u * (u * xx + v * xy) + v * (u * xy + v * yy)
+            gradients[slot, SUM_ST] = w * (u * xy + v * yy)
+            gradients[slot, SUM_TT] = w * w * yy
+            for channel in range(4):
+                gradients[slot, SUM_DEPTH + channel] = sums[6 + channel]
+
+
+# ---- From gradients of entries to gradients of Gaussians ---------------------------------------
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def opacity_backward(begin, end, opacities, slot_start, gradients, written, d_opacities):
+    """Gradients of the opacities of the Gaussians begin..end.
+
+    gradients [slots, 1] float32: column SUM of their entries, where written [slots].
+    d_opacities [n] is written where a gradient arrives.
+    """
+    for i in range(begin, end):
+        total = np.float32(0)
+        for slot in range(slot_start[i], slot_start[i + 1]):
+            if written[slot]:
+                total += gradients[slot, SUM]
+        if total != 0:
+            d_opacities[i] = total / opacities[i]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def project_backward(
+    begin, end, gaussians, pinhole, splats, slot_start, gradients, written, slopes
+):
+    """Gradients of the Gaussians begin..end from those of their entries in the tiles.
+
+    gaussians, pinhole, splats: as in `project`.
+    gradients [slots, 10] float32, where written [slots]: the slots from slot_start[i] to
+        slot_start[i + 1] belong to Gaussian i.
+    slopes: GaussianArrays of gradients, written where one arrives.
+    """
+    means, quats, scales, opacities, sh = gaussians
+    d_means, d_quats, d_scales, d_opacities, d_sh = slopes
+    center = pinhole.center
+    view = _matrix(pinhole.rotation)
+    from_view = _transposed(view)
+    fx, fy = pinhole.intrinsics[0], pinhole.intrinsics[1]
+    least_x, largest_x, least_y, largest_y = _tangent_limits(pinhole)
+    one, two, four = np.float32(1), np.float32(2), np.float32(4)
+    sums = np.empty(NUM_GRADIENT_COLUMNS, np.float32)
+    basis, d_basis = np.empty(sh.shape[1], np.float32), np.empty(sh.shape[1], np.float32)
+    for i in range(begin, end):
+        any_written = False
+        sums[:] = 0
+        for slot in range(slot_start[i], slot_start[i + 1]):
+            if written[slot]:
+                any_written = True
+                for column in range(NUM_GRADIENT_COLUMNS):
+                    sums[column] += gradients[slot, column]
+        if not any_written:
+            continue
+
+        d_opacities[i] = sums[SUM] / opacities[i]
+
+        # Colour, which is cut off at zero
+        direction_x, direction_y, direction_z, inverse_distance = _direction(center, means, i)
+        _evaluate_basis(direction_x, direction_y, direction_z, basis)
+        d_basis[:] = 0
+        for channel in range(3):
+            if splats[i, RED + channel] > 0:
+                d_colour = sums[SUM_RED + channel]
+                for k in range(len(basis)):
+                    d_sh[i, k, channel] = d_colour * basis[k]
+                    d_basis[k] += d_colour * sh[i, k, channel]
+        d_dx, d_dy, d_dz = _basis_slope(direction_x, direction_y, direction_z, d_basis)
+        radial = direction_x * d_dx + direction_y * d_dy + direction_z * d_dz
+
+        x, y, z = _applied(
+            view,
+            means[i, 0] - center[0],
+            means[i, 1] - center[1],
+            means[i, 2] - center[2],
+        )
+        inverse_z = one / z
+        tan_x, tan_y = x * inverse_z, y * inverse_z
+        slope_x, slope_y = fx * inverse_z, fy * inverse_z
+        clamped_x = min(max(tan_x, least_x), largest_x)
+        clamped_y = min(max(tan_y, least_y), largest_y)
+        qw, qx, qy, qz, unit_factor = _unit(quats, i)
+        rotation = _product(view, _rotation(qw, qx, qy, qz))
+        axes = _scaled_columns(rotation, scales[i, 0], scales[i, 1], scales[i, 2])
+        jacobian = (slope_x, -slope_x * clamped_x, slope_y, -slope_y * clamped_y)
+        flat = _flattened(axes, jacobian)
+
+        # dL/dΣ = 2 Uᵀ Q U with Q = [[ss, st], [st, tt]], and Σ = F Fᵀ: dL/dF = 4 Uᵀ Q (U F).
+        u, v, w = splats[i, U], splats[i, V], splats[i, W]
+        ss, st, tt = sums[SUM_SS], sums[SUM_ST], sums[SUM_TT]
+        s0 = u * flat[0] + v * flat[3]
+        s1 = u * flat[1] + v * flat[4]
+        s2 = u * flat[2] + v * flat[5]
+        t0, t1, t2 = w * flat[3], w * flat[4], w * flat[5]
+        a0, a1, a2 = ss * s0 + st * t0, ss * s1 + st * t1, ss * s2 + st * t2
+        b0, b1, b2 = st * s0 + tt * t0, st * s1 + tt * t1, st * s2 + tt * t2
+        d_x0, d_x1, d_x2 = four * u * a0, four * u * a1, four * u * a2
+        d_y0 = four * (v * a0 + w * b0)
+        d_y1 = four * (v * a1 + w * b1)
+        d_y2 = four * (v * a2 + w * b2)
+
+        # F = J axes
+        xx, xz, yy, yz = jacobian
+        d_xx = d_x0 * axes[0] + d_x1 * axes[1] + d_x2 * axes[2]
+        d_xz = d_x0 * axes[6] + d_x1 * axes[7] + d_x2 * axes[8]
+        d_yy = d_y0 * axes[3] + d_y1 * axes[4] + d_y2 * axes[5]
+        d_yz = d_y0 * axes[6] + d_y1 * axes[7] + d_y2 * axes[8]
+        d_axes = (
+            xx * d_x0,
+            xx * d_x1,
+            xx * d_x2,
+            yy * d_y0,
+            yy * d_y1,
+            yy * d_y2,
+            xz * d_x0 + yz * d_y0,
+            xz * d_x1 + yz * d_y1,
+            xz * d_x2 + yz * d_y2,
+        )
+
+        # axes = rotation diag(scales), rotation = view R(quat)
+        for k in range(3):
+            d_scales[i, k] = (
+                d_axes[k] * rotation[k]
+                + d_axes[3 + k] * rotation[3 + k]
+                + d_axes[6 + k] * rotation[6 + k]
+            )
+        d_rotation = _product(
+            from_view, _scaled_columns(d_axes, scales[i, 0], scales[i, 1], scales[i, 2])
+        )
+        d_qw, d_qx, d_qy, d_qz = _rotation_backward(qw, qx, qy, qz, d_rotation)
+        along = qw * d_qw + qx * d_qx + qy * d_qy + qz * d_qz
+        d_quats[i, 0] = (d_qw - qw * along) * unit_factor
+        d_quats[i, 1] = (d_qx - qx * along) * unit_factor
+        d_quats[i, 2] = (d_qy - qy * along) * unit_factor
+        d_quats[i, 3] = (d_qz - qz * along) * unit_factor
+
+        # J and the centre of the splat depend on the mean. A clamped tangent does not.
+        d_tan_x = two * fx * u * sums[SUM_S]
+        d_tan_y = two * fy * (v * sums[SUM_S] + w * sums[SUM_T])
+        if clamped_x == tan_x:
+            d_tan_x -= d_xz * slope_x
+        if clamped_y == tan_y:
+            d_tan_y -= d_yz * slope_y
+        d_z = sums[SUM_DEPTH] - (d_xx * xx + d_xz * xz + d_yy * yy + d_yz * yz) * inverse_z
+        d_z -= (d_tan_x * tan_x + d_tan_y * tan_y) * inverse_z
+        d_x, d_y, d_z = _applied(from_view, d_tan_x * inverse_z, d_tan_y * inverse_z, d_z)
+        d_means[i, 0] = d_x + (d_dx - direction_x * radial) * inverse_distance
+        d_means[i, 1] = d_y + (d_dy - direction_y * radial) * inverse_distance
+        d_means[i, 2] = d_z + (d_dz - direction_z * radial) * inverse_distance

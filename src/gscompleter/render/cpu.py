@@ -1,0 +1,343 @@
+"""Draws on CPUs through compiled kernels, fast enough to optimise with."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int32, Int64
+from numpy import ndarray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gscompleter.kernels import rasterizer
+from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
+from gscompleter.render import OpacityRender
+from gscompleter.types import Camera, Gaussians, Render
+
+PIECES_PER_THREAD = 4
+"""Tiles take unequally long; more pieces than threads even that out."""
+
+
+@dataclass(frozen=True)
+class CpuRenderer:
+    """Draws in float32; other dtypes are converted. The same input gives the same bytes."""
+
+    threads: int | None = None
+    """Threads to draw with; None takes NUMBA_NUM_THREADS, which is the number of usable cores
+    where it is not set. The result does not depend on it."""
+
+    def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        viewpoint = self._viewpoint(camera)
+        return CpuView(viewpoint, viewpoint.nothing(), viewpoint.unlimited()).composite(gaussians)
+
+    def freeze(self, context: Gaussians, camera: Camera) -> CpuView:
+        return self._viewpoint(camera).freeze(context)
+
+    def _viewpoint(self, camera: Camera) -> Viewpoint:
+        threads = self.threads or numba.config.NUMBA_NUM_THREADS
+        return Viewpoint(pinhole_of(camera), threads)
+
+
+@dataclass(frozen=True)
+class CpuView:
+    """The frozen context: projected, sorted, binned, and cut where nothing shows through it."""
+
+    viewpoint: Viewpoint
+    layer: Layer
+    depth_limits: Float32[ndarray, "tiles"]
+    """z-depth behind which a tile shows nothing new."""
+
+    @cached_property
+    def context(self) -> Render:
+        """The context alone."""
+        return render_of(self.viewpoint.composite(self.viewpoint.nothing(), self.layer))
+
+    def composite(self, new: Gaussians) -> Render:
+        """Context and `new` together; only `new` is projected, sorted and binned."""
+        tensors = (new.means, new.quats, new.scales, new.opacities, new.sh)
+        return Render(*_Composite.apply(self, *(t.to("cpu", torch.float32) for t in tensors)))
+
+    def plan(self, new: Gaussians) -> OpacityRender:
+        """Project, sort and bin `new` once, with boxes that hold for every opacity."""
+        opaque = replace(new, opacities=torch.ones_like(new.opacities))
+        binned = self.viewpoint.bin(arrays_of(opaque), self.depth_limits)
+
+        def render(opacities: Float[Tensor, "n"]) -> Render:
+            return Render(*_Planned.apply(self, binned, opacities.to("cpu", torch.float32)))
+
+        return render
+
+
+@dataclass(frozen=True)
+class Binned:
+    """Splats in the lists of the tiles they touch, and the way back to their Gaussians."""
+
+    layer: Layer
+    slots: Int32[ndarray, "entries"]
+    """Where the gradient of each entry of the lists goes."""
+    slot_start: Int64[ndarray, "bounds"]
+    """Where the gradients of each Gaussian start, and the end [n + 1]."""
+
+
+@dataclass(frozen=True)
+class EntryGradients:
+    """Gradients of the entries of the tiles' lists, by slot."""
+
+    values: Float32[ndarray, "entries columns"]
+    written: Bool[ndarray, "entries"]
+    """Which of the values hold something."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera and the threads that draw for it: calls the kernels in their order."""
+
+    pinhole: Pinhole
+    threads: int
+
+    @property
+    def tiles_x(self) -> int:
+        return -(-self.pinhole.width // TILE)
+
+    @property
+    def tiles(self) -> int:
+        return self.tiles_x * -(-self.pinhole.height // TILE)
+
+    def nothing(self) -> Layer:
+        """A layer without splats."""
+        return Layer(
+            np.empty((0, rasterizer.NUM_SPLAT_COLUMNS), np.float32),
+            np.empty(0, np.float32),
+            np.empty((0, 4), np.int32),
+            np.zeros(self.tiles + 1, np.int64),
+            np.empty(0, np.int32),
+        )
+
+    def unlimited(self) -> Float32[ndarray, "tiles"]:
+        """Depth limits of tiles in which nothing hides what comes behind."""
+        return np.full(self.tiles, np.inf, np.float32)
+
+    def freeze(self, context: Gaussians) -> CpuView:
+        """The context's part of every picture that will be taken from here."""
+        layer = self.bin(arrays_of(context), self.unlimited()).layer
+        frame = self.composite(self.nothing(), layer)
+        used = np.ascontiguousarray(frame.used[:, 1])
+        tile_start, entries, depth_limits = rasterizer.truncated(layer, used, frame.full)
+        return CpuView(self, layer._replace(tile_start=tile_start, entries=entries), depth_limits)
+
+    def bin(self, gaussians: GaussianArrays, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
+        """Project the Gaussians, sort them and enter them into the lists of the tiles."""
+        n = len(gaussians.means)
+        splats = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
+        boxes = np.empty((n, 4), np.int32)
+        self.share(rasterizer.project, n, gaussians, self.pinhole, splats, boxes)
+        order, depths = rasterizer.depth_order(splats, boxes)
+
+        chunks = ranges(len(order), self.threads)
+        rectangles = np.empty((len(order), 4), np.int16)
+        sizes = np.zeros(n, np.int32)
+        counts = np.zeros((len(chunks), self.tiles), np.int32)
+        seen = (order, depths, boxes, depth_limits, self.tiles_x, rectangles, sizes)
+        run(
+            self.threads,
+            rasterizer.count_entries,
+            [(*chunk, *seen, count) for chunk, count in zip(chunks, counts, strict=True)],
+        )
+        slot_start = np.zeros(n + 1, np.int64)
+        np.cumsum(sizes, out=slot_start[1:])
+        tile_start = rasterizer.places_of(counts)
+        entries, slots = np.empty(tile_start[-1], np.int32), np.empty(tile_start[-1], np.int32)
+        seen = (order, depths, depth_limits, self.tiles_x, rectangles, slot_start)
+        run(
+            self.threads,
+            rasterizer.fill_entries,
+            [
+                (*chunk, *seen, places, entries, slots)
+                for chunk, places in zip(chunks, counts, strict=True)
+            ],
+        )
+        layer = Layer(splats, gaussians.opacities, boxes, tile_start, entries)
+        return Binned(layer, slots, slot_start)
+
+    def composite(self, context: Layer, new: Layer) -> Frame:
+        """Draw two layers merged by depth."""
+        size = (self.pinhole.height, self.pinhole.width)
+        frame = Frame(
+            image=np.empty((*size, 3), np.float32),
+            depth=np.empty(size, np.float32),
+            alpha=np.empty(size, np.float32),
+            transmittance=np.empty(size, np.float32),
+            last=np.empty(size, np.int32),
+            used=np.empty((self.tiles, 2), np.int32),
+            full=np.empty(self.tiles, np.bool_),
+        )
+        self.share(rasterizer.composite, self.tiles, context, new, frame)
+        return frame
+
+    def composite_backward(
+        self,
+        context: Layer,
+        new: Binned,
+        frame: Frame,
+        slopes: tuple[Tensor, ...],
+        columns: int = rasterizer.NUM_GRADIENT_COLUMNS,
+    ) -> EntryGradients:
+        """Gradients of the entries of the new layer from those of image, depth and alpha.
+
+        One column is enough where only opacities are wanted.
+        """
+        gradients = EntryGradients(
+            np.empty((len(new.slots), columns), np.float32), np.zeros(len(new.slots), np.bool_)
+        )
+        self.share(
+            rasterizer.composite_backward,
+            self.tiles,
+            context,
+            new.layer,
+            frame,
+            *map(float32, slopes),
+            new.slots,
+            columns == 1,
+            gradients.values,
+            gradients.written,
+        )
+        return gradients
+
+    def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
+        """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time."""
+        pieces = ranges(count, self.threads * PIECES_PER_THREAD if self.threads > 1 else 1)
+        run(self.threads, kernel, [(*piece, *arguments) for piece in pieces])
+
+
+class _Composite(torch.autograd.Function):
+    """Image, depth and alpha of a frozen context with new Gaussians in it."""
+
+    @staticmethod
+    def forward(ctx: Any, view: CpuView, *tensors: Tensor) -> tuple[Tensor, ...]:
+        gaussians = GaussianArrays(*map(float32, tensors))
+        binned = view.viewpoint.bin(gaussians, view.depth_limits)
+        frame = view.viewpoint.composite(view.layer, binned.layer)
+        render = render_of(frame)
+        ctx.scene = (view, binned, frame)
+        # Saving tensors makes torch notice if one of them is written to before the backward pass.
+        ctx.save_for_backward(*tensors, render.depth, render.alpha)
+        return render.image, render.depth, render.alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        view, binned, frame = ctx.scene
+        gaussians = GaussianArrays(*map(float32, ctx.saved_tensors[:5]))
+        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, slopes)
+        result = GaussianArrays(*map(np.zeros_like, gaussians))
+        view.viewpoint.share(
+            rasterizer.project_backward,
+            len(gaussians.means),
+            gaussians,
+            view.viewpoint.pinhole,
+            binned.layer.splats,
+            binned.slot_start,
+            gradients.values,
+            gradients.written,
+            result,
+        )
+        return None, *map(torch.from_numpy, result)
+
+
+class _Planned(torch.autograd.Function):
+    """The same where only opacities change: nothing is projected, sorted or binned."""
+
+    @staticmethod
+    def forward(ctx: Any, view: CpuView, binned: Binned, opacities: Tensor) -> tuple[Tensor, ...]:
+        layer = binned.layer._replace(opacities=float32(opacities))
+        frame = view.viewpoint.composite(view.layer, layer)
+        render = render_of(frame)
+        ctx.scene = (view, replace(binned, layer=layer), frame)
+        ctx.save_for_backward(opacities, render.depth, render.alpha)
+        return render.image, render.depth, render.alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        view, binned, frame = ctx.scene
+        opacities = float32(ctx.saved_tensors[0])
+        gradients = view.viewpoint.composite_backward(
+            view.layer, binned, frame, slopes, columns=1
+        )
+        result = np.zeros_like(opacities)
+        view.viewpoint.share(
+            rasterizer.opacity_backward,
+            len(opacities),
+            opacities,
+            binned.slot_start,
+            gradients.values,
+            gradients.written,
+            result,
+        )
+        return None, None, torch.from_numpy(result)
+
+
+def pinhole_of(camera: Camera) -> Pinhole:
+    """The camera as the kernels want it."""
+    K = camera.K.detach().to("cpu", torch.float64)
+    c2w = camera.c2w.detach().to("cpu", torch.float64)
+    return Pinhole(
+        rotation=float32(torch.linalg.inv(c2w[:3, :3])),
+        center=float32(c2w[:3, 3]),
+        intrinsics=float32(torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])),
+        near=np.float32(max(camera.near_plane, 0.0)),
+        width=camera.width,
+        height=camera.height,
+    )
+
+
+def arrays_of(gaussians: Gaussians) -> GaussianArrays:
+    """The Gaussians as the kernels want them, without gradients."""
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    return GaussianArrays(*map(float32, tensors), float32(gaussians.sh))
+
+
+def render_of(frame: Frame) -> Render:
+    """The frame as tensors, which share its memory."""
+    return Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))
+
+
+def float32(values: Tensor) -> Float32[ndarray, "..."]:
+    """The values of a tensor as a contiguous array, not copied where they are one already."""
+    return values.detach().to("cpu", torch.float32).contiguous().numpy()
+
+
+def ranges(count: int, pieces: int) -> list[tuple[int, int]]:
+    """range(count) cut into at most `pieces` contiguous pieces of about equal length."""
+    pieces = max(1, min(pieces, count))
+    bounds = [count * piece // pieces for piece in range(pieces + 1)]
+    return list(zip(bounds[:-1], bounds[1:], strict=True))
+
+
+def run(threads: int, kernel: Callable[..., None], calls: list[tuple[Any, ...]]) -> None:
+    """Run a kernel, which releases the interpreter lock, on several threads.
+
+    They are threads of our own and not those of numba: its OpenMP layer spins where cores are
+    scarce and meddles with torch's, and its other layer does not bear two callers at once.
+    """
+    if threads == 1 or len(calls) == 1:
+        for arguments in calls:
+            kernel(*arguments)
+        return
+    pool = thread_pool(threads, os.getpid())
+    for future in [pool.submit(kernel, *arguments) for arguments in calls]:
+        future.result()
+
+
+@lru_cache(maxsize=8)
+def thread_pool(threads: int, process: int) -> ThreadPoolExecutor:
+    """Threads that wait for work. A forked process inherits none and asks for its own."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="gscompleter")
