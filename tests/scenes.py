@@ -109,9 +109,7 @@ def random_gaussians(n: int, seed: int = 0, sh_degree: int = 0) -> Gaussians:
     def uniform(*shape: int) -> Tensor:
         return torch.rand(shape, generator=generator)
 
-    means = torch.stack(
-        [uniform(n) * 4 - 2, uniform(n) * 4 - 2, uniform(n) * 4 + 1], dim=-1
-    )
+    means = torch.stack([uniform(n) * 4 - 2, uniform(n) * 4 - 2, uniform(n) * 4 + 1], dim=-1)
     return observed(
         means=means,
         quats=torch.randn(n, 4, generator=generator),

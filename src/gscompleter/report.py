@@ -128,7 +128,7 @@ def write_report(
         completion, views, targets, context_images, target_images, settings, seed, device
     )
     save_ply(folder / "context.ply", completion.context)
-    save_ply(folder / "completed.ply", completion.scene)
+    save_ply(folder / "completed.ply", completion.scene, provenance=True)
     (folder / "images").mkdir()
     for number, (result, images) in enumerate(zip(completion.targets, target_images, strict=True)):
         for name, image in pictures(result, images).items():

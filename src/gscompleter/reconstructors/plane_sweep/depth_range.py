@@ -62,7 +62,7 @@ def triangulated(frames: Sequence[Frame]) -> Float[np.ndarray, "n"]:
     return np.concatenate(found)
 
 
-Features = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]
+Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
 
 
 def _features(frame: Frame) -> Features:

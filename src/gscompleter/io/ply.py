@@ -1,0 +1,394 @@
+"""Our reader and writer of 3D Gaussian scenes in PLY files.
+
+Written: the standard 3DGS layout (binary little-endian float32: x y z nx ny nz f_dc_* f_rest_*
+opacity scale_* rot_*), then `uchar generated`. Read: the same properties in any order, type and byte
+order, ASCII too, among other properties and elements. Inside the file scales are logarithms,
+opacities logits, and f_rest_* runs through all coefficients of red, then green, then blue.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.io.files import replacing
+from gscompleter.types import Gaussians
+
+_SCALARS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+_MEANS = ("x", "y", "z")
+_NORMALS = ("nx", "ny", "nz")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+_NEEDED = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
+_NUM_REST = (0, 9, 24, 45)
+"""f_rest_* properties of spherical harmonics of degree 0 to 3."""
+
+_MAX_LOGIT = 30.0
+"""Opacities of 0 are written as this logit, negated; 1 as the largest finite one in float32."""
+
+
+# ------------------------------------------------------------------------------------- header
+
+
+@dataclass(frozen=True)
+class Property:
+    """One property of an element."""
+
+    name: str
+    kind: str
+    """numpy's name of the type, without byte order."""
+    count_kind: str | None = None
+    """Type of the count, for a list property."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element: a table with a row for each of its members."""
+
+    name: str
+    count: int
+    properties: list[Property] = field(default_factory=list)
+
+    def dtype(self, byte_order: str) -> np.dtype:
+        """One row of a binary file; the element must hold no lists."""
+        return np.dtype([(p.name, byte_order + p.kind) for p in self.properties])
+
+    @property
+    def has_lists(self) -> bool:
+        return any(p.count_kind is not None for p in self.properties)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a PLY file says of itself."""
+
+    format: str
+    elements: list[Element]
+
+
+def read_header(file: BinaryIO, path: Path) -> Header:
+    """The header; `file` is left at the first byte of the data.
+
+    Raises:
+        InputError: where this is not a PLY file, or its header is broken.
+    """
+    first = file.readline(512)
+    if first.startswith(b"version https://git-lfs"):
+        raise InputError(
+            f"{path} is a git-lfs pointer, not the scene itself; run `git lfs pull` in its "
+            "repository to fetch it."
+        )
+    if not first:
+        raise InputError(f"{path} is empty; a 3DGS .ply is needed.")
+    if first.strip() != b"ply":
+        raise InputError(f"{path} is not a PLY file (it does not begin with 'ply').")
+
+    file_format, elements = None, []
+    while True:
+        line = file.readline(4096)
+        if not line.endswith(b"\n"):
+            raise InputError(f"{path} is truncated: its header has no end; fetch the file again.")
+        words = line.decode("latin-1").split()
+        if words == ["end_header"]:
+            break
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        try:
+            if words[0] == "format":
+                file_format = words[1]
+            elif words[0] == "element":
+                elements.append(Element(words[1], int(words[2])))
+            elif words[0] == "property":
+                elements[-1].properties.append(_property(words[1:]))
+            else:
+                raise ValueError
+        except (IndexError, KeyError, ValueError) as error:
+            raise InputError(
+                f"{path} has a broken header: {' '.join(words)!r} means nothing; write it anew."
+            ) from error
+    if file_format not in _BYTE_ORDERS:
+        raise InputError(
+            f"{path} has the PLY format {file_format!r}; ascii, binary_little_endian and "
+            "binary_big_endian are known."
+        )
+    return Header(file_format, elements)
+
+
+def _property(words: list[str]) -> Property:
+    if words[0] == "list":
+        return Property(words[3], _SCALARS[words[2]], _SCALARS[words[1]])
+    return Property(words[1], _SCALARS[words[0]])
+
+
+# --------------------------------------------------------------------------------------- data
+
+
+def _read_vertices(file: BinaryIO, header: Header, vertex: Element, path: Path) -> np.ndarray:
+    """The rows of `vertex` as a structured array, whatever stands before it skipped."""
+    ahead = header.elements[: header.elements.index(vertex)]
+    if header.format == "ascii":
+        return _ascii_vertices(file, ahead, vertex, path)
+    byte_order = _BYTE_ORDERS[header.format]
+    for element in ahead:
+        _skip(file, element, byte_order, path)
+    dtype = vertex.dtype(byte_order)
+    remaining = path.stat().st_size - file.tell()
+    if remaining < vertex.count * dtype.itemsize:
+        raise _truncated(path, remaining // dtype.itemsize, vertex.count)
+    return np.fromfile(file, dtype, vertex.count)
+
+
+def _skip(file: BinaryIO, element: Element, byte_order: str, path: Path) -> None:
+    if not element.has_lists:
+        file.seek(element.count * element.dtype(byte_order).itemsize, io.SEEK_CUR)
+        return
+    for row in range(element.count):
+        for prop in element.properties:
+            length = 1
+            if prop.count_kind is not None:
+                size = np.dtype(prop.count_kind).itemsize
+                counted = file.read(size)
+                if len(counted) < size:
+                    raise _truncated(path, row, element.count, element.name)
+                length = int(np.frombuffer(counted, byte_order + prop.count_kind)[0])
+            file.seek(length * np.dtype(prop.kind).itemsize, io.SEEK_CUR)
+
+
+def _ascii_vertices(
+    file: BinaryIO, ahead: list[Element], vertex: Element, path: Path
+) -> np.ndarray:
+    lines = (line for line in file if line.strip())
+    for _ in range(sum(element.count for element in ahead)):
+        next(lines, None)
+    rows = [line.split() for _, line in zip(range(vertex.count), lines, strict=False)]
+    width = len(vertex.properties)
+    if len(rows) < vertex.count or (rows and len(rows[-1]) < width):
+        whole = len(rows) - (1 if rows and len(rows[-1]) < width else 0)
+        raise _truncated(path, whole, vertex.count)
+    try:
+        table = np.array(rows, dtype=np.float64).reshape(vertex.count, width)
+    except ValueError as error:
+        raise InputError(
+            f"{path} holds rows that are not {width} numbers each; write it anew."
+        ) from error
+    vertices = np.empty(vertex.count, vertex.dtype("="))
+    for column, prop in enumerate(vertex.properties):
+        vertices[prop.name] = table[:, column]
+    return vertices
+
+
+def _truncated(path: Path, found: int, expected: int, what: str = "Gaussian") -> InputError:
+    return InputError(
+        f"{path} is truncated: {found:,} of {expected:,} {what}s are there; fetch or write the "
+        "file again."
+    )
+
+
+# --------------------------------------------------------------------------------------- load
+
+
+def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
+    """The Gaussians of a 3DGS .ply, of SH degree 0 to 3.
+
+    Args:
+        path: The file.
+        drop_nonfinite: Leave out Gaussians that hold NaN or infinity, or a rotation of zeros,
+            instead of refusing the file.
+
+    Raises:
+        InputError: no such file, not a PLY, truncated, empty, not 3DGS, or with damaged values.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            header = read_header(file, path)
+            vertex = _gaussian_element(header, path)
+            vertices = _read_vertices(file, header, vertex, path)
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror}.") from error
+    return _whole(_gaussians(vertices, vertex), path, drop_nonfinite)
+
+
+def _gaussian_element(header: Header, path: Path) -> Element:
+    """The vertex element, once it is known to hold Gaussians."""
+    found = {element.name: element for element in header.elements}
+    vertex = found.get("vertex")
+    if vertex is None:
+        raise InputError(f"{path} has no vertices; a 3DGS .ply is needed.")
+    names = [p.name for p in vertex.properties]
+    if "chunk" in found or "packed_position" in names:
+        raise InputError(
+            f"{path} is a compressed PLY; convert it to a standard 3DGS .ply first, for example "
+            "with SuperSplat or splat-transform."
+        )
+    missing = [name for name in _NEEDED if name not in names]
+    if missing:
+        raise InputError(
+            f"{path} is not a 3DGS scene but a mesh or point cloud: it lacks {', '.join(missing)}."
+        )
+    if len(set(names)) < len(names) or vertex.has_lists:
+        raise InputError(
+            f"{path} has a broken header: a property of its vertices is a list or named twice."
+        )
+    num_rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
+    if num_rest not in _NUM_REST or any(f"f_rest_{i}" not in names for i in range(num_rest)):
+        raise InputError(
+            f"{path} has {num_rest} properties f_rest_*; spherical harmonics of degree 0 to 3 "
+            "have 0, 9, 24 or 45, numbered from 0."
+        )
+    if vertex.count == 0:
+        raise InputError(f"{path} is empty: it holds no Gaussian.")
+    return vertex
+
+
+def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
+    def columns(names: tuple[str, ...]) -> Float[Tensor, "n c"]:
+        table = np.empty((len(vertices), len(names)), np.float32)
+        for column, name in enumerate(names):
+            # A double beyond the range of float32 becomes infinite, and is counted as such.
+            with np.errstate(over="ignore"):
+                table[:, column] = vertices[name]
+        return torch.from_numpy(table)
+
+    names = {p.name for p in vertex.properties}
+    num_rest = sum(name.startswith("f_rest_") for name in names)
+    rest = columns(tuple(f"f_rest_{i}" for i in range(num_rest)))
+    rest = rest.view(len(vertices), 3, num_rest // 3).transpose(1, 2)
+    encoded = columns((*_SCALES, "opacity"))
+    generated = np.zeros(len(vertices), np.uint8)
+    if "generated" in names:
+        generated = vertices["generated"].astype(np.uint8)
+    return Gaussians(
+        means=columns(_MEANS),
+        quats=columns(_QUATS),
+        scales=_decoded_scales(encoded),
+        opacities=_decoded_opacities(encoded),
+        sh=torch.cat([columns(_DC)[:, None], rest], dim=1).contiguous(),
+        generated=torch.from_numpy(generated),
+        encoded=encoded,
+    )
+
+
+def _whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
+    """`gaussians` where every value can be drawn."""
+    assert gaussians.encoded is not None
+    good = torch.isfinite(gaussians.encoded).all(1) & torch.isfinite(gaussians.means).all(1)
+    good &= torch.isfinite(gaussians.sh).flatten(1).all(1) & torch.isfinite(gaussians.scales).all(1)
+    good &= torch.isfinite(gaussians.quats).all(1) & (gaussians.quats != 0).any(1)
+    bad = int((~good).sum())
+    if bad == 0:
+        return gaussians
+    if not drop_nonfinite:
+        raise InputError(
+            f"{path} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a rotation of "
+            "zeros; mend it, or go on without them by --drop-nonfinite."
+        )
+    if bad == len(good):
+        raise InputError(f"{path} holds no Gaussian without NaN or infinity; write it anew.")
+    return gaussians[good]
+
+
+def _decoded_scales(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
+    return encoded[:, :3].double().exp().float()
+
+
+def _decoded_opacities(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
+    return encoded[:, 3].double().sigmoid().float()
+
+
+# --------------------------------------------------------------------------------------- save
+
+
+def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
+    """Log-scales and logit opacities as they go into a file, always finite.
+
+    Values that came from a file are used again wherever they still stand for what is in memory.
+    """
+    tiny = torch.finfo(torch.float32).tiny
+    scales = gaussians.scales.double().clamp_min(tiny).log()
+    # The largest float32 below 1 has a logit of 16.6; a larger one could not be read back.
+    opacities = gaussians.opacities.double().clamp(0, 1 - 2**-24).logit()
+    anew = torch.cat([scales, opacities.clamp_min(-_MAX_LOGIT)[:, None]], dim=1).float()
+    if gaussians.encoded is None:
+        return anew
+    held = gaussians.encoded
+    same_scales = _decoded_scales(held) == gaussians.scales
+    same_opacities = _decoded_opacities(held) == gaussians.opacities
+    same = torch.cat([same_scales, same_opacities[:, None]], dim=1)
+    return torch.where(same & held.isfinite(), held, anew)
+
+
+def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = None) -> None:
+    """Write a standard 3DGS .ply, with `uchar generated` behind the standard properties.
+
+    Nothing is left under `path` unless all of it was written.
+
+    Args:
+        path: The file.
+        gaussians: What it is to hold.
+        provenance: Whether to write `generated`; by default, where anything was generated. Some
+            readers (gsply 0.4 is one) take every property for a float and misread rows that end
+            in a byte; False gives them the plain layout.
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    if provenance is None:
+        provenance = bool((gaussians.generated > 0).any())
+    vertices = _vertices(gaussians.to("cpu"), provenance)
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    assert vertices.dtype.names is not None
+    lines += [f"property {kinds[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names]
+    header = "\n".join([*lines, "end_header", ""])
+    with replacing(path) as file:
+        file.write(header.encode("ascii"))
+        file.write(vertices.view(np.uint8).data)
+
+
+def _vertices(gaussians: Gaussians, provenance: bool) -> np.ndarray:
+    """One row per Gaussian in the order of the standard layout."""
+    num_rest = 3 * (gaussians.sh.shape[1] - 1)
+    rest = tuple(f"f_rest_{i}" for i in range(num_rest))
+    names = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
+    layout = [(name, "<f4") for name in names]
+    if provenance:
+        layout.append(("generated", "u1"))
+    vertices = np.zeros(len(gaussians), layout)
+
+    def put(columns: tuple[str, ...], values: Tensor) -> None:
+        table = values.detach().float().numpy()
+        for column, name in enumerate(columns):
+            vertices[name] = table[:, column]
+
+    encoded = encode(gaussians)
+    put(_MEANS, gaussians.means)
+    put(_DC, gaussians.sh[:, 0])
+    put(rest, gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), num_rest))
+    put(_SCALES, encoded[:, :3])
+    put(("opacity",), encoded[:, 3:])
+    put(_QUATS, gaussians.quats)
+    if provenance:
+        vertices["generated"] = gaussians.generated.numpy()
+    return vertices

@@ -1,0 +1,266 @@
+"""PLY scenes: exact round trips, foreign files, and a sentence for every damaged one."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+from gsply import plyread
+
+from gscompleter import Gaussians, InputError, load_ply, merge, save_ply
+from scenes import random_gaussians
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated", "encoded")
+
+
+def saved(tmp_path: Path, gaussians: Gaussians, name: str = "scene.ply") -> Path:
+    save_ply(tmp_path / name, gaussians)
+    return tmp_path / name
+
+
+def rewritten(path: Path, out: Path, **options) -> Path:
+    """The file as plyfile writes it with `options` (text, byte_order)."""
+    data = plyfile.PlyData.read(str(path))
+    plyfile.PlyData(list(data.elements), **options).write(str(out))
+    return out
+
+
+def same(a: Gaussians, b: Gaussians, fields=FIELDS) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in fields)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_file_written_read_and_written_again_has_the_same_bytes(tmp_path, degree):
+    first = saved(tmp_path, random_gaussians(500, sh_degree=degree))
+    again = saved(tmp_path, load_ply(first), "again.ply")
+    assert first.read_bytes() == again.read_bytes()
+    assert same(load_ply(first), load_ply(again))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_what_was_saved_is_loaded_exactly_where_the_file_holds_it_linearly(tmp_path, degree):
+    gaussians = random_gaussians(500, sh_degree=degree)
+    gaussians = replace(gaussians, generated=torch.arange(500).to(torch.uint8))
+    loaded = load_ply(saved(tmp_path, gaussians))
+    assert same(gaussians, loaded, ("means", "quats", "sh", "generated"))
+    assert torch.allclose(loaded.scales, gaussians.scales, rtol=1e-6)
+    assert torch.allclose(loaded.opacities, gaussians.opacities, rtol=1e-5)
+
+
+def test_any_bits_of_scale_and_opacity_survive_a_round_trip(tmp_path):
+    """exp and log, sigmoid and logit are no exact inverses in float32; the file's values stay."""
+    n = 4000
+    encoded = torch.randn(n, 4, generator=torch.Generator().manual_seed(0)) * 6
+    path = saved(tmp_path, random_gaussians(n))
+    data = plyfile.PlyData.read(str(path))
+    for column, name in enumerate(("scale_0", "scale_1", "scale_2", "opacity")):
+        data["vertex"][name] = encoded[:, column].numpy()
+    path = tmp_path / "any.ply"
+    data.write(str(path))
+    loaded = load_ply(path)
+    assert torch.equal(loaded.encoded, encoded)
+    assert saved(tmp_path, loaded, "again.ply").read_bytes() == path.read_bytes()
+
+
+def test_a_changed_opacity_is_written_and_not_the_one_the_file_held(tmp_path):
+    loaded = load_ply(saved(tmp_path, random_gaussians(50)))
+    changed = replace(loaded, opacities=loaded.opacities * 0.5)
+    again = load_ply(saved(tmp_path, changed, "again.ply"))
+    assert torch.allclose(again.opacities, 0.5 * loaded.opacities, rtol=1e-5)
+    assert torch.equal(again.scales, loaded.scales)
+
+
+def test_a_merged_scene_keeps_the_bits_of_the_part_that_was_loaded(tmp_path):
+    loaded = load_ply(saved(tmp_path, random_gaussians(50, sh_degree=3)))
+    whole = load_ply(saved(tmp_path, merge([loaded, random_gaussians(20, seed=1)]), "whole.ply"))
+    assert same(whole[:50], loaded)
+    assert len(whole) == 70
+
+
+def test_extreme_values_are_written_as_finite_ones(tmp_path):
+    gaussians = random_gaussians(3)
+    gaussians = replace(
+        gaussians, opacities=torch.tensor([0.0, 1.0, 0.5]), scales=torch.zeros(3, 3)
+    )
+    loaded = load_ply(saved(tmp_path, gaussians))
+    assert loaded.encoded.isfinite().all()
+    assert loaded.opacities[0] < 1e-12
+    assert loaded.opacities[1] > 0.9999999
+    assert (loaded.scales < 1e-37).all()
+
+
+def test_other_libraries_read_what_we_write(tmp_path):
+    gaussians = random_gaussians(200, sh_degree=3)
+    path = saved(tmp_path, gaussians)
+    vertex = plyfile.PlyData.read(str(path))["vertex"]
+    assert np.array_equal(vertex["x"], gaussians.means[:, 0].numpy())
+    assert np.array_equal(vertex["f_rest_0"], gaussians.sh[:, 1, 0].numpy())
+    assert np.array_equal(vertex["f_rest_15"], gaussians.sh[:, 1, 1].numpy())
+    assert np.allclose(vertex["scale_1"], gaussians.scales[:, 1].log().numpy(), atol=1e-6)
+    theirs = plyread(str(path))
+    assert np.array_equal(np.asarray(theirs.means), gaussians.means.numpy())
+    assert np.array_equal(np.asarray(theirs.quats), gaussians.quats.numpy())
+    assert np.allclose(np.asarray(theirs.scales), gaussians.scales.log().numpy(), atol=1e-6)
+
+
+def test_provenance_is_written_where_there_is_any_or_it_is_asked_for(tmp_path):
+    gaussians = random_gaussians(4)
+
+    def written(gaussians: Gaussians, **options) -> list[int] | None:
+        save_ply(tmp_path / "scene.ply", gaussians, **options)
+        vertex = plyfile.PlyData.read(str(tmp_path / "scene.ply"))["vertex"].data
+        return vertex["generated"].tolist() if "generated" in vertex.dtype.names else None
+
+    marked = replace(gaussians, generated=torch.tensor([0, 1, 255, 0], dtype=torch.uint8))
+    assert written(gaussians) is None
+    assert written(gaussians, provenance=True) == [0, 0, 0, 0]
+    assert written(marked) == [0, 1, 255, 0]
+    assert written(marked, provenance=False) is None
+
+
+@pytest.mark.parametrize(
+    "options", [{"byte_order": ">"}, {"byte_order": "<"}, {"text": True}], ids=str
+)
+def test_every_byte_order_and_ascii_are_read(tmp_path, options):
+    path = saved(tmp_path, random_gaussians(40, sh_degree=1))
+    assert same(load_ply(rewritten(path, tmp_path / "other.ply", **options)), load_ply(path))
+
+
+def foreign(path: Path, out: Path, byte_order: str = "<", text: bool = False) -> Path:
+    """The scene in doubles, shuffled, among other properties and elements, one of them of lists."""
+    vertex = plyfile.PlyData.read(str(path))["vertex"].data
+    names = [n for n in reversed(vertex.dtype.names) if not n.startswith("n")]
+    table = np.zeros(len(vertex), [("segment", "i2"), *((n, "f8") for n in names), ("r", "u1")])
+    for name in names:
+        table[name] = vertex[name]
+    faces = np.empty(2, [("vertex_indices", "O"), ("flag", "u1")])
+    faces["vertex_indices"] = [np.array([0, 1, 2], "i4"), np.array([3, 1, 2, 0], "i4")]
+    cameras = np.ones(3, [("focal", "f4")])
+    elements = [
+        plyfile.PlyElement.describe(faces, "face"),
+        plyfile.PlyElement.describe(cameras, "camera"),
+        plyfile.PlyElement.describe(table, "vertex", comments=["from elsewhere"]),
+    ]
+    plyfile.PlyData(elements, text=text, byte_order=byte_order, comments=["hello"]).write(str(out))
+    return out
+
+
+@pytest.mark.parametrize("options", [{}, {"byte_order": ">"}, {"text": True}], ids=str)
+def test_doubles_other_properties_and_elements_are_read(tmp_path, options):
+    path = saved(tmp_path, random_gaussians(40, sh_degree=2))
+    loaded = load_ply(foreign(path, tmp_path / "other.ply", **options))
+    assert same(loaded, load_ply(path))
+
+
+def test_a_header_with_windows_line_ends_is_read(tmp_path):
+    path = saved(tmp_path, random_gaussians(40))
+    head, mark, data = path.read_bytes().partition(b"end_header\n")
+    (tmp_path / "crlf.ply").write_bytes((head + mark).replace(b"\n", b"\r\n") + data)
+    assert same(load_ply(tmp_path / "crlf.ply"), load_ply(path))
+
+
+def refused(path: Path, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as error:
+        load_ply(path)
+    assert "\n" not in str(error.value)
+    assert path.name in str(error.value)
+
+
+def test_a_truncated_file_says_how_much_is_there(tmp_path):
+    path = saved(tmp_path, random_gaussians(100))
+    whole = path.read_bytes()
+    row = 17 * 4
+    path.write_bytes(whole[: -10 * row - 5])
+    refused(path, "truncated: 89 of 100 Gaussians")
+    path.write_bytes(whole[:60])
+    refused(path, "truncated: its header")
+    text = rewritten(saved(tmp_path, random_gaussians(5)), tmp_path / "text.ply", text=True)
+    text.write_bytes(b"\n".join(text.read_bytes().split(b"\n")[:-3]) + b"\n")
+    refused(text, "truncated: 3 of 5 Gaussians")
+
+
+def test_what_is_no_scene_is_refused(tmp_path):
+    refused(tmp_path / "nowhere.ply", "No such file")
+    (tmp_path / "folder.ply").mkdir()
+    refused(tmp_path / "folder.ply", "directory")
+    path = tmp_path / "scene.ply"
+    path.write_bytes(b"")
+    refused(path, "empty")
+    path.write_bytes(b"solid stl")
+    refused(path, "not a PLY")
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n")
+    refused(path, "git lfs pull")
+    path.write_text("ply\nformat ascii 1.0\nelement vertex many\nend_header\n")
+    refused(path, "broken header")
+    path.write_text("ply\nformat binary_middle_endian 1.0\nelement vertex 1\nend_header\n")
+    refused(path, "binary_middle_endian")
+
+
+def test_a_point_cloud_is_told_from_a_scene(tmp_path):
+    points = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4")])
+    path = tmp_path / "points.ply"
+    plyfile.PlyData([plyfile.PlyElement.describe(points, "vertex")]).write(str(path))
+    refused(path, "mesh or point cloud: it lacks f_dc_0")
+
+
+def test_a_wrong_number_of_harmonics_and_no_gaussians_are_refused(tmp_path):
+    path = saved(tmp_path, random_gaussians(3, sh_degree=1))
+    path.write_bytes(path.read_bytes().replace(b"f_rest_8", b"other_88"))
+    refused(path, "8 properties f_rest")
+    refused(saved(tmp_path, random_gaussians(3)[:0]), "holds no Gaussian")
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "sh"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_damaged_gaussians_are_counted_and_dropped_if_asked(tmp_path, name, value):
+    gaussians = random_gaussians(20)
+    getattr(gaussians, name)[:3].fill_(value)
+    path = saved(tmp_path, gaussians)
+    refused(path, "3 of 20 Gaussians .* --drop-nonfinite")
+    assert len(load_ply(path, drop_nonfinite=True)) == 17
+
+
+def test_rotations_of_zeros_count_as_damage(tmp_path):
+    gaussians = random_gaussians(20)
+    gaussians.quats[5] = 0
+    path = saved(tmp_path, gaussians)
+    refused(path, "1 of 20")
+    assert len(load_ply(path, drop_nonfinite=True)) == 19
+
+
+def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
+    path = saved(tmp_path, random_gaussians(5))
+    before = path.read_bytes()
+    code = (
+        "import resource, sys; sys.path.insert(0, 'tests')\n"
+        "from scenes import random_gaussians; from gscompleter import save_ply, InputError\n"
+        "gaussians = random_gaussians(5000)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
+        "try: save_ply(sys.argv[1], gaussians)\n"
+        "except InputError as error: print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=False
+    )
+    assert "Cannot write" in done.stdout, done.stderr
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == [path.name]
+    with pytest.raises(InputError, match="Cannot write"):
+        save_ply(tmp_path / "missing" / "scene.ply", random_gaussians(5))
+
+
+def test_community_files_are_read_or_refused(shared):
+    folder = shared / "formats"
+    guitar = folder / "gaussians" / "guitar.from-compressed.ply"
+    refused(guitar, "667 of 90,854 Gaussians")  # opaque ones, whose logit was written as infinity
+    assert len(load_ply(guitar, drop_nonfinite=True)) == 90_854 - 667
+    assert load_ply(folder / "gaussians" / "playbot_lod4.from-sog.ply").sh_degree > 0
+    with pytest.raises(InputError, match="compressed PLY"):
+        load_ply(folder / "gaussians" / "biker.compressed.ply")
+    for pointer in (folder / "lfs_pointers").glob("*.ply"):
+        refused(pointer, "git lfs pull")
