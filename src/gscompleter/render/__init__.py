@@ -50,8 +50,8 @@ class Renderer(Protocol):
     def freeze(self, context: Gaussians, camera: Camera) -> FrozenView: ...
 
 
-def load_renderer(name: Literal["reference", "cpu", "cuda"]) -> Renderer:
-    """The renderer called `name`.
+def load_renderer(name: str) -> Renderer:
+    """The renderer called `name`: reference, cpu or cuda.
 
     Raises:
         InputError: where the name is unknown, or `cuda` lacks a GPU or gsplat.

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numba
@@ -269,9 +270,7 @@ class _Planned(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
         opacities = float32(ctx.saved_tensors[0])
-        gradients = view.viewpoint.composite_backward(
-            view.layer, binned, frame, slopes, columns=1
-        )
+        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, slopes, columns=1)
         result = np.zeros_like(opacities)
         view.viewpoint.share(
             rasterizer.opacity_backward,
@@ -319,7 +318,7 @@ def ranges(count: int, pieces: int) -> list[tuple[int, int]]:
     """range(count) cut into at most `pieces` contiguous pieces of about equal length."""
     pieces = max(1, min(pieces, count))
     bounds = [count * piece // pieces for piece in range(pieces + 1)]
-    return list(zip(bounds[:-1], bounds[1:], strict=True))
+    return list(pairwise(bounds))
 
 
 def run(threads: int, kernel: Callable[..., None], calls: list[tuple[Any, ...]]) -> None:
