@@ -18,12 +18,14 @@ from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_ra
 from gscompleter.render import FrozenView, Renderer, load_renderer
 from gscompleter.stages.anchor import lift, select_anchor, synthesize
 from gscompleter.stages.context import depth_range_of_scene, init_context
+from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
     dilate,
     do_no_harm,
     error_with_loss,
     hole_mask,
     keep_in_holes,
+    keep_near_holes,
     refine_opacities,
     squared_error,
 )
@@ -150,6 +152,10 @@ class GSCompleter:
 
         with clock("lift"):
             lifted = lift(self.reconstructor, reference, anchor)
+            wide_holes = hole_mask(at_target.context, self.config.holes)
+            if self.config.holes.neighbourhood is not None:
+                near_holes = dilate(wide_holes, self.config.holes.neighbourhood)
+                lifted = keep_near_holes(lifted, near_holes)
 
         with clock("register"):
             registration = register(
@@ -168,6 +174,15 @@ class GSCompleter:
                 hole_mask(at_target.context, self.config.holes), self.config.holes.dilation
             )
             kept = keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide)
+            kept, placed = respect_free_space(
+                kept,
+                wide,
+                [view.camera for view in views],
+                renders,
+                self.config.registration.footprint,
+                self.config.free_space,
+            )
+            kept = kept[placed]
             kept = replace(kept, generated=torch.full_like(kept.generated, number))
             refined, refine_losses = self.refine(kept, at_target, reference, at_views, views)
             added = do_no_harm(refined, at_views, views, allowed_errors, self.config.harm)

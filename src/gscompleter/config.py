@@ -13,6 +13,7 @@ import yaml
 
 from gscompleter.errors import InputError
 from gscompleter.stages.anchor import AnchorConfig
+from gscompleter.stages.free_space import FreeSpaceConfig
 from gscompleter.stages.integration import HarmConfig, HoleConfig, RefineConfig
 from gscompleter.stages.registration import RegistrationConfig
 
@@ -32,6 +33,8 @@ class CompleterConfig:
     """Which photograph forms the stereo pair with the synthesized image."""
     registration: RegistrationConfig = RegistrationConfig()
     """How the lifted Gaussians are brought to the scene."""
+    free_space: FreeSpaceConfig = FreeSpaceConfig()
+    """How candidates keep out of space that photographs saw through."""
     holes: HoleConfig = HoleConfig()
     """What counts as a hole."""
     refine: RefineConfig = RefineConfig()
@@ -48,11 +51,14 @@ class CompleterConfig:
             registration=RegistrationConfig(
                 learning_rate=0.01,
                 step="literal",
+                rgb_weight=0.1,
                 depth_of="composite",
                 footprint="fixed",
                 mask_occluded=False,
                 carry_into_holes=False,
             ),
+            free_space=FreeSpaceConfig(num_steps=0),
+            holes=HoleConfig(neighbourhood=None),
             harm=HarmConfig(tolerance=None),
         )
 

@@ -17,9 +17,7 @@ def _hash(value):
 
 
 @njit(cache=True, fastmath=True)
-def _patch_cost(
-    image, weight, y, x, source, sy, sx, radius, max_bias, bias_penalty, bias
-):
+def _patch_cost(image, weight, y, x, source, sy, sx, radius, max_bias, bias_penalty, bias):
     """Mean squared difference of two patches after the best small shift of each colour channel.
 
     The shift is written to `bias`. Pixels of the patch outside of the image do not count.

@@ -282,9 +282,7 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
     splat: x and y relative to the centre of the tile's first pixel, u, v, w, opacity, red, green,
         blue and depth.
     """
-    signature = types.int64(
-        types.int64, types.int64, types.int32, state, last, row_limit, splat
-    )
+    signature = types.int64(types.int64, types.int64, types.int32, state, last, row_limit, splat)
 
     def generate(context, builder, signature, arguments):
         begin, end, position, state, last, row_limit, splat = arguments
@@ -418,9 +416,9 @@ _undraw_rows = _undraw("all")
 @intrinsic
 def _bits_of(typing, value):
     """The bits of a float32 as an unsigned integer; for positive numbers they sort alike."""
-    return types.uint32(types.float32), lambda context, builder, signature, arguments: (
-        builder.bitcast(arguments[0], _INT)
-    )
+    return types.uint32(
+        types.float32
+    ), lambda context, builder, signature, arguments: builder.bitcast(arguments[0], _INT)
 
 
 # ---- 3 × 3 matrices as tuples of nine, row by row ---------------------------------------------
@@ -930,7 +928,9 @@ def composite(begin, end, context, new, frame):
                 c += 1
                 c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
             else:
-                first, stop, splat = _placed(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+                first, stop, splat = _placed(
+                    n_splats, n_opacities, n_boxes, n_entries[n], left, top
+                )
                 n += 1
                 n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
             open_rows -= _draw_rows(first, stop, position, state, last, row_limit, splat)

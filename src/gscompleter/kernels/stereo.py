@@ -515,9 +515,7 @@ def _window(image, y, x, radius, contrast, weight, own, place):
 
 
 @njit(cache=True, fastmath=MATH)
-def _window_cost(
-    source, transform, px, py, depth, gx, gy, used, weight, own, place, energy, floor
-):
+def _window_cost(source, transform, px, py, depth, gx, gy, used, weight, own, place, energy, floor):
     """One minus the correlation of a window with the source, on a plane; negative off the image."""
     H, W = source.shape[:2]
     ratio = transform[2, 0] * px + transform[2, 1] * py + transform[2, 2]
@@ -568,9 +566,7 @@ def _window_cost(
             else:
                 s2 += a * value
     square = max(square - s0 * s0 - s1 * s1 - s2 * s2, np.float32(0))
-    return max(
-        np.float32(1) - cross / np.sqrt((square + floor) * (energy + floor)), np.float32(0)
-    )
+    return max(np.float32(1) - cross / np.sqrt((square + floor) * (energy + floor)), np.float32(0))
 
 
 @njit(cache=True, fastmath=MATH)

@@ -14,7 +14,7 @@ from torch import Tensor
 from gscompleter.geometry import inside, project
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, OpacityRender
-from gscompleter.types import Camera, Gaussians, Render, View
+from gscompleter.types import Camera, Gaussians, Lift, Render, View
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,9 @@ class HoleConfig:
     """τ of Eq. 10: a pixel that the scene covers by less is a hole."""
     dilation: int = 3
     """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
+    neighbourhood: int | None = 16
+    """Pixels around a hole within which candidates are registered. Those farther away neither
+    join the scene nor inform those that do. None registers all of them, as the paper does."""
 
 
 def hole_mask(render: Render, config: HoleConfig = HoleConfig()) -> Bool[Tensor, "h w"]:
@@ -51,6 +54,14 @@ def keep_in_holes(
     seen = inside(pixels, z, target)
     x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
     return registered[seen & mask[y, x]]
+
+
+def keep_near_holes(lift: Lift, near_holes: Bool[Tensor, "h w"]) -> Lift:
+    """The candidates of pixels in `near_holes`; all of them where their pixels are not known."""
+    if lift.pixel_index is None:
+        return lift
+    kept = near_holes.flatten()[lift.pixel_index]
+    return replace(lift, gaussians=lift.gaussians[kept], pixel_index=lift.pixel_index[kept])
 
 
 @dataclass(frozen=True)
@@ -111,7 +122,7 @@ def refine_opacities(
 
 @dataclass(frozen=True)
 class HarmConfig:
-    tolerance: float | None = 0.05
+    tolerance: float | None = 0.045
     """Largest loss of PSNR, in dB, that any context view may suffer; None checks nothing, as in
     the paper."""
     max_trials: int = 16
@@ -163,11 +174,16 @@ def do_no_harm(
 
 
 def most_harmful(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
-    """The fewest entries whose `relief` adds up to `needed`; all positive ones if they do not."""
+    """The fewest entries whose `relief` adds up to `needed`, or to half of all relief there is.
+
+    Relief is a promise of first order. Where it cannot be enough, the worst go first and the rest
+    are judged anew without them.
+    """
     order = relief.argsort(descending=True, stable=True)
-    before = relief[order].cumsum(0) - relief[order]
+    positive = relief[order].clamp_min(0)
+    enough = min(needed, positive.sum().item() / 2)
     chosen = torch.zeros_like(relief, dtype=torch.bool)
-    chosen[order] = (before < needed) & (relief[order] > 0)
+    chosen[order] = (positive.cumsum(0) - positive < enough) & (positive > 0)
     return chosen
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gscompleter.interpolation import fill_smoothly
@@ -35,8 +35,9 @@ class RegistrationConfig:
     """λ_d of Eq. 9."""
     stereo_weight: float = 1.0
     """λ_s of Eq. 9."""
-    rgb_weight: float = 0.1
-    """λ_c of Eq. 9."""
+    rgb_weight: float = 0.0
+    """λ_c of Eq. 9; 0.1 in the paper. With a constant footprint a primitive looks the same at the
+    target wherever it stands on its ray, and the term tells it nothing."""
     depth_of: Literal["candidates", "composite"] = "candidates"
     """What L_depth renders: the candidates alone, each of which then feels its own error; or, as
     in the paper, the scene with them, where those behind the context are hidden and stay wrong."""
@@ -48,6 +49,9 @@ class RegistrationConfig:
     context there. The paper's literal loss pulls it forward onto the context."""
     occlusion_tolerance: float = 0.05
     """How far behind the context, relative to depth, still counts as the same surface."""
+    carry_tolerance: float = 0.02
+    """Largest error of depth, relative to the scene's, of an observed pixel that is taken for an
+    example by the holes."""
     carry_into_holes: bool = True
     """Let pixels in a hole, where the scene has no depth to agree with, move like the observed
     ones around them, so that no step remains at the border. The paper leaves them to the affine."""
@@ -93,9 +97,8 @@ def register(
         coarse, at_target, at_anchor, reference, anchor, renderer, config
     )
     if config.carry_into_holes and config.degrees_of_freedom == 1 and lift.pixel_index is not None:
-        observed = at_target.context.depth_map().valid
         registered = carry_into_holes(
-            coarse, registered, lift.pixel_index, observed, reference.camera, config.footprint
+            coarse, registered, lift.pixel_index, at_target.context, reference.camera, config
         )
     return Registration(registered, affine, losses)
 
@@ -104,23 +107,29 @@ def carry_into_holes(
     coarse: Gaussians,
     registered: Gaussians,
     pixel_index: Int[Tensor, "n"],
-    observed: Bool[Tensor, "h w"],
+    at_target: Render,
     camera: Camera,
-    footprint: Literal["constant", "fixed"],
+    config: RegistrationConfig,
 ) -> Gaussians:
-    """`registered` with the shifts of the observed pixels continued smoothly into the holes.
+    """`registered`, where those in a hole moved like the well registered ones around them.
 
-    What is continued is the logarithm of d' / d, the correction each ray received.
+    What is continued smoothly is the logarithm of d' / d, the correction each ray received.
     """
-    distance = (coarse.means - camera.center).norm(dim=1)
-    correction = ((registered.means - camera.center).norm(dim=1) / distance).log()
-    grid = correction.new_zeros(observed.numel())
-    grid[pixel_index] = correction
-    has_primitive = torch.zeros_like(grid, dtype=torch.bool)
-    has_primitive[pixel_index] = True
-    known = observed & has_primitive.view_as(observed)
-    filled = fill_smoothly(grid.view_as(observed), known)
-    return slide(coarse, camera, filled.flatten()[pixel_index].exp(), footprint)
+    before = (coarse.means - camera.center) @ camera.forward
+    after = (registered.means - camera.center) @ camera.forward
+    scene = at_target.depth_map()
+    error = (after / scene.depth.flatten()[pixel_index].clamp_min(1e-12) - 1).abs()
+    agrees = scene.valid.flatten()[pixel_index] & (error < config.carry_tolerance)
+
+    correction = torch.zeros_like(scene.depth).flatten()
+    correction[pixel_index] = (after / before).log()
+    known = torch.zeros_like(scene.valid).flatten()
+    known[pixel_index] = agrees
+    shape = scene.valid.shape
+    filled = fill_smoothly(correction.view(shape), known.view(shape)).flatten()[pixel_index]
+    in_hole = ~scene.valid.flatten()[pixel_index]
+    ratio = torch.where(in_hole, filled, (after / before).log()).exp()
+    return slide(coarse, camera, ratio, config.footprint)
 
 
 def apply_affine(
@@ -174,9 +183,7 @@ def register_along_rays(
     losses = []
     for _ in track(range(config.iterations), "Registering"):
         moved = displace(coarse, parameters, reference.camera, config)
-        image = at_target.composite(moved)
-        depth = renderer.render(moved, reference.camera) if config.depth_of == "candidates" else image
-        loss = objective(image, depth, renderer.render(moved, anchor))
+        loss = objective(moved, at_target, reference.camera, anchor, renderer)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -203,7 +210,7 @@ def displace(
 
 @dataclass(frozen=True)
 class Objective:
-    """Eq. 9: `λ_d L_depth + λ_s L_stereo + λ_c L_rgb`, each a mean over its pixels."""
+    """Eq. 9: `λ_d L_depth + λ_s L_stereo + λ_c L_rgb`, each a mean over the image."""
 
     target_depth: DepthMap
     anchor_depth: DepthMap
@@ -224,20 +231,32 @@ class Objective:
         return Objective(at_target.depth_map(), anchor_depth, reference.image, unit, config)
 
     def __call__(
-        self, composite: Render, at_target: Render, at_anchor: Render
+        self,
+        candidates: Gaussians,
+        at_target: FrozenView,
+        target: Camera,
+        anchor: Camera,
+        renderer: Renderer,
     ) -> Float[Tensor, ""]:
-        """The loss, given the composite at the target and what stands for the new depth in both
-        cameras."""
-        depth = masked_mean(
-            (at_target.depth - self.target_depth.depth).abs() / self.unit, self.target_depth.valid
-        )
-        stereo = masked_mean(
-            (at_anchor.depth - self.anchor_depth.depth).abs() / self.unit,
-            self.comparable(at_anchor),
-        )
-        rgb = (composite.image - self.image).abs().mean()
+        """The loss of `candidates` where they stand."""
         c = self.config
-        return c.depth_weight * depth + c.stereo_weight * stereo + c.rgb_weight * rgb
+        loss = torch.zeros((), device=candidates.means.device)
+        if c.depth_of == "composite" or c.rgb_weight > 0:
+            together = at_target.composite(candidates)
+            loss = loss + c.rgb_weight * (together.image - self.image).abs().mean()
+        shown = together if c.depth_of == "composite" else renderer.render(candidates, target)
+        loss = loss + c.depth_weight * self.depth_error(
+            shown, self.target_depth, self.target_depth.valid & (shown.alpha.detach() >= 0.5)
+        )
+        alone = renderer.render(candidates, anchor)
+        return loss + c.stereo_weight * self.depth_error(
+            alone, self.anchor_depth, self.comparable(alone)
+        )
+
+    def depth_error(self, shown: Render, expected: DepthMap, where: Tensor) -> Float[Tensor, ""]:
+        """Absolute difference of depth, in `unit`, summed over `where` per pixel of the image."""
+        error = (shown.depth - expected.depth).abs() / self.unit
+        return torch.where(where, error, 0.0).mean()
 
     def comparable(self, at_anchor: Render) -> Tensor:
         """Where the anchor sees both the scene and the candidates [h, w]."""
@@ -248,8 +267,3 @@ class Objective:
             1 + self.config.occlusion_tolerance
         )
         return seen & ~behind
-
-
-def masked_mean(values: Float[Tensor, "h w"], mask: Tensor) -> Float[Tensor, ""]:
-    """Sum over `mask` per pixel of the image, so that few pixels do not weigh like many."""
-    return torch.where(mask, values, 0.0).mean()

@@ -104,9 +104,22 @@ def _solve(level, filled, field, rounds, seed, config):
         current[~known] = filled.numpy()[~known]
     for k in range(rounds):
         cost, shift = patchmatch.search(
-            current, weight, queries, query_at, expected, images, usable, log_depth, matches,
-            radius, np.float32(config.max_bias), np.float32(config.bias_penalty),
-            np.float32(config.depth_penalty), np.float32(config.distance_penalty), 2, seed + 31 * k,
+            current,
+            weight,
+            queries,
+            query_at,
+            expected,
+            images,
+            usable,
+            log_depth,
+            matches,
+            radius,
+            np.float32(config.max_bias),
+            np.float32(config.bias_penalty),
+            np.float32(config.depth_penalty),
+            np.float32(config.distance_penalty),
+            2,
+            seed + 31 * k,
         )
         sigma = np.float32(max(np.percentile(cost, 75), 1e-6))
         votes = trust * np.exp(-cost / (2 * sigma))

@@ -74,9 +74,7 @@ def _visibility(
     return torch.exp(-(error**2)) * visible
 
 
-def _closeness(
-    points: Float[Tensor, "h w 3"], target: Camera, view: View
-) -> Float[Tensor, "h w"]:
+def _closeness(points: Float[Tensor, "h w 3"], target: Camera, view: View) -> Float[Tensor, "h w"]:
     """1 where target and photograph look at a point along the same ray, less the more they turn."""
     to_target = torch.nn.functional.normalize(target.center - points, dim=-1)
     to_view = torch.nn.functional.normalize(view.camera.center - points, dim=-1)

@@ -97,9 +97,7 @@ def quaternions(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
     return torch.nn.functional.normalize(best, dim=-1)
 
 
-def normals_of(
-    depth: Float[Tensor, "h w"], view: View
-) -> Float[Tensor, "h w 3"]:
+def normals_of(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w 3"]:
     """Surface normals in camera axes, towards the camera, from the nearer of two differences."""
     camera = view.camera
     rays = camera.z_rays() @ camera.c2w[:3, :3]

@@ -1,0 +1,90 @@
+"""Stage 3, ours: what a photograph saw through stays empty.
+
+Inside a hole nothing tells a candidate its depth but what was lifted. The photographs do tell where
+it cannot be: a candidate that would stand before what a context camera sees of the scene slides
+back along its own ray until no camera contradicts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.geometry import project
+from gscompleter.stages.registration import slide
+from gscompleter.types import Camera, Gaussians, Render
+
+
+@dataclass(frozen=True)
+class FreeSpaceConfig:
+    num_steps: int = 48
+    """How often a candidate slides back before it is given up; 0 checks nothing, as in the
+    paper."""
+    step: float = 0.04
+    """By how much it slides each time, relative to its distance."""
+    clearance: float = 0.01
+    """How far behind the scene's surface, relative to depth, a camera that sees this surface must
+    find the candidate. What lies a little behind is hidden there, and still closes the hole."""
+    border: int = 3
+    """Pixels beyond the border of an image at which a Gaussian still shows within it."""
+
+
+def respect_free_space(
+    gaussians: Gaussians,
+    target: Camera,
+    cameras: Sequence[Camera],
+    renders: Sequence[Render],
+    footprint: Literal["constant", "fixed"],
+    config: FreeSpaceConfig = FreeSpaceConfig(),
+) -> tuple[Gaussians, Bool[Tensor, "n"]]:
+    """`gaussians` moved back along the rays of `target` to where no camera saw through them.
+
+    Args:
+        gaussians: Candidates.
+        target: Camera whose rays they slide along.
+        cameras: The context cameras.
+        renders: The scene as these see it.
+        footprint: Whether sizes follow the distance, as in the registration.
+        config: Steps and tolerance.
+
+    Returns:
+        The Gaussians, and which of them found a place [n].
+    """
+    ratio = torch.ones_like(gaussians.opacities)
+    offsets = gaussians.means - target.center
+    waiting = torch.arange(len(gaussians), device=ratio.device)
+    for step in range(config.num_steps):
+        means = target.center + ratio[waiting, None] * offsets[waiting]
+        waiting = waiting[seen_through(means, cameras, renders, config)]
+        if len(waiting) == 0:
+            break
+        ratio[waiting] = (1 + config.step) ** (step + 1)
+    placed = torch.ones_like(ratio, dtype=torch.bool)
+    placed[waiting] = config.num_steps == 0
+    return slide(gaussians, target, ratio, footprint), placed
+
+
+def seen_through(
+    points: Float[Tensor, "n 3"],
+    cameras: Sequence[Camera],
+    renders: Sequence[Render],
+    config: FreeSpaceConfig,
+) -> Bool[Tensor, "n"]:
+    """Which points stand before what some camera sees of the scene."""
+    contradicted = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    for camera, render in zip(cameras, renders, strict=True):
+        pixels, z = project(points, camera)
+        size = torch.tensor([camera.width, camera.height], device=pixels.device)
+        reach = config.border
+        shows = (z > 0) & (pixels > -reach).all(-1) & (pixels < size + reach).all(-1)
+        nearest = torch.where(shows[:, None], pixels, 0.0).long().clamp_min(0)
+        x, y = torch.minimum(nearest, size - 1).unbind(-1)
+        scene = render.depth_map()
+        before = z < (1 + config.clearance) * scene.depth[y, x]
+        contradicted |= shows & scene.valid[y, x] & before
+    return contradicted
