@@ -33,12 +33,17 @@ def strange(sh_degree: int = 0) -> Gaussians:
     return gaussians
 
 
+def muted(gaussians: Gaussians) -> Gaussians:
+    """Without the blackest black, where the colour has a kink and no gradient to compare."""
+    return replace(gaussians, sh=0.9 * gaussians.sh)
+
+
 SCENES = {
     "random": random_gaussians(300),
     "harmonics": random_gaussians(200, seed=1, sh_degree=3),
     "strange": strange(),
     "strange-harmonics": strange(sh_degree=2),
-    "room": gaussians_of(view_of(Room(), camera_at(0.2, size=24))),
+    "room": muted(gaussians_of(view_of(Room(), camera_at(0.2, size=24)))),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib import import_module
 from typing import Annotated
@@ -27,11 +28,13 @@ COMMANDS = {
 
 def main() -> None:
     """Entry point. Exit codes: 0 done, 2 the input is wrong, 1 anything else."""
+    # Threads of torch that spin while they wait cost a busy machine ten times the work they do.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if sys.argv[1:] == ["--version"]:
         print(__version__)
         return
     options = tyro.cli(
-        Command,  # type: ignore[arg-type]
+        Command,
         prog="gscompleter",
         description="Complete 3D Gaussian Splatting scenes: generate, then register.",
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),

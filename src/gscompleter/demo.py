@@ -19,7 +19,7 @@ from gscompleter.io.image import read_image, write_image
 from gscompleter.io.scene import write_cameras
 from gscompleter.options import CompleteOptions, DemoOptions
 from gscompleter.report import strip
-from gscompleter.run import run_completion
+from gscompleter.run import complete_folder, tell
 from gscompleter.types import Camera
 
 FOCAL_PX = 994.978
@@ -80,7 +80,7 @@ def run_demo(options: DemoOptions) -> None:
     with output_folder(options.out, options.overwrite) as folder:
         scene = folder / "scene"
         write_motorcycle_scene(scene)
-        run_completion(
+        summary, completion = complete_folder(
             CompleteOptions(
                 folder=scene,
                 context=(0, 1),
@@ -90,7 +90,7 @@ def run_demo(options: DemoOptions) -> None:
                 device=options.device,
                 seed=options.seed,
                 quiet=options.quiet,
-            )
+            ),
         )
         images = folder / "completion" / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
@@ -98,6 +98,7 @@ def run_demo(options: DemoOptions) -> None:
             folder / "before_after.png", strip([read_image(images / f"{n}.png") for n in names])
         )
     if not options.quiet:
+        tell(summary, completion, options.out / "completion")
         Console().print(
             f"Before and after, beyond the left and the right camera: "
             f"{options.out / 'before_after.png'}",

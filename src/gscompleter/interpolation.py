@@ -11,14 +11,13 @@ from torch.nn.functional import avg_pool2d, conv2d, interpolate, pad
 def fill_smoothly(
     values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"], num_relaxations: int = 64
 ) -> Float[Tensor, "h w"]:
-    """`values` where `known`, continued smoothly elsewhere.
+    """`values` where `known`, continued smoothly elsewhere; zero everywhere if nothing is known.
 
-    A pyramid gives every unknown pixel the mean of what is known around it, from the finest level
-    that knows anything; relaxation then smooths the unknown part towards the membrane that is
-    clamped to what is known. Zero everywhere if nothing is known.
+    The pyramid of `push_pull` gives a first guess, which relaxation then draws towards the
+    membrane that is clamped to what is known.
     """
-    weights = known.to(values.dtype)[None, None]
-    filled = push_pull(values[None, None] * weights, weights)
+    weight = known.to(values.dtype)
+    filled = push_pull(values[..., None], weight, blend=False)[None, None, ..., 0]
     kernel = values.new_tensor([[0, 1, 0], [1, 0, 1], [0, 1, 0]])[None, None] / 4
     for _ in range(num_relaxations):
         around = conv2d(pad(filled, (1, 1, 1, 1), mode="replicate"), kernel)
@@ -27,14 +26,42 @@ def fill_smoothly(
 
 
 def push_pull(
-    weighted: Float[Tensor, "1 1 h w"], weights: Float[Tensor, "1 1 h w"]
-) -> Float[Tensor, "1 1 h w"]:
-    """Weighted means, and where a pixel has no weight those of the next coarser level."""
-    mean = weighted / weights.clamp_min(1e-12)
-    if weights.shape[-2:].numel() == 1 or bool((weights > 0).all()):
-        return mean
-    coarse = push_pull(
-        avg_pool2d(weighted, 2, ceil_mode=True), avg_pool2d(weights, 2, ceil_mode=True)
+    values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"], blend: bool = True
+) -> Float[Tensor, "h w c"]:
+    """`values` where `weight` is 1; where it is 0, a smooth continuation of what surrounds it.
+
+    Averages are pushed up a pyramid, and whatever a level lacks is pulled down from the coarser
+    one (Gortler et al., The Lumigraph, 1996). Where no weight is positive at all the result is 0.
+    With `blend`, a level that knows little gives way to the coarser one, which is smoother;
+    without, whatever it knows counts, which stays closer to the nearest known values.
+    """
+    weighted = (values * weight[..., None]).permute(2, 0, 1)[None]
+    filled = _fill(weighted, weight[None, None], blend)
+    return filled[0].permute(1, 2, 0)
+
+
+def _fill(
+    weighted: Float[Tensor, "1 c h w"], weight: Float[Tensor, "1 1 h w"], blend: bool
+) -> Float[Tensor, "1 c h w"]:
+    own = weighted / weight.clamp_min(1e-8)
+    size = (weight.shape[2], weight.shape[3])
+    if max(size) == 1 or bool((weight > 0).all()):
+        return own
+    coarse = _fill(
+        avg_pool2d(weighted, 2, ceil_mode=True, count_include_pad=False),
+        avg_pool2d(weight, 2, ceil_mode=True, count_include_pad=False),
+        blend,
     )
-    upsampled = interpolate(coarse, size=weights.shape[-2:], mode="bilinear", align_corners=False)
-    return torch.where(weights > 0, mean, upsampled)
+    below = interpolate(coarse, size=size, mode="bilinear", align_corners=False)
+    trust = weight.clamp(0, 1) if blend else (weight > 0).to(weight.dtype)
+    return torch.lerp(below, own, trust)
+
+
+def smoothed(
+    values: Float[Tensor, "h w c"], mask: Bool[Tensor, "h w"], radius: int
+) -> Float[Tensor, "h w c"]:
+    """Means of `values` over the pixels of `mask` within a square of 2 radius + 1."""
+    weight = mask.to(values.dtype)[..., None]
+    layers = torch.cat([values * weight, weight], dim=-1).permute(2, 0, 1)[None]
+    means = avg_pool2d(layers, 2 * radius + 1, 1, radius, count_include_pad=False)[0]
+    return (means[:-1] / means[-1:].clamp_min(1e-8)).permute(1, 2, 0)

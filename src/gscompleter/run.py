@@ -26,7 +26,18 @@ from gscompleter.types import Completion, View
 
 
 def run_completion(options: CompleteOptions) -> None:
-    """Complete the scene of `options.folder` and write `options.out`.
+    """Complete the scene of `options.folder`, write `options.out` and say what was done.
+
+    Raises:
+        InputError: anything about the input that the user can mend; nothing is written then.
+    """
+    summary, completion = complete_folder(options)
+    if not options.quiet:
+        tell(summary, completion, options.out)
+
+
+def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completion]:
+    """Complete the scene of `options.folder` and write `options.out`; also returns the summary.
 
     Raises:
         InputError: anything about the input that the user can mend; nothing is written then.
@@ -64,8 +75,7 @@ def run_completion(options: CompleteOptions) -> None:
         summary = write_report(
             folder, completion, views, targets, renderer, settings, options.seed, device
         )
-    if not options.quiet:
-        tell(summary, completion, options.out)
+    return summary, completion
 
 
 def check_context(options: CompleteOptions) -> None:

@@ -1,8 +1,8 @@
 """Our reader and writer of 3D Gaussian scenes in PLY files.
 
 Written: the standard 3DGS layout (binary little-endian float32: x y z nx ny nz f_dc_* f_rest_*
-opacity scale_* rot_*), then `uchar generated`. Read: the same properties in any order, type and byte
-order, ASCII too, among other properties and elements. Inside the file scales are logarithms,
+opacity scale_* rot_*), then `uchar generated`. Read: the same properties in any order, type and
+byte order, ASCII too, among other properties and elements. Inside the file scales are logarithms,
 opacities logits, and f_rest_* runs through all coefficients of red, then green, then blue.
 """
 

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, pad
 
-from gscompleter.generators.warp_inpaint.smooth import push_pull
+from gscompleter.interpolation import push_pull
 from gscompleter.kernels import patchmatch
 
 
@@ -29,8 +29,10 @@ class ExemplarConfig:
     """Cost of taking from a surface before the expected depth, per squared log-depth."""
     distance_penalty: float = 0.002
     """Cost of taking from the other end of the image."""
-    iterations: tuple[int, int] = (2, 6)
-    """Rounds of search and vote on the finest level and on the coarsest."""
+    fewest_rounds: int = 2
+    """Rounds of search and vote on the finest level."""
+    most_rounds: int = 6
+    """Rounds on the coarsest level."""
     confidence: float = 0.85
     """Factor of the weight of an unknown pixel per pixel from the border of the hole."""
     min_size: int = 24
@@ -45,64 +47,109 @@ class Sources:
     valid: Bool[Tensor, "s h w"]
     log_depth: Float[Tensor, "s h w"]
 
+    @staticmethod
+    def stacked(
+        images: list[Float[Tensor, "_ _ 3"]],
+        valid: list[Bool[Tensor, "_ _"]],
+        depths: list[Float[Tensor, "_ _"]],
+    ) -> Sources:
+        """Images of any sizes as sources; depth in scene units, 0 where unknown."""
+        h, w = (max(image.shape[axis] for image in images) for axis in (0, 1))
+
+        def padded(values: Tensor) -> Tensor:
+            below, right = h - values.shape[0], w - values.shape[1]
+            return pad(values, ((0, 0) * (values.dim() - 2)) + (0, right, 0, below))
+
+        # A surface of unknown depth counts as far away, which costs nothing.
+        farthest = max(depth.max().item() for depth in depths)
+        logs = [torch.where(d > 0, d, farthest).clamp_min(1e-30).log() for d in depths]
+        return Sources(
+            torch.stack([padded(image) for image in images]),
+            torch.stack([padded(v) for v in valid]),
+            torch.stack([padded(log) for log in logs]),
+        )
+
 
 @dataclass(frozen=True)
-class _Level:
+class Level:
+    """The image, what is known of it, the log-depth it should have, and sources of its scale."""
+
     image: Float[Tensor, "h w 3"]
     known: Bool[Tensor, "h w"]
     expected: Float[Tensor, "h w"]
     sources: Sources
 
 
+Field = Int64[ndarray, "h w 3"]
+"""For each pixel near the hole the source, row and column of the patch that matches; -1 else."""
+
+
 def fill_by_patches(
     image: Float[Tensor, "h w 3"],
     known: Bool[Tensor, "h w"],
-    expected_log_depth: Float[Tensor, "h w"],
+    expected: Float[Tensor, "h w"],
     sources: Sources,
     seed: int,
     config: ExemplarConfig = ExemplarConfig(),
 ) -> Float[Tensor, "h w 3"]:
-    """`image` with what is not `known` made of patches of `sources`."""
-    levels = _pyramid(_Level(image, known, expected_log_depth, sources), config)
-    filled = push_pull(levels[-1].image, levels[-1].known.float())
-    field: Int64[ndarray, "h w 3"] | None = None
+    """`image` with what is not `known` made of patches of `sources`.
+
+    Args:
+        image: Colours, where known.
+        known: Which pixels are to stay.
+        expected: Logarithm of the depth that each pixel should have; nearer sources cost.
+        sources: Where patches come from.
+        seed: Of the random search.
+        config: Sizes and costs.
+    """
+    levels = [Level(image, known, expected, sources)]
+    while min(levels[-1].known.shape) // 2 >= config.min_size:
+        levels.append(halved(levels[-1]))
+    filled, field = push_pull(levels[-1].image, levels[-1].known.float()), None
     for number, level in reversed(list(enumerate(levels))):
-        if number < len(levels) - 1:
-            filled = None
         share = number / max(len(levels) - 1, 1)
-        first, last = config.iterations
-        rounds = round(first + (last - first) * share)
-        filled, field = _solve(level, filled, field, rounds, seed + 7919 * number, config)
+        extra = round((config.most_rounds - config.fewest_rounds) * share)
+        start = filled if field is None else None
+        rounds = config.fewest_rounds + extra
+        filled, field = solve(level, start, field, rounds, seed + 7919 * number, config)
     return filled
 
 
-def _solve(level, filled, field, rounds, seed, config):
+def solve(
+    level: Level,
+    start: Float[Tensor, "h w 3"] | None,
+    coarse_field: Field | None,
+    rounds: int,
+    seed: int,
+    config: ExemplarConfig,
+) -> tuple[Float[Tensor, "h w 3"], Field | None]:
+    """Alternate between the best patches for the image and the image these patches vote for.
+
+    It begins with the image `start`, or with what the field of the coarser level votes for.
+    """
     h, w = level.known.shape
-    radius = config.radius
-    usable = _usable(level.sources.valid, radius)
-    known = level.known.numpy()
-    near_hole = cv2.dilate((~known).astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
-    if not usable.any() or not near_hole.any():
-        return (push_pull(level.image, level.known.float()) if filled is None else filled), field
-    queries = np.argwhere(near_hole)
+    known, radius = level.known.numpy(), config.radius
+    usable = usable_centres(level.sources.valid, radius)
+    near_hole = dilated(~known, radius)
+    if not usable.any() or known.all():
+        return push_pull(level.image, level.known.float()), None
+
+    queries, hole = np.argwhere(near_hole), np.argwhere(~known)
     query_at = np.full((h, w), -1, np.int64)
     query_at[near_hole] = np.arange(len(queries))
-    hole = np.argwhere(~known)
-    away = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5)
-    weight = np.where(known, 1.0, np.maximum(config.confidence**away, 0.05)).astype(np.float32)
-    matches = _initial_field(queries, field, usable, seed)
+    weight = trust(known, config.confidence)
+    votes, shift = weight[near_hole], np.zeros((len(queries), 3), np.float32)
+    matches = initial_matches(queries, coarse_field, usable, seed)
     images = np.ascontiguousarray(level.sources.images.numpy())
     log_depth = np.ascontiguousarray(level.sources.log_depth.numpy())
     expected = level.expected.numpy()[near_hole]
+
+    def voted() -> Float32[ndarray, "p 3"]:
+        return patchmatch.vote((h, w), hole, query_at, votes, images, matches, shift, radius)[0]
+
     current = level.image.numpy().copy()
-    trust = weight[near_hole]
-    if filled is None:
-        shift = np.zeros((len(queries), 3), np.float32)
-        colours, _ = patchmatch.vote((h, w), hole, query_at, trust, images, matches, shift, radius)
-        current[~known] = colours
-    else:
-        current[~known] = filled.numpy()[~known]
-    for k in range(rounds):
+    current[~known] = voted() if start is None else start.numpy()[~known]
+    for number in range(rounds):
         cost, shift = patchmatch.search(
             current,
             weight,
@@ -119,72 +166,82 @@ def _solve(level, filled, field, rounds, seed, config):
             np.float32(config.depth_penalty),
             np.float32(config.distance_penalty),
             2,
-            seed + 31 * k,
+            seed + 31 * number,
         )
-        sigma = np.float32(max(np.percentile(cost, 75), 1e-6))
-        votes = trust * np.exp(-cost / (2 * sigma))
-        colours, totals = patchmatch.vote(
-            (h, w), hole, query_at, votes.astype(np.float32), images, matches, shift, radius
-        )
-        current[~known] = colours
-    dense = np.zeros((h, w, 3), np.int64)
-    dense[near_hole] = matches
-    dense[~near_hole] = -1
-    return torch.from_numpy(current), dense
+        likely = np.exp(-cost / (2 * max(float(np.percentile(cost, 75)), 1e-6)))
+        votes = (weight[near_hole] * likely).astype(np.float32)
+        current[~known] = voted()
+    field = np.full((h, w, 3), -1, np.int64)
+    field[near_hole] = matches
+    return torch.from_numpy(current), field
 
 
-def _initial_field(queries, coarse, usable, seed):
-    rng = np.random.default_rng(seed)
+def trust(known: Bool[ndarray, "h w"], confidence: float) -> Float32[ndarray, "h w"]:
+    """How much a pixel counts when patches are compared: less, the deeper it lies in the hole."""
+    away = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.where(known, 1.0, np.maximum(confidence**away, 0.05)).astype(np.float32)
+
+
+def dilated(mask: Bool[ndarray, "h w"], radius: int) -> Bool[ndarray, "h w"]:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
+
+
+def usable_centres(valid: Bool[Tensor, "s h w"], radius: int) -> Bool[ndarray, "s h w"]:
+    """Pixels around which a whole patch is valid."""
+    kernel = np.ones((2 * radius + 1,) * 2, np.uint8)
+    return np.stack(
+        [
+            cv2.erode(v, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+            for v in valid.numpy().astype(np.uint8)
+        ]
+    )
+
+
+def initial_matches(
+    queries: Int64[ndarray, "q 2"],
+    coarse_field: Field | None,
+    usable: Bool[ndarray, "s h w"],
+    seed: int,
+) -> Int64[ndarray, "q 3"]:
+    """The matches of the coarser level at twice their place, and random ones where it has none."""
     centres = np.argwhere(usable)
-    matches = centres[rng.integers(len(centres), size=len(queries))]
-    if coarse is not None:
-        h, w = coarse.shape[:2]
-        above = coarse[np.minimum(queries[:, 0] // 2, h - 1), np.minimum(queries[:, 1] // 2, w - 1)]
-        guess = above.copy()
-        guess[:, 1:] = above[:, 1:] * 2 + queries % 2
-        H, W = usable.shape[1:]
-        ok = (above[:, 0] >= 0) & (guess[:, 1] < H) & (guess[:, 2] < W)
-        guess[~ok] = 0
-        ok &= usable[guess[:, 0], guess[:, 1], guess[:, 2]]
-        matches[ok] = guess[ok]
+    matches = centres[np.random.default_rng(seed).integers(len(centres), size=len(queries))]
+    if coarse_field is None:
+        return matches
+    h, w = coarse_field.shape[:2]
+    above = coarse_field[
+        np.minimum(queries[:, 0] // 2, h - 1), np.minimum(queries[:, 1] // 2, w - 1)
+    ]
+    guess = above.copy()
+    guess[:, 1:] = above[:, 1:] * 2 + queries % 2
+    inside = (above[:, 0] >= 0) & (guess[:, 1:] < usable.shape[1:]).all(axis=1)
+    guess[~inside] = 0
+    inside &= usable[guess[:, 0], guess[:, 1], guess[:, 2]]
+    matches[inside] = guess[inside]
     return np.ascontiguousarray(matches)
 
 
-def _usable(valid, radius):
-    out = np.zeros(valid.shape, bool)
-    kernel = np.ones((2 * radius + 1,) * 2, np.uint8)
-    for k, v in enumerate(valid.numpy().astype(np.uint8)):
-        out[k] = cv2.erode(v, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    return out
+def halved(level: Level) -> Level:
+    """The level at half the size; averages leave out what is unknown."""
+    known = level.known.float()[..., None]
+    share = pooled(known)
+    image = pooled(level.image * known) / share.clamp_min(1e-6)
+    expected = pooled(level.expected[..., None])[..., 0]
+
+    valid = level.sources.valid.float()[..., None]
+    usable = pooled(valid)
+    sources = Sources(
+        pooled(level.sources.images * valid) / usable.clamp_min(1e-6),
+        usable[..., 0] > 0.75,
+        (pooled(level.sources.log_depth[..., None] * valid) / usable.clamp_min(1e-6))[..., 0],
+    )
+    return Level(image, share[..., 0] > 0.5, expected, sources)
 
 
-def _pyramid(level, config):
-    levels = [level]
-    while True:
-        last = levels[-1]
-        hole = (~last.known).numpy().astype(np.uint8)
-        size = min(last.known.shape)
-        if size // 2 < config.min_size:
-            break
-        levels.append(_halve(last))
-    return levels
-
-
-def _halve(level):
-    k = level.known.float()
-    image, weight = _pool(level.image * k[..., None]), _pool(k[..., None])
-    expected = _pool(level.expected[..., None])[..., 0]
-    s = level.sources
-    v = s.valid.float()[..., None]
-    sw = _pool(v)
-    images = _pool(s.images * v) / sw.clamp_min(1e-6)
-    depth = _pool(s.log_depth[..., None] * v) / sw.clamp_min(1e-6)
-    sources = Sources(images, sw[..., 0] > 0.75, depth[..., 0])
-    return _Level(image / weight.clamp_min(1e-6), weight[..., 0] > 0.5, expected, sources)
-
-
-def _pool(values):
-    batch = values if values.ndim == 4 else values[None]
-    out = avg_pool2d(batch.permute(0, 3, 1, 2), 2, ceil_mode=True, count_include_pad=False)
-    out = out.permute(0, 2, 3, 1)
-    return (out if values.ndim == 4 else out[0]).contiguous()
+def pooled(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:
+    """Means of 2 x 2 pixels."""
+    channels_first = values.movedim(-1, -3)
+    flat = channels_first.reshape(-1, *channels_first.shape[-3:])
+    means = avg_pool2d(flat, 2, ceil_mode=True, count_include_pad=False)
+    shape = (*channels_first.shape[:-2], *means.shape[-2:])
+    return means.reshape(shape).movedim(-3, -1).contiguous()

@@ -33,6 +33,9 @@ class Warped:
     depth: Float[Tensor, "h w"]
     """z-depth in the target camera, in scene units, where known."""
 
+    def to(self, device: torch.device | str) -> Warped:
+        return Warped(self.image.to(device), self.known.to(device), self.depth.to(device))
+
 
 def warp_photographs(
     target: Camera, context: SceneContext, config: WarpConfig = WarpConfig()

@@ -68,7 +68,7 @@ Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
 def _features(frame: Frame) -> Features:
     """Pixels and descriptors of SIFT; the top-left pixel's centre is (0.5, 0.5)."""
     grey = cv2.cvtColor((frame.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = cv2.SIFT_create(2000, contrastThreshold=0.02).detectAndCompute(
+    keypoints, descriptors = cv2.SIFT.create(2000, contrastThreshold=0.02).detectAndCompute(
         grey, None
     )
     if descriptors is None:

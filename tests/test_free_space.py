@@ -1,0 +1,94 @@
+"""What a photograph saw through stays empty."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter.geometry import project
+from gscompleter.stages.free_space import FreeSpaceConfig, respect_free_space, seen_through
+from gscompleter.types import Gaussians, Render, observed
+from scenes import camera_at
+
+SIZE = 32
+TARGET, WITNESS = camera_at(0.5, size=SIZE), camera_at(-0.5, size=SIZE)
+
+
+def wall(depth: float, alpha: float = 1.0) -> Render:
+    """What a camera sees of a wall that fills its image."""
+    shape = (SIZE, SIZE)
+    return Render(torch.zeros(*shape, 3), torch.full(shape, depth), torch.full(shape, alpha))
+
+
+def floaters(depth: float) -> Gaussians:
+    """Small Gaussians before the target camera."""
+    x = torch.linspace(-0.3, 0.3, 7)
+    means = torch.stack([x, 0 * x, torch.full((7,), depth)], dim=-1)
+    return observed(
+        means,
+        torch.tensor([1.0, 0, 0, 0]).repeat(7, 1),
+        torch.full((7, 3), 0.01),
+        torch.ones(7),
+        torch.zeros(7, 1, 3),
+    )
+
+
+def test_what_stands_before_a_wall_slides_back_along_its_ray_until_it_is_hidden():
+    moved, placed = respect_free_space(
+        floaters(2.0), TARGET, [WITNESS], [wall(4.0)], "constant", FreeSpaceConfig()
+    )
+    assert placed.all()
+    assert (moved.means[:, 2] > 4.0).all()
+    assert (moved.means[:, 2] < 4.0 * 1.01 * 1.05).all()
+    before, _ = project(floaters(2.0).means, TARGET)
+    after, _ = project(moved.means, TARGET)
+    assert torch.allclose(before, after, atol=1e-3)
+    ratio = moved.means[:, 2] / 2.0
+    assert torch.allclose(moved.scales, floaters(2.0).scales * ratio[:, None], rtol=1e-4)
+
+
+def test_what_lies_behind_the_wall_or_in_a_hole_stays():
+    for render, depth in ((wall(4.0), 5.0), (wall(4.0, alpha=0.2), 2.0)):
+        moved, placed = respect_free_space(floaters(depth), TARGET, [WITNESS], [render], "fixed")
+        assert placed.all()
+        assert torch.allclose(moved.means, floaters(depth).means)
+
+
+def test_what_finds_no_place_is_told():
+    config = FreeSpaceConfig(num_steps=3)
+    _, placed = respect_free_space(
+        floaters(2.0), TARGET, [WITNESS], [wall(100.0)], "constant", config
+    )
+    assert not placed.any()
+
+
+def test_a_gaussian_just_beyond_the_border_shows_and_is_judged_by_the_border():
+    # 1 m before the witness, 1.5 pixels left of its image.
+    x = (-1.5 - SIZE / 2) / WITNESS.K[0, 0].item() - 0.5
+    just_outside = torch.tensor([[x, 0.0, 1.0]])
+    far_outside = torch.tensor([[x - 1.0, 0.0, 1.0]])
+    config = FreeSpaceConfig()
+    assert seen_through(just_outside, [WITNESS], [wall(4.0)], config).all()
+    assert not seen_through(far_outside, [WITNESS], [wall(4.0)], config).any()
+    narrow = replace(config, border=0)
+    assert not seen_through(just_outside, [WITNESS], [wall(4.0)], narrow).any()
+
+
+@pytest.mark.parametrize("unit", [0.001, 1000.0])
+def test_the_unit_of_the_scene_does_not_matter(unit):
+    def place(unit: float) -> torch.Tensor:
+        target, witness = (camera_at(x, size=SIZE, unit=unit) for x in (0.5, -0.5))
+        gaussians = replace(floaters(2.0), means=floaters(2.0).means * unit)
+        views = [witness], [wall(4.0 * unit)]
+        return respect_free_space(gaussians, target, *views, "fixed")[0].means
+
+    assert torch.allclose(place(unit) / unit, place(1.0), rtol=1e-4)
+
+
+def test_without_steps_nothing_is_checked():
+    config = FreeSpaceConfig(num_steps=0)
+    moved, placed = respect_free_space(
+        floaters(2.0), TARGET, [WITNESS], [wall(4.0)], "constant", config
+    )
+    assert placed.all()
+    assert torch.allclose(moved.means, floaters(2.0).means)
