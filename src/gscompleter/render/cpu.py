@@ -43,7 +43,7 @@ class CpuRenderer:
         return self._viewpoint(camera).freeze(context)
 
     def _viewpoint(self, camera: Camera) -> Viewpoint:
-        threads = self.threads or numba.config.NUMBA_NUM_THREADS
+        threads = self.threads or numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
         return Viewpoint(pinhole_of(camera), threads)
 
 
@@ -156,12 +156,12 @@ class Viewpoint:
         np.cumsum(sizes, out=slot_start[1:])
         tile_start = rasterizer.places_of(counts)
         entries, slots = np.empty(tile_start[-1], np.int32), np.empty(tile_start[-1], np.int32)
-        seen = (order, depths, depth_limits, self.tiles_x, rectangles, slot_start)
+        filled = (order, depths, depth_limits, self.tiles_x, rectangles, slot_start)
         run(
             self.threads,
             rasterizer.fill_entries,
             [
-                (*chunk, *seen, places, entries, slots)
+                (*chunk, *filled, places, entries, slots)
                 for chunk, places in zip(chunks, counts, strict=True)
             ],
         )
@@ -300,8 +300,13 @@ def pinhole_of(camera: Camera) -> Pinhole:
 
 def arrays_of(gaussians: Gaussians) -> GaussianArrays:
     """The Gaussians as the kernels want them, without gradients."""
-    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    return GaussianArrays(*map(float32, tensors), float32(gaussians.sh))
+    return GaussianArrays(
+        float32(gaussians.means),
+        float32(gaussians.quats),
+        float32(gaussians.scales),
+        float32(gaussians.opacities),
+        float32(gaussians.sh),
+    )
 
 
 def render_of(frame: Frame) -> Render:

@@ -82,6 +82,8 @@ class Level:
 
 Field = Int64[ndarray, "h w 3"]
 """For each pixel near the hole the source, row and column of the patch that matches; -1 else."""
+CoarseField = Int64[ndarray, "coarse_h coarse_w 3"]
+"""The field of the next coarser level."""
 
 
 def fill_by_patches(
@@ -105,11 +107,12 @@ def fill_by_patches(
     levels = [Level(image, known, expected, sources)]
     while min(levels[-1].known.shape) // 2 >= config.min_size:
         levels.append(halved(levels[-1]))
-    filled, field = push_pull(levels[-1].image, levels[-1].known.float()), None
+    filled, field = image, None
     for number, level in reversed(list(enumerate(levels))):
         share = number / max(len(levels) - 1, 1)
         extra = round((config.most_rounds - config.fewest_rounds) * share)
-        start = filled if field is None else None
+        # Small holes vanish on coarse levels; the first level that has them begins smoothly.
+        start = push_pull(level.image, level.known.float()) if field is None else None
         rounds = config.fewest_rounds + extra
         filled, field = solve(level, start, field, rounds, seed + 7919 * number, config)
     return filled
@@ -118,7 +121,7 @@ def fill_by_patches(
 def solve(
     level: Level,
     start: Float[Tensor, "h w 3"] | None,
-    coarse_field: Field | None,
+    coarse_field: CoarseField | None,
     rounds: int,
     seed: int,
     config: ExemplarConfig,
@@ -199,8 +202,8 @@ def usable_centres(valid: Bool[Tensor, "s h w"], radius: int) -> Bool[ndarray, "
 
 def initial_matches(
     queries: Int64[ndarray, "q 2"],
-    coarse_field: Field | None,
-    usable: Bool[ndarray, "s h w"],
+    coarse_field: CoarseField | None,
+    usable: Bool[ndarray, "s source_h source_w"],
     seed: int,
 ) -> Int64[ndarray, "q 3"]:
     """The matches of the coarser level at twice their place, and random ones where it has none."""

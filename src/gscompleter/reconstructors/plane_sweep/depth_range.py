@@ -94,7 +94,7 @@ def _inverse_depths(
     matched: Float[np.ndarray, "n 2"],
     max_error: float = 3.0,
     min_parallax: float = 1.0,
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, "m"]:
     """Inverse z-depths in `reference` of the matches that lie on their epipolar lines.
 
     A match that hardly moves tells nothing of depth, so that it takes a parallax of

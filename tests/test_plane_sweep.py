@@ -1,0 +1,154 @@
+"""Ψ without weights: depth is right where views overlap, in any unit, for any number of views."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from skimage.data import stereo_motorcycle
+
+from gscompleter import InputError, View
+from gscompleter.demo import (
+    BASELINE_M,
+    FOCAL_PX,
+    PRINCIPAL_POINT_DX_PX,
+    motorcycle_cameras,
+)
+from gscompleter.geometry import project
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, estimate_depth_range
+from scenes import Room, camera_at, view_of
+
+SIZE = 96
+
+
+def room_views(*cameras, unit: float = 1.0) -> list[View]:
+    return [view_of(Room(unit=unit), camera) for camera in cameras]
+
+
+def side_by_side(unit: float = 1.0) -> list[View]:
+    return room_views(*(camera_at(x, size=SIZE, unit=unit) for x in (-0.2, 0.2)), unit=unit)
+
+
+def share_within(depth: torch.Tensor, truth: torch.Tensor, tolerance: float, where=None) -> float:
+    error = (depth - truth).abs() / truth
+    return (error[where] if where is not None else error).lt(tolerance).float().mean().item()
+
+
+def test_depth_of_a_room_is_found():
+    views = side_by_side()
+    for view, found in zip(views, PlaneSweep()(views).depths, strict=True):
+        assert share_within(found.depth, view.depth, 0.05) > 0.8
+        assert share_within(found.depth, view.depth, 0.03, found.valid) > 0.85
+        assert found.valid.float().mean() > 0.6
+
+
+def test_every_pixel_has_one_gaussian_that_projects_to_its_centre():
+    views = side_by_side()
+    found = PlaneSweep()(views)
+    for index, view in enumerate(views):
+        own = found.view_index == index
+        assert torch.equal(found.pixel_index[own].sort().values, torch.arange(SIZE * SIZE))
+        pixels, _ = project(found.gaussians.means[own], view.camera)
+        expected_x = found.pixel_index[own] % SIZE + 0.5
+        expected_y = found.pixel_index[own] // SIZE + 0.5
+        assert (pixels[:, 0] - expected_x).abs().max() < 0.01
+        assert (pixels[:, 1] - expected_y).abs().max() < 0.01
+
+
+def test_moving_forward_gives_depth_too():
+    views = room_views(camera_at(0.1, z=-0.5, size=SIZE), camera_at(0.0, z=0.1, size=SIZE))
+    found = PlaneSweep()(views)
+    assert share_within(found.depths[0].depth, views[0].depth, 0.1, found.depths[0].valid) > 0.7
+
+
+def test_more_views_do_not_make_it_worse():
+    two = side_by_side()
+    three = [*two, *room_views(camera_at(0.0, 0.25, size=SIZE))]
+    truth = two[0].depth
+    share_of_two = share_within(PlaneSweep()(two).depths[0].depth, truth, 0.05)
+    assert share_within(PlaneSweep()(three).depths[0].depth, truth, 0.05) > share_of_two - 0.03
+
+
+def test_views_of_different_sizes_are_matched():
+    small = room_views(camera_at(0.2, size=SIZE // 2))
+    found = PlaneSweep()([side_by_side()[0], *small])
+    assert found.depths[1].depth.shape == (SIZE // 2, SIZE // 2)
+    assert share_within(found.depths[0].depth, side_by_side()[0].depth, 0.08) > 0.7
+
+
+def test_another_exposure_leaves_the_depth():
+    left, right = side_by_side()
+    darker = replace(right, image=0.7 * right.image)
+    found = PlaneSweep()([left, darker])
+    assert share_within(found.depths[0].depth, left.depth, 0.05) > 0.8
+
+
+@pytest.mark.parametrize("unit", [0.001, 1000.0])
+def test_the_unit_of_the_scene_scales_means_and_sizes(unit):
+    ours, theirs = PlaneSweep()(side_by_side()), PlaneSweep()(side_by_side(unit))
+    # A winner-takes-all decision may flip by rounding; one pixel in a thousand may move.
+    for name in ("means", "scales"):
+        a, b = getattr(theirs.gaussians, name) / unit, getattr(ours.gaussians, name)
+        assert ((a - b).abs() > 1e-3 * b.abs().max()).float().mean() < 1e-3, name
+    assert torch.allclose(theirs.gaussians.sh, ours.gaussians.sh, atol=1e-2)
+
+
+def test_the_same_views_give_the_same_bytes():
+    a, b = PlaneSweep()(side_by_side()), PlaneSweep()(side_by_side())
+    assert torch.equal(a.gaussians.means, b.gaussians.means)
+    assert torch.equal(a.gaussians.scales, b.gaussians.scales)
+
+
+@pytest.mark.parametrize("unit", [0.001, 1.0, 1000.0])
+def test_the_estimated_range_encloses_what_the_views_see(unit):
+    views = side_by_side(unit)
+    near, far = estimate_depth_range(views)
+    for view in views:
+        assert near < view.depth.quantile(0.02)
+        assert far > view.depth.quantile(0.98)
+    assert near > 0.05 * unit
+    assert far < 500 * unit
+
+
+def test_without_texture_the_baseline_sets_the_range():
+    flat = [replace(v, image=torch.full_like(v.image, 0.5)) for v in side_by_side()]
+    near, far = estimate_depth_range(flat)
+    assert 0 < near < far
+
+
+def test_too_few_views_no_baseline_and_an_empty_range_are_refused():
+    left, right = side_by_side()
+    with pytest.raises(InputError, match="at least two views"):
+        PlaneSweep()([left])
+    with pytest.raises(InputError, match="in one place"):
+        PlaneSweep()([left, left])
+    empty = [replace(v, camera=replace(v.camera, near=5.0, far=2.0)) for v in (left, right)]
+    with pytest.raises(InputError, match="near must be positive and less than far"):
+        PlaneSweep()(empty)
+
+
+def test_the_motorcycle_at_a_quarter_of_its_size():
+    """Real photographs with true disparity, which scikit-image carries."""
+    left, right, disparity = stereo_motorcycle()
+    images = [torch.from_numpy(i / 255).float()[::4, ::4] for i in (left, right)]
+    height, width = images[0].shape[:2]
+    scale = torch.tensor([[0.25], [0.25], [1.0]])
+    cameras = [
+        replace(c, K=c.K * scale, width=width, height=height, near=1.5, far=8.0)
+        for c in motorcycle_cameras(741, 500)
+    ]
+    views = [View(i, c) for i, c in zip(images, cameras, strict=True)]
+    found = PlaneSweep()(views).depths[0].depth
+    disparity = disparity[::4, ::4]
+    known = torch.from_numpy(np.isfinite(disparity))
+    truth = torch.from_numpy(FOCAL_PX * BASELINE_M / (disparity + PRINCIPAL_POINT_DX_PX)).float()
+    assert share_within(found, truth, 0.05, known) > 0.75
+
+
+def test_depth_of_a_real_room(shared):
+    from gscompleter import load_views
+
+    views = load_views(shared / "data" / "open3d_rgbd", [0, 2], (256, 256), near=0.5, far=10.0)
+    found = PlaneSweep()(views).depths[0].depth
+    known = views[0].depth > 0
+    assert share_within(found[known], views[0].depth[known], 0.05) > 0.7
