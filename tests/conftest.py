@@ -1,6 +1,10 @@
 """Every shape in an annotation is a run-time check while the tests run."""
 
+import os
 from pathlib import Path
+
+# As the command line has it: threads that spin while they wait make a busy machine crawl.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import pytest
 from jaxtyping import install_import_hook
