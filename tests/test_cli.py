@@ -189,6 +189,7 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--near", -1), "near"),
         (("--far", "nan"), "far"),
         (("--resolution", 0, 64), "resolution"),
+        (("--resolution", 4, 64), "at least 16"),
         (("--config", "papper"), "no config 'papper'"),
         (("--generator", "dall-e"), "no generator 'dall-e'"),
         (("--reconstructor", "nerf"), "no reconstructor 'nerf'"),

@@ -264,3 +264,54 @@ def test_community_files_are_read_or_refused(shared):
         load_ply(folder / "gaussians" / "biker.compressed.ply")
     for pointer in (folder / "lfs_pointers").glob("*.ply"):
         refused(pointer, "git lfs pull")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "sentence"),
+    [
+        (b"vertex 3", b"vertex -3", "broken header"),
+        (b"property float nx", b"property float ny", "named twice"),
+        (
+            b"element vertex",
+            b"element eye 1\nproperty int a\nproperty int a\nelement vertex",
+            "twice",
+        ),
+        (b"element vertex", b"element face 1\nproperty list float int a\nelement vertex", "broken"),
+        (b"property float nx", b"property quad nx", "broken header"),
+        (b"property float nx", b"property list uchar float nx", "hold lists"),
+        (b"vertex 3", b"vertex 99999999999999999999", "truncated: 3 of 99,999,999,999,999,999,999"),
+    ],
+)
+def test_a_header_that_lies_is_refused(tmp_path, before, after, sentence):
+    path = saved(tmp_path, random_gaussians(3))
+    path.write_bytes(path.read_bytes().replace(before, after))
+    refused(path, sentence)
+
+
+def test_a_list_of_negative_length_is_refused(tmp_path):
+    path = saved(tmp_path, random_gaussians(3))
+    faces = b"element face 1\nproperty list char int a\nelement vertex"
+    head, mark, data = path.read_bytes().partition(b"end_header\n")
+    path.write_bytes(head.replace(b"element vertex", faces) + mark + b"\xff" + data)
+    refused(path, "negative length")
+
+
+def test_an_infinite_scale_is_written_as_a_finite_one(tmp_path):
+    gaussians = random_gaussians(2)
+    gaussians.scales[0] = float("inf")
+    assert load_ply(saved(tmp_path, gaussians)).scales[0].tolist() == pytest.approx(
+        [1e38] * 3, rel=1e-5
+    )
+
+
+def test_part_of_a_loaded_scene_keeps_its_bits(tmp_path):
+    """Decoding must not depend on where in the array a Gaussian stands."""
+    loaded = load_ply(saved(tmp_path, random_gaussians(10_007)))
+    odd = load_ply(saved(tmp_path, loaded[1::2], "odd.ply"))
+    assert same(odd, loaded[1::2])
+
+
+def test_rows_beyond_one_block_are_in_their_place(tmp_path):
+    gaussians = random_gaussians(20_000, sh_degree=1)
+    loaded = load_ply(saved(tmp_path, gaussians))
+    assert same(loaded, gaussians, ("means", "quats", "sh"))

@@ -12,7 +12,7 @@ from PIL import Image
 from gscompleter import InputError, load_camera, load_cameras, load_views
 from gscompleter.geometry import inside, project, sample, unproject
 from gscompleter.io.files import output_folder
-from gscompleter.io.scene import write_cameras
+from gscompleter.io.scene import read_index, write_cameras
 from scenes import camera_at
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -196,3 +196,298 @@ def test_true_depth_carries_pixels_from_one_photograph_to_the_next(shared, name,
     assert seen.float().mean() > 0.3
     assert error < 0.06
     assert error < 0.8 * unmoved
+
+
+def turned(degrees: float) -> np.ndarray:
+    """A camera-to-world matrix turned about the vertical axis, in nerfstudio's axes."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[c, 0, s, 0.3], [0, 1, 0, -0.2], [-s, 0, c, 2.0], [0, 0, 0, 1]])
+
+
+def scaled_pose() -> np.ndarray:
+    return turned(20) @ np.diag([1.01, 1.01, 1.01, 1])
+
+
+def sheared_pose() -> np.ndarray:
+    shear = np.eye(4)
+    shear[0, 1] = 0.1
+    return turned(20) @ shear
+
+
+def projective_pose() -> np.ndarray:
+    pose = turned(20)
+    pose[3, 0] = 0.5
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("pose", "sentence"),
+    [
+        (scaled_pose(), "not a rigid transform but scaled"),
+        (sheared_pose(), "not a rigid transform but scaled, sheared"),
+        (projective_pose(), "projective"),
+        (turned(20) @ np.diag([-1, 1, 1, 1]), "reflection"),
+        (np.full((4, 4), math.nan), "NaN"),
+        (np.zeros((4, 4)), "not a rigid transform"),
+        (np.eye(3), "no 3×4 or 4×4 matrix"),
+        ("identity", "no 3×4 or 4×4 matrix"),
+        ([[1, 0, 0, 0], [0, 1], [0, 0, 1, 0]], "no 3×4 or 4×4 matrix"),
+    ],
+)
+def test_a_pose_that_is_no_rigid_transform_is_refused(tmp_path, pose, sentence):
+    scene = write_scene(tmp_path / "s", {"a.png": noise()})
+    matrix = pose.tolist() if isinstance(pose, np.ndarray) else pose
+    changed(scene, lambda c: c["frames"][0].update(transform_matrix=matrix))
+    with pytest.raises(InputError, match=sentence) as error:
+        load_views(scene)
+    assert "a.png" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_pose_of_three_rows_is_one_of_four(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise()})
+    changed(scene, lambda c: c["frames"][0].update(transform_matrix=turned(30).tolist()))
+    four = load_camera(scene, 0).c2w
+    changed(scene, lambda c: c["frames"][0].update(transform_matrix=turned(30)[:3].tolist()))
+    assert torch.equal(load_camera(scene, 0).c2w, four)
+    # A turn by 30 degrees about nerfstudio's y, which points up, is one by -30 about ours.
+    assert torch.allclose(four[:3, 2], torch.tensor([-0.5, 0.0, -math.sqrt(0.75)]))
+
+
+def test_a_slightly_inexact_rotation_becomes_exact(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise()})
+    pose = turned(30)
+    pose[:3, :3] *= 1.0003
+    changed(scene, lambda c: c["frames"][0].update(transform_matrix=pose.tolist()))
+    c2w = load_camera(scene, 0).c2w.double().numpy()
+    assert np.allclose(c2w[:3, :3], (turned(30) @ OPENGL)[:3, :3], atol=1e-7)
+    assert np.allclose(c2w[:3, 3], [0.3, -0.2, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda c: c.update(frames=[]), "lists no frames"),
+        (lambda c: c.update(frames={"a": 1}), "lists no frames"),
+        (lambda c: c.update(frames=["a.png"]), "not an object"),
+        (lambda c: c.update(fl_x=0), "`fl_x` .* positive"),
+        (lambda c: c.update(fl_y=-3.0), "`fl_y` .* positive"),
+        (lambda c: c.update(fl_x=math.nan), "`fl_x` .* finite"),
+        (lambda c: c["frames"][0].update(fl_x=0), "`fl_x` of frame a.png"),
+        (lambda c: (c.pop("fl_x"), c.pop("fl_y")), "focal length .* missing"),
+        (lambda c: c.update(cx="middle"), "`cx`"),
+        (lambda c: c.update(h=-40), "`h` .* positive"),
+        (lambda c: c.update(w=60.5), "whole numbers"),
+        (lambda c: c.update(k1=0.1, k4=0.2), "k4"),
+        (lambda c: c.update(depth_unit_scale_factor=0), "depth_unit_scale_factor"),
+        (lambda c: c["frames"][0].update(file_path=7), "file_path"),
+        (lambda c: c["frames"][0].pop("file_path"), "image of frame 0 .* missing"),
+        (
+            lambda c: c["frames"][0].update(file_path="gone.png"),
+            "image of frame gone.png .* missing",
+        ),
+        (lambda c: c["frames"][0].update(depth_file_path="gone.png"), "no depth map .*gone.png"),
+        (lambda c: c["frames"][0].update(depth_file_path="a.png"), "is no depth map"),
+        (lambda c: c["frames"][0].update(depth_file_path="transforms.json"), "cannot be read"),
+        (lambda c: c["frames"][0].update(file_path="transforms.json"), "not an image"),
+    ],
+)
+def test_every_impossible_entry_has_its_sentence(tmp_path, change, sentence):
+    scene = changed(write_scene(tmp_path / "s", {"a.png": noise()}), change)
+    with pytest.raises(InputError, match=sentence) as error:
+        load_views(scene)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", ["[]", "null", "3", '"frames"', "{", "", "\x00\xff"])
+def test_what_is_no_object_in_json_is_refused(tmp_path, content):
+    (tmp_path / "transforms.json").write_text(content, encoding="latin-1")
+    with pytest.raises(InputError, match="JSON|object"):
+        load_views(tmp_path)
+
+
+def test_a_scene_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(InputError, match="There is no scene"):
+        load_views(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="There is no scene"):
+        load_cameras(tmp_path / "nowhere.json")
+
+
+@pytest.mark.parametrize("number", [2, 99, -1])
+def test_a_frame_out_of_range_is_refused_with_the_range(tmp_path, number):
+    scene = write_scene(tmp_path / "s", {"a.png": noise(), "b.png": noise()})
+    with pytest.raises(InputError, match=f"no frame {number} .* numbered 0 to 1"):
+        load_views(scene, [0, number])
+    with pytest.raises(InputError, match=f"no frame {number} "):
+        load_camera(scene, number)
+
+
+@pytest.mark.parametrize("resolution", [(0, 20), (20, 0), (-1, 20)])
+def test_an_impossible_resolution_is_refused(tmp_path, resolution):
+    scene = write_scene(tmp_path / "s", {"a.png": noise()})
+    with pytest.raises(InputError, match="resolution"):
+        load_views(scene, resolution=resolution)
+
+
+def test_one_frame_needs_no_choice_and_several_do(tmp_path):
+    one = write_scene(tmp_path / "one", {"a.png": noise()})
+    assert torch.equal(load_camera(one / "transforms.json").c2w, load_camera(one, 0).c2w)
+    two = write_scene(tmp_path / "two", {"a.png": noise(), "b.png": noise()})
+    with pytest.raises(InputError, match="2 frames; choose one, from 0 to 1"):
+        load_camera(two)
+
+
+def test_a_truncated_photograph_is_refused(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise()})
+    whole = (scene / "a.png").read_bytes()
+    (scene / "a.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="a.png is damaged"):
+        load_views(scene)
+
+
+def test_only_the_frames_asked_for_are_read(tmp_path):
+    scene = write_scene(tmp_path / "s", {f"{i}.png": noise(seed=i) for i in range(4)})
+    for unread in ("1.png", "2.png"):
+        (scene / unread).unlink()
+    views = load_views(scene, [3, 0])
+    assert [view.frame for view in views] == [3, 0]
+    assert torch.equal(views[1].image, load_views(scene, [0])[0].image)
+
+
+def test_a_camera_needs_no_photograph_where_its_size_is_given(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise()})
+    with_photograph = load_camera(scene, 0, (20, 20))
+    (scene / "a.png").unlink()
+    assert torch.equal(load_camera(scene, 0, (20, 20)).K, with_photograph.K)
+    changed(scene, lambda c: (c.pop("w"), c.pop("h")))
+    with pytest.raises(InputError, match="size of frame a.png .* not known"):
+        load_camera(scene, 0)
+
+
+def test_a_list_of_cameras_keeps_its_order_and_needs_no_paths(tmp_path):
+    cameras = [camera_at(x) for x in (0.3, -0.2, 0.1)]
+    write_cameras(tmp_path / "c.json", cameras, ["z.png", "m.png", "a.png"])
+    loaded = load_cameras(tmp_path / "c.json", near=0.5, far=9.0)
+    assert [camera.center[0].item() for camera in loaded] == pytest.approx([0.3, -0.2, 0.1])
+    assert (loaded[2].near, loaded[2].far) == (0.5, 9.0)
+    write_cameras(tmp_path / "c.json", cameras)
+    assert torch.equal(load_camera(tmp_path / "c.json", 1).c2w, cameras[1].c2w)
+
+
+def test_poses_are_written_and_read_back_bit_for_bit(tmp_path):
+    cameras = [camera_at(0.3, 0.1, yaw=yaw) for yaw in (-77, -5, 0, 20, 133)]
+    write_cameras(tmp_path / "c.json", cameras)
+    for ours, theirs in zip(cameras, load_cameras(tmp_path / "c.json"), strict=True):
+        assert torch.equal(ours.c2w, theirs.c2w)
+
+
+def test_an_opening_angle_stands_for_a_focal_length(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise(40, 60)})
+    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    changed(scene, lambda c: ([c.pop(key) for key in keys], c.update(camera_angle_x=math.pi / 2)))
+    # Half of 60 pixels is seen under 45 degrees; pixels are square, and the centre is the middle.
+    assert torch.allclose(
+        load_camera(scene, 0).K, torch.tensor([[30.0, 0, 30], [0, 30, 20], [0, 0, 1]])
+    )
+
+
+def test_intrinsics_of_a_frame_win_over_those_of_the_scene(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise(), "b.png": noise()})
+    changed(scene, lambda c: c["frames"][1].update(fl_x=70.0, cx=31.0))
+    assert load_camera(scene, 0).K[0].tolist() == [50.0, 0.0, 30.0]
+    assert load_camera(scene, 1).K[0].tolist() == [70.0, 0.0, 31.0]
+
+
+def test_an_odd_crop_moves_the_principal_point_by_whole_pixels(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise(40, 61)})
+    (view,) = load_views(scene, resolution=(20, 20))
+    # 61 columns become round(30.5) = 30, of which five on the left are cropped.
+    assert view.camera.K[0].tolist() == pytest.approx([50 * 30 / 61, 0, 15 - 5])
+
+
+def test_paths_without_an_extension_are_found(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.jpg": noise(), "b.png": noise()})
+    for frame, name in ((0, "a"), (1, "./b")):
+        changed(scene, lambda c, f=frame, n=name: c["frames"][f].update(file_path=n))
+    assert len(load_views(scene)) == 2
+
+
+def image_of(tmp_path: Path, pixels: np.ndarray, mode: str | None = None) -> list[float]:
+    """The top-left colour of a picture that is saved and loaded as a scene of one frame."""
+    scene = write_scene(tmp_path / "s", {"a.png": noise(*pixels.shape[:2])})
+    image = Image.fromarray(pixels)
+    (image if mode is None else image.convert(mode)).save(scene / "a.png")
+    return load_views(scene)[0].image[0, 0].tolist()
+
+
+def test_pictures_of_every_kind_become_colours(tmp_path):
+    faint = np.full((8, 9, 4), 255, np.uint8)
+    faint[..., 3] = 51
+    assert image_of(tmp_path, faint) == pytest.approx([0.2, 0.2, 0.2])
+    assert image_of(tmp_path, np.full((8, 9), 51, np.uint8)) == pytest.approx([0.2] * 3)
+    assert image_of(tmp_path, np.full((8, 9), 51 * 257, np.uint16)) == pytest.approx([0.2] * 3)
+    assert image_of(tmp_path, np.full((8, 9, 3), 51, np.uint8), "P") == pytest.approx([0.2] * 3)
+
+
+def with_depth(scene: Path, depth: np.ndarray) -> Path:
+    """The scene with a depth map of its first frame, as an array file."""
+    np.save(scene / "d.npy", depth)
+    return changed(scene, lambda c: c["frames"][0].update(depth_file_path="d.npy"))
+
+
+def test_a_depth_map_is_cropped_like_its_photograph_and_never_blended(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise(40, 60)})
+    changed(scene, lambda c: c.update(depth_unit_scale_factor=1.0))
+    columns = np.tile(np.arange(60, dtype=np.float32), (40, 1))
+    columns[0, 10:] = np.nan
+    (view,) = load_views(with_depth(scene, columns), resolution=(40, 20))
+    assert torch.equal(view.depth[1], torch.arange(20.0, 40.0))
+    assert torch.equal(view.depth[0], torch.zeros(20))
+    (small,) = load_views(scene, resolution=(20, 20))
+    assert set(small.depth[1].tolist()) <= set(map(float, range(10, 50)))
+
+
+def test_a_smaller_depth_map_is_brought_to_the_size_of_the_photograph(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise(40, 60)})
+    (view,) = load_views(with_depth(scene, np.array([[1000, 3000]], np.uint16)))
+    assert view.depth.shape == (40, 60)
+    assert (view.depth[:, :30] == 1).all()
+    assert (view.depth[:, 30:] == 3).all()
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"camera_model": "OPENCV", "k1": -0.2, "k2": 0.05, "p1": 0.001, "p2": -0.002},
+        {"camera_model": "SIMPLE_RADIAL", "k1": 0.2},
+        {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": -0.001},
+        {"is_fisheye": True},
+    ],
+    ids=str,
+)
+def test_the_camera_alone_is_that_of_the_undistorted_photograph(tmp_path, lens):
+    scene = write_scene(tmp_path / "s", {"a.png": noise(40, 60)}, **lens)
+    (view,) = load_views(scene, resolution=(32, 32))
+    camera = load_camera(scene, 0, (32, 32))
+    assert torch.equal(view.camera.K, camera.K)
+    straight = load_camera(write_scene(tmp_path / "p", {"a.png": noise()}), 0, (32, 32))
+    assert camera.K[0, 0] != straight.K[0, 0]
+    assert torch.allclose(camera.K[:2, 2], straight.K[:2, 2])
+
+
+def test_undistortion_leaves_no_dark_border(tmp_path):
+    white = np.full((60, 80, 3), 255, np.uint8)
+    for k1 in (-0.3, 0.3):
+        scene = write_scene(tmp_path / f"s{k1}", {"a.png": white}, k1=k1)
+        assert (load_views(scene)[0].image == 1).all()
+
+
+def test_every_real_scene_loads_completely(shared):
+    for scene in sorted(path for path in (shared / "data").iterdir() if path.is_dir()):
+        index = read_index(scene)
+        views = load_views(scene, resolution=(64, 64), near=0.5, far=10.0)
+        assert len(views) == len(index)
+        assert all(view.image.shape == (64, 64, 3) for view in views)
+        for view in views:
+            rotation = view.camera.c2w[:3, :3].double()
+            assert (rotation.T @ rotation - torch.eye(3).double()).abs().max() < 3e-6

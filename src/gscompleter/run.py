@@ -24,6 +24,9 @@ from gscompleter.render import choose_device, load_renderer
 from gscompleter.report import Target, write_report
 from gscompleter.types import Completion, View
 
+MIN_SIZE = 16
+"""Shorter side of an image, in pixels, under which there is nothing to match and to score."""
+
 
 def run_completion(options: CompleteOptions) -> None:
     """Complete the scene of `options.folder`, write `options.out` and say what was done.
@@ -97,9 +100,16 @@ def check_context(options: CompleteOptions) -> None:
 
 def read_views(options: CompleteOptions, frames: Sequence[int]) -> list[View]:
     """The photographs of `frames` as the options want them."""
-    return load_views(
+    views = load_views(
         options.folder, list(frames), options.resolution, near=options.near, far=options.far
     )
+    for view in views:
+        if min(view.camera.width, view.camera.height) < MIN_SIZE:
+            raise InputError(
+                f"Frame {view.frame} is {view.camera.width} x {view.camera.height} pixels, and "
+                f"both sides must have at least {MIN_SIZE}; choose a larger --resolution."
+            )
+    return views
 
 
 def read_targets(options: CompleteOptions) -> list[Target]:

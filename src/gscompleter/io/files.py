@@ -108,7 +108,10 @@ class _Draft:
 
     def __init__(self, path: Path, overwrite: bool) -> None:
         self.target = Path(os.path.realpath(path))
-        self.exists = self.target.is_dir()
+        try:
+            self.exists = self.target.is_dir()
+        except OSError as error:
+            raise InputError(_cannot_write(path, error)) from error
         self.parents: list[Path] = []
         _check_free(path, self.target, overwrite)
         # Inside an existing folder, because its parent may be another file system or closed to us.
@@ -145,7 +148,10 @@ class _Draft:
             if os.path.lexists(self.target / name)
         ]
         moves += [(self.folder / name, self.target / name) for name in names]
-        _rename_all(moves)
+        try:
+            _rename_all(moves)
+        except OSError as error:
+            raise InputError(_cannot_write(self.target, error)) from error
 
     def close(self) -> None:
         """Remove what was not published, and the parents made for it where they are empty."""

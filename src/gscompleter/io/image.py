@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -90,7 +91,7 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     Raises:
         InputError: where the file is missing, damaged or not a depth map.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(
             f"There is no depth map {path}; restore it, or remove its `depth_file_path`."
         )
@@ -115,7 +116,7 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
 
 
 def _opened(path: Path | str) -> Image.Image:
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise InputError(f"There is no image {path}; restore it or correct its path.")
     try:
         return Image.open(path)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -33,6 +34,7 @@ _SCALARS = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+_COUNTS = {name: kind for name, kind in _SCALARS.items() if kind[0] in "iu"}
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 _MEANS = ("x", "y", "z")
@@ -46,6 +48,12 @@ _NUM_REST = (0, 9, 24, 45)
 
 _MAX_LOGIT = 30.0
 """Opacities of 0 are written as this logit, negated; 1 as the largest finite one in float32."""
+
+_MAX_SCALE = 1e38
+"""Larger scales are written as this one, so that what is read back is finite in float32."""
+
+_BLOCK = 8192
+"""Rows copied at a time: few enough to stay in the cache while one column follows another."""
 
 
 # ------------------------------------------------------------------------------------- header
@@ -118,7 +126,7 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             if words[0] == "format":
                 file_format = words[1]
             elif words[0] == "element":
-                elements.append(Element(words[1], int(words[2])))
+                elements.append(Element(words[1], _count(words[2])))
             elif words[0] == "property":
                 elements[-1].properties.append(_property(words[1:]))
             else:
@@ -135,9 +143,15 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     return Header(file_format, elements)
 
 
+def _count(word: str) -> int:
+    if not word.isdecimal():
+        raise ValueError(word)
+    return int(word)
+
+
 def _property(words: list[str]) -> Property:
     if words[0] == "list":
-        return Property(words[3], _SCALARS[words[2]], _SCALARS[words[1]])
+        return Property(words[3], _SCALARS[words[2]], _COUNTS[words[1]])
     return Property(words[1], _SCALARS[words[0]])
 
 
@@ -172,6 +186,8 @@ def _skip(file: BinaryIO, element: Element, byte_order: str, path: Path) -> None
                 if len(counted) < size:
                     raise _truncated(path, row, element.count, element.name)
                 length = int(np.frombuffer(counted, byte_order + prop.count_kind)[0])
+                if length < 0:
+                    raise InputError(f"{path} holds a list of negative length; write it anew.")
             file.seek(length * np.dtype(prop.kind).itemsize, io.SEEK_CUR)
 
 
@@ -237,6 +253,12 @@ def _gaussian_element(header: Header, path: Path) -> Element:
     if vertex is None:
         raise InputError(f"{path} has no vertices; a 3DGS .ply is needed.")
     names = [p.name for p in vertex.properties]
+    for element in header.elements:
+        if len({p.name for p in element.properties}) < len(element.properties):
+            raise InputError(
+                f"{path} has a broken header: a property of its element {element.name!r} is named "
+                "twice; write it anew."
+            )
     if "chunk" in found or "packed_position" in names:
         raise InputError(
             f"{path} is a compressed PLY; convert it to a standard 3DGS .ply first, for example "
@@ -247,9 +269,9 @@ def _gaussian_element(header: Header, path: Path) -> Element:
         raise InputError(
             f"{path} is not a 3DGS scene but a mesh or point cloud: it lacks {', '.join(missing)}."
         )
-    if len(set(names)) < len(names) or vertex.has_lists:
+    if vertex.has_lists:
         raise InputError(
-            f"{path} has a broken header: a property of its vertices is a list or named twice."
+            f"{path} is not a 3DGS scene: its vertices hold lists; write it anew without them."
         )
     num_rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
     if num_rest not in _NUM_REST or any(f"f_rest_{i}" not in names for i in range(num_rest)):
@@ -265,10 +287,11 @@ def _gaussian_element(header: Header, path: Path) -> Element:
 def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
     def columns(names: tuple[str, ...]) -> Float[Tensor, "n c"]:
         table = np.empty((len(vertices), len(names)), np.float32)
-        for column, name in enumerate(names):
-            # A double beyond the range of float32 becomes infinite, and is counted as such.
-            with np.errstate(over="ignore"):
-                table[:, column] = vertices[name]
+        # A double beyond the range of float32 becomes infinite, and is counted as such.
+        with np.errstate(over="ignore"):
+            for rows in _blocks(len(vertices)):
+                for column, name in enumerate(names):
+                    table[rows, column] = vertices[name][rows]
         return torch.from_numpy(table)
 
     names = {p.name for p in vertex.properties}
@@ -309,6 +332,10 @@ def _whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
     return gaussians[good]
 
 
+def _blocks(count: int) -> Iterator[slice]:
+    return (slice(start, start + _BLOCK) for start in range(0, count, _BLOCK))
+
+
 def _decoded_scales(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
     return encoded[:, :3].double().exp().float()
 
@@ -326,7 +353,7 @@ def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
     Values that came from a file are used again wherever they still stand for what is in memory.
     """
     tiny = torch.finfo(torch.float32).tiny
-    scales = gaussians.scales.double().clamp_min(tiny).log()
+    scales = gaussians.scales.double().clamp(tiny, _MAX_SCALE).log()
     # The largest float32 below 1 has a logit of 16.6; a larger one could not be read back.
     opacities = gaussians.opacities.double().clamp(0, 1 - 2**-24).logit()
     anew = torch.cat([scales, opacities.clamp_min(-_MAX_LOGIT)[:, None]], dim=1).float()
@@ -379,8 +406,9 @@ def _vertices(gaussians: Gaussians, provenance: bool) -> np.ndarray:
 
     def put(columns: tuple[str, ...], values: Tensor) -> None:
         table = values.detach().float().numpy()
-        for column, name in enumerate(columns):
-            vertices[name] = table[:, column]
+        for rows in _blocks(len(vertices)):
+            for column, name in enumerate(columns):
+                vertices[name][rows] = table[rows, column]
 
     encoded = encode(gaussians)
     put(_MEANS, gaussians.means)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,7 +84,7 @@ class Frame:
             return None
         path = self.folder / self.file_path
         candidates = [path] + [path.with_name(path.name + end) for end in (".png", ".jpg", ".jpeg")]
-        return next((candidate for candidate in candidates if candidate.is_file()), None)
+        return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
     def size(self) -> tuple[int, int]:
         """Width and height of the photograph, or where there is none, what the file says.
@@ -167,15 +168,15 @@ def read_frames(scene: Path | str) -> list[Frame]:
 
 
 def _json_path(scene: Path) -> Path:
-    if scene.is_dir():
+    if os.path.isdir(scene):
         path = scene / "transforms.json"
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise InputError(
                 f"The folder {scene} has no transforms.json; export the scene in nerfstudio's "
                 "format, or name the JSON file itself."
             )
         return path
-    if not scene.exists():
+    if not os.path.exists(scene):
         raise InputError(f"There is no scene {scene}; name a folder with a transforms.json.")
     return scene
 
