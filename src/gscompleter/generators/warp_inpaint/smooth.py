@@ -1,0 +1,59 @@
+"""Continue colours smoothly beyond the border of what is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray
+from torch import Tensor
+
+BLUR = 1.5
+"""Standard deviation, in pixels of its level, of the blur on every level of the pyramid."""
+
+
+def distance_to_known(known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Pixels to the nearest known pixel; 0 where known. Some pixel must be known."""
+    away = cv2.distanceTransform((~known).numpy().astype(np.uint8), cv2.DIST_L2, 5)
+    return torch.from_numpy(away)
+
+
+def continued(
+    values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"], reach: float = 0.7
+) -> Float[Tensor, "h w c"]:
+    """`values` where `weight` is positive, and weighted means of what lies around elsewhere.
+
+    A pixel averages over a neighbourhood whose standard deviation is `reach` times its distance
+    from what is known: just beyond the border it continues the nearest values, far away it tends
+    to the mean. Averages grow with distance evenly in all directions, which a pyramid that fills
+    its blocks (`push_pull`) does not do.
+    """
+    known = weight > 0
+    if not known.any():
+        return torch.zeros_like(values)
+    weighted = torch.cat([values * weight[..., None], weight[..., None]], dim=-1).numpy()
+    layers = blur_pyramid(np.ascontiguousarray(weighted, np.float32))
+
+    size = reach * distance_to_known(known).numpy()
+    level = np.log2(np.maximum(size / BLUR, 1.0)).clip(0, len(layers) - 1)
+    below = np.minimum(level.astype(np.int64), max(len(layers) - 2, 0))
+    above = np.minimum(below + 1, len(layers) - 1)
+    share = (level - below)[..., None].astype(np.float32)
+    rows, columns = np.indices(level.shape)
+    mixed = (1 - share) * layers[below, rows, columns] + share * layers[above, rows, columns]
+    means = torch.from_numpy(mixed[..., :-1] / np.maximum(mixed[..., -1:], 1e-20))
+    return torch.where(known[..., None], values, means)
+
+
+def blur_pyramid(image: Float32[ndarray, "h w c"]) -> Float32[ndarray, "levels h w c"]:
+    """Blurred copies of `image`, each twice as wide as the one before, all at its size."""
+    h, w = image.shape[:2]
+    layers = []
+    while True:
+        blurred = cv2.GaussianBlur(image, (0, 0), BLUR)
+        layers.append(cv2.resize(blurred, (w, h), interpolation=cv2.INTER_LINEAR))
+        if min(image.shape[:2]) <= 8:
+            return np.stack(layers).reshape(len(layers), h, w, -1)
+        half = ((image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2)
+        image = cv2.resize(blurred, half, interpolation=cv2.INTER_AREA)
