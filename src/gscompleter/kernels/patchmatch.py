@@ -17,7 +17,7 @@ def _hash(value):
 
 
 @njit(cache=True, fastmath=True)
-def _patch_cost(image, weight, y, x, source, sy, sx, radius, max_bias, bias_penalty, bias):
+def _patch_cost(image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias):
     """Mean squared difference of two patches after the best small shift of each colour channel.
 
     The shift is written to `bias`. Pixels of the patch outside of the image do not count.
@@ -31,9 +31,9 @@ def _patch_cost(image, weight, y, x, source, sy, sx, radius, max_bias, bias_pena
     for dy in range(max(-radius, -y), min(radius, h - 1 - y) + 1):
         for dx in range(max(-radius, -x), min(radius, w - 1 - x) + 1):
             a = weight[y + dy, x + dx]
-            e0 = image[y + dy, x + dx, 0] - source[sy + dy, sx + dx, 0]
-            e1 = image[y + dy, x + dx, 1] - source[sy + dy, sx + dx, 1]
-            e2 = image[y + dy, x + dx, 2] - source[sy + dy, sx + dx, 2]
+            e0 = image[y + dy, x + dx, 0] - sources[s, sy + dy, sx + dx, 0]
+            e1 = image[y + dy, x + dx, 1] - sources[s, sy + dy, sx + dx, 1]
+            e2 = image[y + dy, x + dx, 2] - sources[s, sy + dy, sx + dx, 2]
             total += a
             square += a * (e0 * e0 + e1 * e1 + e2 * e2)
             d0 += a * e0
@@ -79,6 +79,7 @@ def search(
     depth_penalty,
     distance_penalty,
     rounds,
+    max_reach,
     seed,
 ):
     """Improve the nearest source patch of every query, by propagation and random search.
@@ -92,6 +93,8 @@ def search(
             and the logarithm of their depths [s, H, W].
         field: Matches (source, y, x) [q, 3]; all of them usable. Written to.
         rounds: Passes of propagation and random search.
+        max_reach: Pixels within which the random search begins; it shrinks from there.
+        seed: Of the random search.
 
     Returns:
         The cost of every match [q] and its shift of colour [q, 3].
@@ -108,7 +111,7 @@ def search(
         s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
         away = np.float32(np.sqrt(float((sy - y) ** 2 + (sx - x) ** 2)))
         cost[i] = _patch_cost(
-            image, weight, y, x, sources[s], sy, sx, radius, max_bias, bias_penalty, bias
+            image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias
         ) + _prior(
             log_depth[s, sy, sx], expected[i], away, diagonal, depth_penalty, distance_penalty
         )
@@ -125,11 +128,11 @@ def search(
                 + np.uint64(pass_number * 1000003)
                 + np.uint64(y * 65537 + x)
             )
-            reach = max(H, W)
+            reach = max_reach
             for trial in range(24):
-                if trial < 12:
-                    # Neighbours one, two and five pixels away propose their own offset.
-                    step = 1 if trial < 4 else (2 if trial < 8 else 5)
+                if trial < 8:
+                    # Neighbours one and four pixels away propose their own offset.
+                    step = 1 if trial < 4 else 4
                     side = trial % 4
                     ny = y + (step if side == 0 else (-step if side == 1 else 0))
                     nx = x + (step if side == 2 else (-step if side == 3 else 0))
@@ -157,6 +160,8 @@ def search(
                     reach = reach * 6 // 10
                 if sy < 0 or sy >= H or sx < 0 or sx >= W or not usable[s, sy, sx]:
                     continue
+                if s == field[i, 0] and sy == field[i, 1] and sx == field[i, 2]:
+                    continue
                 away = np.float32(np.sqrt(float((sy - y) ** 2 + (sx - x) ** 2)))
                 prior = _prior(
                     log_depth[s, sy, sx],
@@ -173,7 +178,8 @@ def search(
                     weight,
                     y,
                     x,
-                    sources[s],
+                    sources,
+                    s,
                     sy,
                     sx,
                     radius,

@@ -13,7 +13,6 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from gscompleter.interpolation import push_pull
 from gscompleter.kernels import patchmatch
 
 
@@ -35,8 +34,11 @@ class ExemplarConfig:
     """Rounds on the coarsest level."""
     confidence: float = 0.85
     """Factor of the weight of an unknown pixel per pixel from the border of the hole."""
-    min_size: int = 24
-    """Shorter side, in pixels, under which the pyramid stops."""
+    min_size: int = 80
+    """Shorter side, in pixels, under which the pyramid stops. Coarser levels would invent large
+    structures, which are seldom the true ones; over real cases they cost 0.3 dB."""
+    fine_reach: int = 8
+    """Pixels within which the random search looks around what the coarser level found."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ def fill_by_patches(
     """`image` with what is not `known` made of patches of `sources`.
 
     Args:
-        image: Colours, where known.
+        image: Colours; where not known, a first guess of the tone.
         known: Which pixels are to stay.
         expected: Logarithm of the depth that each pixel should have; nearer sources cost.
         sources: Where patches come from.
@@ -111,16 +113,13 @@ def fill_by_patches(
     for number, level in reversed(list(enumerate(levels))):
         share = number / max(len(levels) - 1, 1)
         extra = round((config.most_rounds - config.fewest_rounds) * share)
-        # Small holes vanish on coarse levels; the first level that has them begins smoothly.
-        start = push_pull(level.image, level.known.float()) if field is None else None
         rounds = config.fewest_rounds + extra
-        filled, field = solve(level, start, field, rounds, seed + 7919 * number, config)
+        filled, field = solve(level, field, rounds, seed + 7919 * number, config)
     return filled
 
 
 def solve(
     level: Level,
-    start: Float[Tensor, "h w 3"] | None,
     coarse_field: CoarseField | None,
     rounds: int,
     seed: int,
@@ -128,14 +127,14 @@ def solve(
 ) -> tuple[Float[Tensor, "h w 3"], Field | None]:
     """Alternate between the best patches for the image and the image these patches vote for.
 
-    It begins with the image `start`, or with what the field of the coarser level votes for.
+    It begins with the first guess, or with what the field of the coarser level votes for.
     """
     h, w = level.known.shape
     known, radius = level.known.numpy(), config.radius
     usable = usable_centres(level.sources.valid, radius)
     near_hole = dilated(~known, radius)
     if not usable.any() or known.all():
-        return push_pull(level.image, level.known.float()), None
+        return level.image, None
 
     queries, hole = np.argwhere(near_hole), np.argwhere(~known)
     query_at = np.full((h, w), -1, np.int64)
@@ -151,7 +150,9 @@ def solve(
         return patchmatch.vote((h, w), hole, query_at, votes, images, matches, shift, radius)[0]
 
     current = level.image.numpy().copy()
-    current[~known] = voted() if start is None else start.numpy()[~known]
+    if coarse_field is not None:
+        current[~known] = voted()
+    reach = max(usable.shape) if coarse_field is None else config.fine_reach
     for number in range(rounds):
         cost, shift = patchmatch.search(
             current,
@@ -169,6 +170,7 @@ def solve(
             np.float32(config.depth_penalty),
             np.float32(config.distance_penalty),
             2,
+            reach,
             seed + 31 * number,
         )
         likely = np.exp(-cost / (2 * max(float(np.percentile(cost, 75)), 1e-6)))
@@ -206,29 +208,50 @@ def initial_matches(
     usable: Bool[ndarray, "s source_h source_w"],
     seed: int,
 ) -> Int64[ndarray, "q 3"]:
-    """The matches of the coarser level at twice their place, and random ones where it has none."""
-    centres = np.argwhere(usable)
-    matches = centres[np.random.default_rng(seed).integers(len(centres), size=len(queries))]
-    if coarse_field is None:
-        return matches
-    h, w = coarse_field.shape[:2]
-    above = coarse_field[
-        np.minimum(queries[:, 0] // 2, h - 1), np.minimum(queries[:, 1] // 2, w - 1)
-    ]
-    guess = above.copy()
-    guess[:, 1:] = above[:, 1:] * 2 + queries % 2
-    inside = (above[:, 0] >= 0) & (guess[:, 1:] < usable.shape[1:]).all(axis=1)
-    guess[~inside] = 0
-    inside &= usable[guess[:, 0], guess[:, 1], guess[:, 2]]
-    matches[inside] = guess[inside]
+    """The matches of the coarser level at twice their place; where it has none, what is nearest.
+
+    Nearest in the last source, which is what is known of the image itself; at random where it has
+    no whole patch.
+    """
+    own = len(usable) - 1
+    if usable[own].any():
+        places = nearest_places(usable[own])[queries[:, 0], queries[:, 1]]
+        matches = np.column_stack([np.full(len(queries), own), places])
+    else:
+        centres = np.argwhere(usable)
+        matches = centres[np.random.default_rng(seed).integers(len(centres), size=len(queries))]
+    if coarse_field is not None:
+        h, w = coarse_field.shape[:2]
+        above = coarse_field[
+            np.minimum(queries[:, 0] // 2, h - 1), np.minimum(queries[:, 1] // 2, w - 1)
+        ]
+        guess = above.copy()
+        guess[:, 1:] = above[:, 1:] * 2 + queries % 2
+        inside = (above[:, 0] >= 0) & (guess[:, 1:] < usable.shape[1:]).all(axis=1)
+        guess[~inside] = 0
+        inside &= usable[guess[:, 0], guess[:, 1], guess[:, 2]]
+        matches[inside] = guess[inside]
     return np.ascontiguousarray(matches)
+
+
+def nearest_places(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
+    """Row and column of the nearest pixel of `mask`, for every pixel."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    places = np.zeros((labels.max() + 1, 2), np.int64)
+    rows, columns = np.nonzero(mask)
+    places[labels[rows, columns]] = np.column_stack([rows, columns])
+    return places[labels]
 
 
 def halved(level: Level) -> Level:
     """The level at half the size; averages leave out what is unknown."""
     known = level.known.float()[..., None]
     share = pooled(known)
-    image = pooled(level.image * known) / share.clamp_min(1e-6)
+    guess = pooled(level.image * (1 - known)) / (1 - share).clamp_min(1e-6)
+    seen = pooled(level.image * known) / share.clamp_min(1e-6)
+    image = torch.where(share > 0.5, seen, guess)
     expected = pooled(level.expected[..., None])[..., 0]
 
     valid = level.sources.valid.float()[..., None]

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.geometry import inside, project, sample, unproject
+from gscompleter.generators.warp_inpaint.harmonize import HarmonizeConfig, gains
+from gscompleter.geometry import baseline_between, inside, project, sample, unproject
 from gscompleter.types import Camera, Render, SceneContext, View
 
 
@@ -16,11 +17,13 @@ from gscompleter.types import Camera, Render, SceneContext, View
 class WarpConfig:
     min_alpha: float = 0.5
     """Opacity of the scene from which a pixel of the target counts as observed."""
-    depth_tolerance: float = 0.02
+    depth_tolerance: float = 0.03
     """Difference between the depth of a point and the depth that a photograph sees in its
     direction, relative to the depth, at which the weight of the photograph has fallen to 1/e."""
-    sharpness: float = 2.0
+    sharpness: float = 4.0
     """Power of the weights: larger ones prefer the nearest photograph to the average."""
+    harmonize: HarmonizeConfig = HarmonizeConfig()
+    """How exposures are compared."""
 
 
 @dataclass(frozen=True)
@@ -32,34 +35,49 @@ class Warped:
     """True where the image shows the scene; elsewhere it means nothing."""
     depth: Float[Tensor, "h w"]
     """z-depth in the target camera, in scene units, where known."""
+    gains: tuple[Float[Tensor, "3"], ...]
+    """Factor that each photograph was multiplied by to match the nearest one."""
 
     def to(self, device: torch.device | str) -> Warped:
-        return Warped(self.image.to(device), self.known.to(device), self.depth.to(device))
+        return Warped(
+            self.image.to(device),
+            self.known.to(device),
+            self.depth.to(device),
+            tuple(gain.to(device) for gain in self.gains),
+        )
 
 
 def warp_photographs(
-    target: Camera, context: SceneContext, config: WarpConfig = WarpConfig()
+    nearest: View, target: Camera, context: SceneContext, config: WarpConfig = WarpConfig()
 ) -> Warped:
     """Colours of all photographs at the surfaces that the target sees.
 
     A photograph counts where the scene, seen from its camera, lies at the depth of the surface:
     elsewhere something stands before it. What no photograph shows keeps the colour of the render.
+    All are brought to the exposure of `nearest`.
     """
     scene = context.at_target
     known = scene.alpha >= config.min_alpha
     points = unproject(scene.depth, target)
-    colour = torch.zeros_like(scene.image)
-    total = torch.zeros_like(scene.depth)
+    colours, weights = [], []
     for view, render in zip(context.views, context.at_views, strict=True):
         pixels, z = project(points, view.camera)
-        weight = _visibility(pixels, z, view, render, config) * _closeness(points, target, view)
-        weight = weight**config.sharpness
-        colour = colour + weight[..., None] * sample(view.image, pixels)
-        total = total + weight
+        visible = _visibility(pixels, z, view, render, config)
+        colours.append(sample(view.image, pixels))
+        weights.append((visible * _closeness(points, target, view)) ** config.sharpness)
+
+    baselines = [baseline_between(nearest.camera, view.camera) for view in context.views]
+    reference = baselines.index(min(baselines))
+    factors = gains(colours, [known & (w > 1) for w in weights], reference, config.harmonize)
+    total = torch.stack(weights).sum(dim=0)
+    colour = torch.stack(
+        [w[..., None] * c * g for w, c, g in zip(weights, colours, factors, strict=True)]
+    ).sum(dim=0)
+
     rendered = scene.image / scene.alpha.clamp_min(config.min_alpha)[..., None]
     trust = (total / (total + 1e-4))[..., None]
     image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
-    return Warped(image.clamp(0, 1), known, scene.depth)
+    return Warped(image.clamp(0, 1), known, scene.depth, tuple(factors))
 
 
 def _visibility(
