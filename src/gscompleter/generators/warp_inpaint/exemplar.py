@@ -267,7 +267,7 @@ def halved(level: Level) -> Level:
 def pooled(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:
     """Means of 2 x 2 pixels."""
     channels_first = values.movedim(-1, -3)
-    flat = channels_first.reshape(-1, *channels_first.shape[-3:])
+    flat = channels_first.reshape(-1, *channels_first.shape[-3:]).contiguous()
     means = avg_pool2d(flat, 2, ceil_mode=True, count_include_pad=False)
     shape = (*channels_first.shape[:-2], *means.shape[-2:])
     return means.reshape(shape).movedim(-3, -1).contiguous()
