@@ -1,9 +1,9 @@
 """The embedded Φ: warp what the photographs saw into the target, and fill what none of them saw.
 
 It needs no weights. Observed pixels come from the photographs through the depth of the scene
-(`warp`), all in one exposure (`harmonize`). The hole takes its tone from a smooth continuation of
-its border (`smooth`) and, as far as the border can tell, its structure from patches of the
-photographs (`exemplar`).
+(`warp`), all in one exposure (`harmonize`), and so does what they show where the scene itself is
+empty. The rest takes its tone from a smooth continuation of its border (`smooth`) and, as far as
+the border can tell, its structure from patches of the photographs (`exemplar`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,12 @@ from torch import Tensor
 
 from gscompleter.generators.warp_inpaint.exemplar import ExemplarConfig, Sources, fill_by_patches
 from gscompleter.generators.warp_inpaint.smooth import continued, distance_to_known
-from gscompleter.generators.warp_inpaint.warp import WarpConfig, Warped, warp_photographs
+from gscompleter.generators.warp_inpaint.warp import (
+    WarpConfig,
+    Warped,
+    warp_photographs,
+    with_unexplained,
+)
 from gscompleter.interpolation import smoothed
 from gscompleter.types import Camera, SceneContext, View
 
@@ -36,7 +41,7 @@ class WarpInpaint:
     structure_reach: float = 0.1
     """How far into a hole structure is continued, relative to the longer side of the image; it
     fades out on the way. Nothing tells what lies deeper, and a wrong guess is worse than none."""
-    tone_radius: int = 8
+    tone_radius: int = 6
     """Pixels over which a hole keeps the mean colour of its smooth continuation. Patches alone
     look as plausible but drift in tone."""
     crack_width: int = 4
@@ -47,10 +52,13 @@ class WarpInpaint:
     ) -> Float[Tensor, "h w 3"]:
         """The image `target` would take, completely filled, in [0, 1]."""
         device = nearest.image.device
-        warped = warp_photographs(nearest, target, context, self.warp).to("cpu")
+        warped = warp_photographs(nearest, target, context, self.warp)
         if not warped.known.any():
             # Nothing of the scene is in sight: there is no border to continue.
             return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
+        _, log_depth = background_first(warped)
+        guess = log_depth.exp().to(device)
+        warped = with_unexplained(warped, guess, target, context, self.warp).to("cpu")
         tone, log_depth = background_first(warped)
         image = self.with_structure(tone, log_depth, warped, context)
         return image.clamp(0, 1).to(device)
@@ -69,12 +77,10 @@ class WarpInpaint:
         if not undecided.any():
             return tone
         sources = sources_of(context, warped)
-        patched = fill_by_patches(
-            tone, ~undecided, log_depth, sources, self.seed, self.exemplar
-        )
+        patched = fill_by_patches(tone, ~undecided, log_depth, sources, self.seed, self.exemplar)
         detail = patched - tone
         detail = detail - smoothed(detail, undecided, self.tone_radius)
-        fading = (1 - away / reach).clamp_min(0).sqrt()
+        fading = (1 - away / reach).clamp_min(0)
         return torch.where(undecided[..., None], tone + fading[..., None] * detail, tone)
 
 
@@ -86,6 +92,7 @@ def background_first(
     A hole beside an object is where the object hid what stands behind it, so the farther side of
     its border counts more: with the square of its depth.
     """
+    warped = warped.to("cpu")
     known = warped.known
     middle = warped.depth[known].median()
     relative = (warped.depth / middle).clamp(0.1, 10.0)

@@ -33,7 +33,7 @@ def continued(
     if not known.any():
         return torch.zeros_like(values)
     weighted = torch.cat([values * weight[..., None], weight[..., None]], dim=-1).numpy()
-    layers = blur_pyramid(np.ascontiguousarray(weighted, np.float32))
+    layers = mean_pyramid(np.ascontiguousarray(weighted, np.float32))
 
     size = reach * distance_to_known(known).numpy()
     level = np.log2(np.maximum(size / BLUR, 1.0)).clip(0, len(layers) - 1)
@@ -42,18 +42,31 @@ def continued(
     share = (level - below)[..., None].astype(np.float32)
     rows, columns = np.indices(level.shape)
     mixed = (1 - share) * layers[below, rows, columns] + share * layers[above, rows, columns]
-    means = torch.from_numpy(mixed[..., :-1] / np.maximum(mixed[..., -1:], 1e-20))
+    means = torch.from_numpy(mixed)
     return torch.where(known[..., None], values, means)
 
 
-def blur_pyramid(image: Float32[ndarray, "h w c"]) -> Float32[ndarray, "levels h w c"]:
-    """Blurred copies of `image`, each twice as wide as the one before, all at its size."""
-    h, w = image.shape[:2]
-    layers = []
+def mean_pyramid(weighted: Float32[ndarray, "h w c"]) -> Float32[ndarray, "levels h w values"]:
+    """Weighted means over wider and wider neighbourhoods, each twice as wide as the one before.
+
+    The last channel of `weighted` is the weight that the others were multiplied by. Where a
+    neighbourhood holds no weight, the mean of the next wider one stands in.
+    """
+    h, w = weighted.shape[:2]
+    sums = []
     while True:
-        blurred = cv2.GaussianBlur(image, (0, 0), BLUR)
-        layers.append(cv2.resize(blurred, (w, h), interpolation=cv2.INTER_LINEAR))
-        if min(image.shape[:2]) <= 8:
-            return np.stack(layers).reshape(len(layers), h, w, -1)
-        half = ((image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2)
-        image = cv2.resize(blurred, half, interpolation=cv2.INTER_AREA)
+        blurred = cv2.GaussianBlur(weighted, (0, 0), BLUR)
+        sums.append(cv2.resize(blurred, (w, h), interpolation=cv2.INTER_LINEAR))
+        if min(weighted.shape[:2]) <= 8:
+            break
+        half = ((weighted.shape[1] + 1) // 2, (weighted.shape[0] + 1) // 2)
+        weighted = cv2.resize(blurred, half, interpolation=cv2.INTER_AREA)
+
+    total = sums[0].sum(axis=(0, 1))
+    wider = np.broadcast_to(total[:-1] / total[-1], (h, w, len(total) - 1))
+    means = []
+    for layer in reversed(sums):
+        own = layer[..., :-1] / np.maximum(layer[..., -1:], 1e-12)
+        wider = np.where(layer[..., -1:] > 1e-6, own, wider).astype(np.float32)
+        means.append(wider)
+    return np.stack(means[::-1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -78,6 +78,40 @@ def warp_photographs(
     trust = (total / (total + 1e-4))[..., None]
     image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
     return Warped(image.clamp(0, 1), known, scene.depth, tuple(factors))
+
+
+def with_unexplained(
+    warped: Warped,
+    guess: Float[Tensor, "h w"],
+    target: Camera,
+    context: SceneContext,
+    config: WarpConfig = WarpConfig(),
+) -> Warped:
+    """`warped`, and in its holes what photographs show although the scene has a hole there too.
+
+    A scene may lack surfaces that were photographed: captured from too few sides, or trimmed. Their
+    depth is unknown, so they are carried over at `guess`, the depth [h, w] in scene units that
+    continues what surrounds the hole. Only photographs whose own view of the scene is empty in
+    that direction take part: elsewhere they show what stands before the hole.
+    """
+    points = unproject(guess, target)
+    colour = torch.zeros_like(warped.image)
+    total = torch.zeros_like(guess)
+    for view, render, gain in zip(context.views, context.at_views, warped.gains, strict=True):
+        pixels, z = project(points, view.camera)
+        empty = sample(render.alpha[..., None], pixels)[..., 0] < config.min_alpha
+        unexplained = empty & inside(pixels, z, view.camera) & ~warped.known
+        weight = unexplained * _closeness(points, target, view) ** config.sharpness
+        colour = colour + weight[..., None] * gain * sample(view.image, pixels)
+        total = total + weight
+    found = total > 0
+    shown = (colour / total.clamp_min(1e-12)[..., None]).clamp(0, 1)
+    return replace(
+        warped,
+        image=torch.where(found[..., None], shown, warped.image),
+        known=warped.known | found,
+        depth=torch.where(found, guess, warped.depth),
+    )
 
 
 def _visibility(
