@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import combinations
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.reconstructors.plane_sweep.features import features_of, matches
 from gscompleter.reconstructors.plane_sweep.frames import Frame, frames_of, transform_between
 from gscompleter.types import View
 
@@ -48,43 +48,18 @@ def range_from_baseline(frames: Sequence[Frame]) -> tuple[float, float]:
 
 def triangulated(frames: Sequence[Frame]) -> Float[np.ndarray, "n"]:
     """Inverse z-depths (per baseline) of features that agree with the epipolar geometry."""
-    features = [_features(frame) for frame in frames]
+    features = [features_of(frame) for frame in frames]
     pairs = sorted(
         combinations(range(len(frames)), 2),
         key=lambda p: -float(np.linalg.norm(frames[p[0]].center - frames[p[1]].center)),
     )
     found = [np.zeros(0)]
     for i, j in pairs[:MAX_PAIRS]:
-        a, b = _matches(features[i], features[j])
+        a, b = matches(features[i], features[j])
         if len(a):
             found.append(_inverse_depths(frames[i], frames[j], a, b))
             found.append(_inverse_depths(frames[j], frames[i], b, a))
     return np.concatenate(found)
-
-
-Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
-
-
-def _features(frame: Frame) -> Features:
-    """Pixels and descriptors of SIFT; the top-left pixel's centre is (0.5, 0.5)."""
-    grey = cv2.cvtColor((frame.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = cv2.SIFT.create(2000, contrastThreshold=0.02).detectAndCompute(
-        grey, None
-    )
-    if descriptors is None:
-        return np.zeros((0, 2)), np.zeros((0, 128))
-    return np.array([k.pt for k in keypoints], np.float64) + 0.5, descriptors.astype(np.float64)
-
-
-def _matches(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of mutual nearest neighbours that are clearly nearer than the second."""
-    if len(a[0]) < 2 or len(b[0]) < 2:
-        return np.zeros((0, 2)), np.zeros((0, 2))
-    squares = (a[1] ** 2).sum(1)[:, None] + (b[1] ** 2).sum(1)[None] - 2 * a[1] @ b[1].T
-    forward, backward = squares.argmin(1), squares.argmin(0)
-    best, second = np.partition(squares, 1, axis=1)[:, :2].T
-    i = np.flatnonzero((backward[forward] == np.arange(len(a[0]))) & (best < 0.64 * second))
-    return a[0][i], b[0][forward[i]]
 
 
 def _inverse_depths(

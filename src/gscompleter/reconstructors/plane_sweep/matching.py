@@ -9,7 +9,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from gscompleter.kernels import stereo
-from gscompleter.reconstructors.plane_sweep.frames import Frame, transform_between
+from gscompleter.reconstructors.plane_sweep.frames import Frame
+
+Source = tuple[Frame, Float[np.ndarray, "3 4"]]
+"""Another view, and the transform to its pixels from those of the reference."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class MatchingConfig:
     """Most planes."""
     radius: int = 2
     """Of the windows that are correlated, in pixels."""
-    noise: float = 0.004
+    noise: float = 0.015
     """Standard deviation of noise in colour; weaker texture correlates with nothing."""
     detail: float = 0.4
     """Share of the pixels' own difference in the cost; the rest is correlation of windows."""
@@ -33,7 +36,7 @@ class MatchingConfig:
 
 
 def inverse_depth_planes(
-    reference: Frame, sources: Sequence[Frame], near: float, far: float, config: MatchingConfig
+    reference: Frame, sources: Sequence[Source], near: float, far: float, config: MatchingConfig
 ) -> Float[np.ndarray, "d"]:
     """Inverse depths from far to near, evenly spaced, so that planes move by about `step` pixels.
 
@@ -45,8 +48,8 @@ def inverse_depth_planes(
     samples = np.linspace(1 / far, 1 / near, 257)
     motion = np.zeros(256)
     overlap = np.zeros(257)
-    for source in sources:
-        transform = transform_between(reference, source).astype(np.float64)
+    for source, float_transform in sources:
+        transform = float_transform.astype(np.float64)
         moved = (pixels @ transform[:, :3].T)[None] + samples[:, None, None] * transform[:, 3]
         ratio = moved[..., 2]
         at = moved[..., :2] / np.maximum(ratio, 1e-3)[..., None]
@@ -67,7 +70,7 @@ def inverse_depth_planes(
 
 def cost_volume(
     reference: Frame,
-    sources: Sequence[Frame],
+    sources: Sequence[Source],
     inverse_depths: Float[np.ndarray, "d"],
     config: MatchingConfig,
 ) -> UInt8[np.ndarray, "h w d"]:
@@ -76,12 +79,12 @@ def cost_volume(
         stereo.matching_costs(
             reference.image,
             source.image,
-            transform_between(reference, source),
+            transform,
             inverse_depths,
             config.radius,
             np.float32(config.noise),
             np.float32(config.detail),
         )
-        for source in sources
+        for source, transform in sources
     ]
     return stereo.best_mean(np.stack(costs), config.best_share, np.uint8(config.unseen_cost))

@@ -3,43 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import combinations, permutations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from gscompleter.errors import InputError
-from gscompleter.interpolation import fill_smoothly
 from gscompleter.kernels import stereo
 from gscompleter.reconstructors.plane_sweep.aggregation import AggregationConfig, aggregate
-from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_range
-from gscompleter.reconstructors.plane_sweep.frames import (
-    Frame,
-    frames_of,
-    transform_between,
+from gscompleter.reconstructors.plane_sweep.appearance import AppearanceConfig, fit_appearance
+from gscompleter.reconstructors.plane_sweep.confidence import (
+    ConfidenceConfig,
+    agreement,
+    confidence_of,
 )
+from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_range
+from gscompleter.reconstructors.plane_sweep.epipolar import EpipolarConfig, turned_to_matches
+from gscompleter.reconstructors.plane_sweep.features import features_of, matches
+from gscompleter.reconstructors.plane_sweep.frames import Frame, frames_of, transform_between
 from gscompleter.reconstructors.plane_sweep.gaussians import DiscConfig, discs, normals_of
 from gscompleter.reconstructors.plane_sweep.matching import (
     MatchingConfig,
     cost_volume,
     inverse_depth_planes,
 )
+from gscompleter.reconstructors.plane_sweep.surfaces import SurfaceConfig, fit_surfaces
+from gscompleter.render import Renderer, load_renderer
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
+
+Map = Float32[np.ndarray, "_ _"]
+Transforms = dict[tuple[int, int], Float32[np.ndarray, "3 4"]]
+"""From the pixels of one view, at an inverse depth, to those of another, by their numbers."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What matching says of one view."""
+
+    planes: Float32[np.ndarray, "d"]
+    """Inverse depths from far to near, evenly spaced."""
+    index: Map
+    """The best plane of each pixel, to a fraction."""
+    margin: Map
+    """How much more the second best costs."""
+
+    def inverse(self, index: Map) -> Map:
+        """Inverse depths at fractions of planes, none farther than twice the farthest plane."""
+        step = self.planes[1] - self.planes[0]
+        within = index.clip(-0.5, len(self.planes) - 0.5)
+        return np.maximum(self.planes[0] + within * step, self.planes[0] / 2).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class PlaneSweep:
-    """Plane-sweep stereo with semi-global aggregation, completed where nothing matches."""
+    """Plane-sweep stereo, completed by surfaces, splatted, and fitted to the photographs."""
 
+    epipolar: EpipolarConfig = EpipolarConfig()
+    """Small errors of the poses."""
     matching: MatchingConfig = MatchingConfig()
     """Planes and costs."""
     aggregation: AggregationConfig = AggregationConfig()
     """Penalties of the semi-global aggregation."""
+    confidence: ConfidenceConfig = ConfidenceConfig()
+    """Which matches count."""
+    surfaces: SurfaceConfig = SurfaceConfig()
+    """How depth is smoothed, and completed where nothing matches."""
     discs: DiscConfig = DiscConfig()
     """Sizes of the Gaussians."""
-    max_return_error: float = 1.5
-    """Pixels by which a match may miss itself on the way to another view and back."""
+    appearance: AppearanceConfig = AppearanceConfig()
+    """How opacities and colours are fitted."""
+    renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
+    """Draws Gaussians while they are fitted."""
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Gaussians of all pixels of `views`, and their depths.
@@ -47,34 +83,67 @@ class PlaneSweep:
         Raises:
             InputError: fewer than two views, no baseline between them, an empty depth range.
         """
-        frames, unit = frames_of(views)
-        near, far = depth_range(views)
-        inverses = [self.sweep(i, frames, near / unit, far / unit) for i in range(len(frames))]
-        depths = []
-        for number, view in enumerate(views):
-            valid = torch.from_numpy(agreeing(number, frames, inverses, self.max_return_error))
-            inverse = torch.from_numpy(inverses[number])
-            filled = fill_smoothly(inverse, valid) if valid.any() else inverse
-            device = view.image.device
-            depths.append(DepthMap((unit / filled).to(device), valid.to(device)))
+        depths = self.depths(views)
         parts = [self.splat(view, depth) for view, depth in zip(views, depths, strict=True)]
+        device = views[0].image.device
+        fitted = fit_appearance(
+            merge(parts).to("cpu"),
+            [view.to("cpu") for view in views],
+            self.renderer,
+            self.appearance,
+        )
         return Reconstruction(
-            merge(parts),
+            fitted.to(device),
             tuple(depths),
             torch.cat([torch.full((len(p),), i) for i, p in enumerate(parts)]),
             torch.cat([torch.arange(len(p)) for p in parts]),
         )
 
+    def depths(self, views: Sequence[View]) -> list[DepthMap]:
+        """z-depth of all pixels of `views`, valid where it was measured."""
+        frames, unit = frames_of(views)
+        near, far = depth_range(views)
+        transforms = transforms_among(frames, self.epipolar)
+        sweeps = [
+            self.sweep(i, frames, transforms, near / unit, far / unit) for i in range(len(frames))
+        ]
+        confidences = self.confidences(sweeps, transforms)
+        depths = []
+        for view, frame, sweep, confidence in zip(views, frames, sweeps, confidences, strict=True):
+            heights = fit_surfaces(sweep.index, confidence, frame.image, self.surfaces)
+            depth = torch.from_numpy(np.float32(unit) / sweep.inverse(heights))
+            valid = torch.from_numpy(confidence > 0)
+            depths.append(DepthMap(depth.to(view.image.device), valid.to(view.image.device)))
+        return depths
+
     def sweep(
-        self, number: int, frames: Sequence[Frame], near: float, far: float
-    ) -> Float32[np.ndarray, "h w"]:
-        """Inverse depths of view `number`, by matching it with all others."""
+        self,
+        number: int,
+        frames: Sequence[Frame],
+        transforms: Transforms,
+        near: float,
+        far: float,
+    ) -> Sweep:
+        """The planes that match best in view `number`."""
         frame = frames[number]
-        sources = [other for i, other in enumerate(frames) if i != number]
+        others = [i for i in range(len(frames)) if i != number]
+        sources = [(frames[i], transforms[number, i]) for i in others]
         planes = inverse_depth_planes(frame, sources, near, far, self.matching)
         costs = cost_volume(frame, sources, planes, self.matching)
-        index, _ = stereo.winners(aggregate(costs, frame, self.aggregation))
-        return (planes[0] + index * (planes[1] - planes[0])).astype(np.float32)
+        index, margin = stereo.winners(aggregate(costs, frame, self.aggregation))
+        return Sweep(planes, index, margin)
+
+    def confidences(self, sweeps: Sequence[Sweep], transforms: Transforms) -> list[Map]:
+        """How much each pixel's match counts: 0 where no other view agrees with it."""
+        inverses = [sweep.inverse(sweep.index) for sweep in sweeps]
+        agrees = [np.zeros(inverse.shape, bool) for inverse in inverses]
+        for i, j in permutations(range(len(sweeps)), 2):
+            there, back = transforms[i, j], transforms[j, i]
+            agrees[i] |= agreement(inverses[i], inverses[j], there, back, self.confidence)
+        return [
+            confidence_of(sweep.index, sweep.margin, agree, self.confidence)
+            for sweep, agree in zip(sweeps, agrees, strict=True)
+        ]
 
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
         """A disc for every pixel of `view`."""
@@ -82,21 +151,16 @@ class PlaneSweep:
         return discs(view, depth.depth, normals_of(depth.depth, view), opacity, self.discs)
 
 
-def agreeing(
-    number: int,
-    frames: Sequence[Frame],
-    inverses: Sequence[Float32[np.ndarray, "_ _"]],
-    max_return_error: float,
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels of view `number` that some other view sees at the same depth."""
-    agree = np.zeros(frames[number].size, bool)
-    for other in range(len(frames)):
-        if other != number:
-            there = transform_between(frames[number], frames[other])
-            back = transform_between(frames[other], frames[number])
-            error, _ = stereo.reproject(inverses[number], inverses[other], there, back)
-            agree |= (error >= 0) & (error < max_return_error)
-    return agree
+def transforms_among(frames: Sequence[Frame], config: EpipolarConfig) -> Transforms:
+    """From every view to every other, through poses that agree with the matched features."""
+    features = [features_of(frame) for frame in frames]
+    transforms = {}
+    for i, j in combinations(range(len(frames)), 2):
+        pixels, matched = matches(features[i], features[j])
+        turned = turned_to_matches(frames[i], frames[j], pixels, matched, config)
+        transforms[i, j] = transform_between(frames[i], turned)
+        transforms[j, i] = transform_between(turned, frames[i])
+    return transforms
 
 
 def depth_range(views: Sequence[View]) -> tuple[float, float]:

@@ -1,0 +1,83 @@
+"""Total generalized variation of second order: surfaces that are plane wherever they can be."""
+
+import numpy as np
+from numba import njit, prange
+
+MATH = {"nnan", "ninf", "nsz", "arcp", "contract", "reassoc"}
+PRIMAL_STEP = 0.25
+SLOPE_STEP = 0.2
+DUAL_STEP = 1 / 3
+SLOPE_DUAL_STEP = 0.5
+"""Steps of the four variables: inverse row sums of the operator, as in Pock and Chambolle 2011."""
+
+
+@njit(cache=True, parallel=True, fastmath=MATH, error_model="numpy")
+def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations):
+    """Heights u and slopes v that minimise, by the first-order primal-dual algorithm,
+
+        sum weight * huber(u - data) + across |u_x - v_x| + down |u_y - v_y| + bend |grad v|
+
+    over all pixels: an image of least bending in which a step, where it must be, costs its height.
+
+    Args:
+        heights, slopes: Where to begin [h, w] and [2, h, w] (x, y); written to.
+        data, weight: Measured heights and how much each counts [h, w]; 0 where nothing was.
+        across, down: Cost of a step to the right and to the pixel below [h, w].
+        bend: Cost of a change of slope.
+        tolerance: Deviation from `data` under which the loss is quadratic.
+        iterations: How many.
+    """
+    h, w = heights.shape
+    one, two, none = np.float32(1), np.float32(2), np.float32(0)
+    ahead, slopes_ahead = heights.copy(), slopes.copy()
+    steps = np.zeros((2, h, w), np.float32)
+    bends = np.zeros((4, h, w), np.float32)
+    primal, slope_step = np.float32(PRIMAL_STEP), np.float32(SLOPE_STEP)
+    dual, slope_dual = np.float32(DUAL_STEP), np.float32(SLOPE_DUAL_STEP)
+    for _ in range(iterations):
+        for y in prange(h):
+            for x in range(w):
+                b0, b1, b2, b3 = bends[0, y, x], bends[1, y, x], bends[2, y, x], bends[3, y, x]
+                if x < w - 1:
+                    rise = ahead[y, x + 1] - ahead[y, x] - slopes_ahead[0, y, x]
+                    value = steps[0, y, x] + dual * rise
+                    steps[0, y, x] = min(max(value, -across[y, x]), across[y, x])
+                    b0 += slope_dual * (slopes_ahead[0, y, x + 1] - slopes_ahead[0, y, x])
+                    b2 += slope_dual * (slopes_ahead[1, y, x + 1] - slopes_ahead[1, y, x])
+                if y < h - 1:
+                    rise = ahead[y + 1, x] - ahead[y, x] - slopes_ahead[1, y, x]
+                    value = steps[1, y, x] + dual * rise
+                    steps[1, y, x] = min(max(value, -down[y, x]), down[y, x])
+                    b1 += slope_dual * (slopes_ahead[0, y + 1, x] - slopes_ahead[0, y, x])
+                    b3 += slope_dual * (slopes_ahead[1, y + 1, x] - slopes_ahead[1, y, x])
+                length = np.sqrt(b0 * b0 + b1 * b1 + b2 * b2 + b3 * b3)
+                shorter = one / max(one, length / bend)
+                bends[0, y, x], bends[1, y, x] = b0 * shorter, b1 * shorter
+                bends[2, y, x], bends[3, y, x] = b2 * shorter, b3 * shorter
+        for y in prange(h):
+            for x in range(w):
+                push = steps[0, y, x] + steps[1, y, x]
+                turn0 = bends[0, y, x] + bends[1, y, x]
+                turn1 = bends[2, y, x] + bends[3, y, x]
+                if x > 0:
+                    push -= steps[0, y, x - 1]
+                    turn0 -= bends[0, y, x - 1]
+                    turn1 -= bends[2, y, x - 1]
+                if y > 0:
+                    push -= steps[1, y - 1, x]
+                    turn0 -= bends[1, y - 1, x]
+                    turn1 -= bends[3, y - 1, x]
+                before = heights[y, x]
+                pull = primal * weight[y, x]
+                miss = before + primal * push - data[y, x]
+                if abs(miss) <= pull + tolerance:
+                    miss *= tolerance / (tolerance + pull)
+                else:
+                    miss -= pull if miss > none else -pull
+                heights[y, x] = data[y, x] + miss
+                ahead[y, x] = two * heights[y, x] - before
+                v0, v1 = slopes[0, y, x], slopes[1, y, x]
+                slopes[0, y, x] = v0 + slope_step * (steps[0, y, x] + turn0)
+                slopes[1, y, x] = v1 + slope_step * (steps[1, y, x] + turn1)
+                slopes_ahead[0, y, x] = two * slopes[0, y, x] - v0
+                slopes_ahead[1, y, x] = two * slopes[1, y, x] - v1

@@ -1,0 +1,33 @@
+"""Matched features of two views (SIFT, Lowe 2004)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.reconstructors.plane_sweep.frames import Frame
+
+Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
+"""Pixels (the top-left pixel's centre is (0.5, 0.5)) and descriptors."""
+Pixels = Float[np.ndarray, "m 2"]
+
+
+def features_of(frame: Frame) -> Features:
+    grey = cv2.cvtColor((frame.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    detector = cv2.SIFT.create(2000, contrastThreshold=0.02)
+    keypoints, descriptors = detector.detectAndCompute(grey, None)
+    if descriptors is None:
+        return np.zeros((0, 2)), np.zeros((0, 128))
+    return np.array([k.pt for k in keypoints], np.float64) + 0.5, descriptors.astype(np.float64)
+
+
+def matches(a: Features, b: Features) -> tuple[Pixels, Pixels]:
+    """Pixels of mutual nearest neighbours that are clearly nearer than the second."""
+    if len(a[0]) < 2 or len(b[0]) < 2:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    squares = (a[1] ** 2).sum(1)[:, None] + (b[1] ** 2).sum(1)[None] - 2 * a[1] @ b[1].T
+    forward, backward = squares.argmin(1), squares.argmin(0)
+    best, second = np.partition(squares, 1, axis=1)[:, :2].T
+    i = np.flatnonzero((backward[forward] == np.arange(len(a[0]))) & (best < 0.64 * second))
+    return a[0][i], b[0][forward[i]]

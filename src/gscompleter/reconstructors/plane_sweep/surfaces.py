@@ -1,0 +1,112 @@
+"""Plane pieces from uncertain depths: total generalized variation (Bredies, Kunisch and Pock 2010;
+for stereo Ranftl et al. 2012).
+
+The inverse depth of a plane is linear in the pixel. A map of inverse depths that bends as little as
+its measurements allow is therefore made of planes, and where nothing was measured, at the border of
+the frame or on a blank wall, the planes around go on; they end at the edges of the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from gscompleter.interpolation import fill_smoothly
+from gscompleter.kernels import variation
+
+Image = Float32[np.ndarray, "h w 3"]
+Map = Float32[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """Heights are inverse depths, in steps between the planes of the sweep."""
+
+    step_penalty: float = 3.0
+    """Cost of a step by one plane where the image is even; a measurement that counts in full costs
+    1 per plane that is missed."""
+    bend_penalty: float = 12.0
+    """Cost of a change of slope by one plane per pixel."""
+    edge_contrast: float = 0.1
+    """Difference of colour at which a step costs 1/e of that."""
+    least_penalty: float = 0.02
+    """Cost of a step at the strongest edge, relative to one where the image is even."""
+    tolerance: float = 0.3
+    """Planes by which a measurement may be off as a matter of course."""
+    levels: int = 5
+    """Levels of the pyramid, each of half the size; planes travel far on the coarse ones."""
+    iterations: int = 150
+    """Steps on each level."""
+
+
+def fit_surfaces(
+    measured: Map, confidence: Map, image: Image, config: SurfaceConfig = SurfaceConfig()
+) -> Map:
+    """Heights [h, w] that follow `measured` as far as `confidence` [h, w] in [0, 1] goes.
+
+    Where nothing at all is measured, the result is `measured`.
+    """
+    known = confidence > 0
+    if not known.any():
+        return measured
+    start = fill_smoothly(torch.from_numpy(measured), torch.from_numpy(known)).numpy()
+    levels = [(start, measured, confidence, image)]
+    while len(levels) < config.levels and min(levels[-1][0].shape) > 4:
+        levels.append(halved(*levels[-1]))
+    heights = levels[-1][0].copy()
+    slopes = np.zeros((2, *heights.shape), np.float32)
+    for number, (start, data, weight, colours) in reversed(list(enumerate(levels))):
+        if heights.shape != start.shape:
+            heights = doubled(heights, start.shape)
+            slopes = np.stack([doubled(slope, start.shape) / 2 for slope in slopes])
+        # A coarse pixel holds 4 ** number fine ones; its steps are 2 ** number times as high.
+        scale = 2.0**number
+        across, down = step_costs(colours, config)
+        variation.fit(
+            heights,
+            slopes,
+            data,
+            weight,
+            across / np.float32(scale),
+            down / np.float32(scale),
+            np.float32(config.bend_penalty / scale**2),
+            np.float32(config.tolerance),
+            config.iterations,
+        )
+    return heights
+
+
+def step_costs(image: Image, config: SurfaceConfig) -> tuple[Map, Map]:
+    """What a step to the right neighbour costs, and to the one below: less at an edge."""
+
+    def cost(contrast: Map) -> Map:
+        share = np.maximum(np.exp(-contrast / config.edge_contrast), config.least_penalty)
+        return (config.step_penalty * share).astype(np.float32)
+
+    across = np.abs(np.diff(image, axis=1, append=image[:, -1:])).max(axis=-1)
+    down = np.abs(np.diff(image, axis=0, append=image[-1:])).max(axis=-1)
+    return cost(across), cost(down)
+
+
+def halved(start: Map, data: Map, weight: Map, image: Image) -> tuple[Map, Map, Map, Image]:
+    """A level of half the size; measurements are averaged by their weights."""
+    h, w = start.shape
+    size = (h + 1) // 2, (w + 1) // 2
+
+    def sums(values: Map) -> Map:
+        padded = np.pad(values, ((0, size[0] * 2 - h), (0, size[1] * 2 - w)))
+        return padded.reshape(size[0], 2, size[1], 2).sum(axis=(1, 3))
+
+    total = sums(weight)
+    mean = sums(weight * data) / np.maximum(total, np.float32(1e-9))
+    area = sums(np.ones_like(start))
+    smaller = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
+    return sums(start) / area, mean, total / area, smaller
+
+
+def doubled(values: Map, shape: tuple[int, ...]) -> Map:
+    return cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
