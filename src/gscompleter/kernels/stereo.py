@@ -387,3 +387,38 @@ def reproject(depth, other, there, back):
             error[y, x] = np.sqrt(rx * rx + ry * ry)
             ratio[y, x] = value / max(expected, np.float32(1e-12))
     return error, ratio
+
+
+@njit(cache=True, parallel=True)
+def background(values, known):
+    """For each unknown pixel the second lowest of the known values met first in eight directions.
+
+    Inverse depths are low far away, and one direction may slip past a thin object in front.
+
+    Returns:
+        `values`, filled [h, w]; where fewer than two directions meet anything they stay.
+    """
+    h, w = values.shape
+    filled = values.copy()
+    for y in prange(h):
+        for x in range(w):
+            if known[y, x]:
+                continue
+            lowest, second = np.float32(np.inf), np.float32(np.inf)
+            for direction in range(9):
+                dy, dx = direction // 3 - 1, direction % 3 - 1
+                if dy == 0 and dx == 0:
+                    continue
+                yy, xx = y + dy, x + dx
+                while 0 <= yy < h and 0 <= xx < w and not known[yy, xx]:
+                    yy += dy
+                    xx += dx
+                if 0 <= yy < h and 0 <= xx < w:
+                    value = values[yy, xx]
+                    if value < lowest:
+                        lowest, second = value, lowest
+                    elif value < second:
+                        second = value
+            if second < np.inf:
+                filled[y, x] = second
+    return filled

@@ -13,9 +13,9 @@ from gscompleter.reconstructors.plane_sweep.frames import Frame
 
 @dataclass(frozen=True)
 class AggregationConfig:
-    small_penalty: float = 16.0
+    small_penalty: float = 25.0
     """Cost of a change by one plane between neighbours."""
-    large_penalty: float = 220.0
+    large_penalty: float = 300.0
     """Cost of a jump between neighbours of the same colour."""
     edge_contrast: float = 0.06
     """Difference of colour at which the penalty of a jump has halved."""

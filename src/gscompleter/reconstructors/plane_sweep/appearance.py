@@ -1,8 +1,8 @@
 """Opacities and colours that bring the Gaussians nearer to their photographs; geometry stays.
 
 Pixels become Gaussians at the depth that stereo gave them, all of them opaque. Where two views
-disagree, one of them stands in the other's way; drawn on top of each other they blur. A few steps of
-descent tell which of the two to believe, and give the colours the sharpness that drawing takes.
+disagree, one of them stands in the other's way; drawn on top of each other they blur. A few steps
+of descent tell which of the two to believe, and give the colours the sharpness that drawing takes.
 """
 
 from __future__ import annotations

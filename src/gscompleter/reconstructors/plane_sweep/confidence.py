@@ -24,6 +24,8 @@ class ConfidenceConfig:
     """Pixels of the smallest patch of like depth that is no accident."""
     max_step: float = 2.0
     """Planes between neighbours of one patch."""
+    of_background: float = 0.3
+    """Of the background's depth where an object hides it from the other views."""
 
 
 def confidence_of(index: Map, margin: Map, agrees: Mask, config: ConfidenceConfig) -> Map:

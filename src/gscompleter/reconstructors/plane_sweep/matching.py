@@ -17,7 +17,7 @@ Source = tuple[Frame, Float[np.ndarray, "3 4"]]
 
 @dataclass(frozen=True)
 class MatchingConfig:
-    step: float = 0.6
+    step: float = 0.5
     """Pixels by which neighbouring planes move in the other image, at most pixels."""
     min_planes: int = 48
     """Fewest planes."""

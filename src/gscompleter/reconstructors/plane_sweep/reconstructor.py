@@ -29,6 +29,7 @@ from gscompleter.reconstructors.plane_sweep.matching import (
     cost_volume,
     inverse_depth_planes,
 )
+from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
 from gscompleter.reconstructors.plane_sweep.surfaces import SurfaceConfig, fit_surfaces
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
@@ -36,6 +37,8 @@ from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
 Map = Float32[np.ndarray, "_ _"]
 Transforms = dict[tuple[int, int], Float32[np.ndarray, "3 4"]]
 """From the pixels of one view, at an inverse depth, to those of another, by their numbers."""
+UNKNOWN = np.float32(1e-9)
+"""Inverse depth of what a view is not sure of."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +112,11 @@ class PlaneSweep:
         ]
         confidences = self.confidences(sweeps, transforms)
         depths = []
-        for view, frame, sweep, confidence in zip(views, frames, sweeps, confidences, strict=True):
-            heights = fit_surfaces(sweep.index, confidence, frame.image, self.surfaces)
+        for number, (view, frame, sweep) in enumerate(zip(views, frames, sweeps, strict=True)):
+            measured, weight = self.with_background(number, sweeps, confidences, transforms)
+            heights = fit_surfaces(measured, weight, frame.image, self.surfaces)
             depth = torch.from_numpy(np.float32(unit) / sweep.inverse(heights))
-            valid = torch.from_numpy(confidence > 0)
+            valid = torch.from_numpy(confidences[number] > 0)
             depths.append(DepthMap(depth.to(view.image.device), valid.to(view.image.device)))
         return depths
 
@@ -144,6 +148,31 @@ class PlaneSweep:
             confidence_of(sweep.index, sweep.margin, agree, self.confidence)
             for sweep, agree in zip(sweeps, agrees, strict=True)
         ]
+
+    def with_background(
+        self,
+        number: int,
+        sweeps: Sequence[Sweep],
+        confidences: Sequence[Map],
+        transforms: Transforms,
+    ) -> tuple[Map, Map]:
+        """The planes of view `number` and how much each counts, those of occluded pixels too."""
+        sweep, confidence = sweeps[number], confidences[number]
+        background = stereo.background(sweep.index, confidence > 0)
+        neighbours = [
+            Neighbour(
+                np.where(confidences[i] > 0, other.inverse(other.index), UNKNOWN),
+                transforms[number, i],
+                transforms[i, number],
+            )
+            for i, other in enumerate(sweeps)
+            if i != number
+        ]
+        occluded = (confidence == 0) & hidden_from_others(
+            sweep.inverse(background), neighbours, self.confidence.max_return_error
+        )
+        weight = np.where(occluded, np.float32(self.confidence.of_background), confidence)
+        return np.where(occluded, background, sweep.index), weight
 
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
         """A disc for every pixel of `view`."""

@@ -35,11 +35,11 @@ class SurfaceConfig:
     """Difference of colour at which a step costs 1/e of that."""
     least_penalty: float = 0.02
     """Cost of a step at the strongest edge, relative to one where the image is even."""
-    tolerance: float = 0.3
+    tolerance: float = 0.15
     """Planes by which a measurement may be off as a matter of course."""
     levels: int = 5
     """Levels of the pyramid, each of half the size; planes travel far on the coarse ones."""
-    iterations: int = 150
+    iterations: int = 250
     """Steps on each level."""
 
 

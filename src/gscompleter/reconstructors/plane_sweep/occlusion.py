@@ -1,0 +1,42 @@
+"""What one view sees past the edge of an object and the others do not lies on the background."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from gscompleter.kernels import stereo
+
+Map = Float32[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """Another view: what it knows of its depths, and the ways to it and back."""
+
+    inverse: Float32[np.ndarray, "other_h other_w"]
+    """Inverse depths; next to 0 where it is not sure of them."""
+    there: Float32[np.ndarray, "3 4"]
+    back: Float32[np.ndarray, "3 4"]
+
+
+def hidden_from_others(
+    background: Map, neighbours: Sequence[Neighbour], max_return_error: float
+) -> Mask:
+    """Where a surface at inverse depth `background` [h, w] is hidden from some and seen by none.
+
+    A neighbour hides it whose own surface in that direction is nearer.
+    """
+    hidden = np.zeros(background.shape, bool)
+    seen = np.zeros(background.shape, bool)
+    for other in neighbours:
+        error, ratio = stereo.reproject(background, other.inverse, other.there, other.back)
+        known = (error >= 0) & (ratio > 1e-3)
+        before = known & (error > max_return_error) & (ratio > 1)
+        hidden |= before
+        seen |= known & ~before
+    return hidden & ~seen
