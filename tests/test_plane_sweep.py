@@ -86,11 +86,14 @@ def test_another_exposure_leaves_the_depth():
 @pytest.mark.parametrize("unit", [0.001, 1000.0])
 def test_the_unit_of_the_scene_scales_means_and_sizes(unit):
     ours, theirs = PlaneSweep()(side_by_side()), PlaneSweep()(side_by_side(unit))
-    # A winner-takes-all decision may flip by rounding; one pixel in a thousand may move.
+    # A winner-takes-all decision may flip by rounding; one pixel in a thousand may move, and the
+    # appearance of what stands before or behind it.
     for name in ("means", "scales"):
         a, b = getattr(theirs.gaussians, name) / unit, getattr(ours.gaussians, name)
         assert ((a - b).abs() > 1e-3 * b.abs().max()).float().mean() < 1e-3, name
-    assert torch.allclose(theirs.gaussians.sh, ours.gaussians.sh, atol=1e-2)
+    for name in ("sh", "opacities"):
+        a, b = getattr(theirs.gaussians, name), getattr(ours.gaussians, name)
+        assert (a - b).abs().gt(0.1).float().mean() < 1e-2, name
 
 
 def test_the_same_views_give_the_same_bytes():
@@ -138,11 +141,17 @@ def test_the_motorcycle_at_a_quarter_of_its_size():
         for c in motorcycle_cameras(741, 500)
     ]
     views = [View(i, c) for i, c in zip(images, cameras, strict=True)]
-    found = PlaneSweep()(views).depths[0].depth
+    found = PlaneSweep().depths(views)[0]
     disparity = disparity[::4, ::4]
     known = torch.from_numpy(np.isfinite(disparity))
     truth = torch.from_numpy(FOCAL_PX * BASELINE_M / (disparity + PRINCIPAL_POINT_DX_PX)).float()
-    assert share_within(found, truth, 0.05, known) > 0.75
+    assert share_within(found.depth, truth, 0.05, known) > 0.8
+    unsure = share_within(found.depth, truth, 0.05, known & (found.confidence == 0))
+    halfway = (found.confidence > 0) & (found.confidence < 0.9)
+    between = share_within(found.depth, truth, 0.05, known & halfway)
+    sure = share_within(found.depth, truth, 0.05, known & (found.confidence >= 0.9))
+    assert unsure < between < sure
+    assert sure > 0.9
 
 
 def test_depth_of_a_real_room(shared):

@@ -227,6 +227,8 @@ class DepthMap:
 
     depth: Float[Tensor, "h w"]
     valid: Bool[Tensor, "h w"]
+    confidence: Float[Tensor, "h w"] | None = None
+    """How sure the model is of it, in [0, 1]; None where the model does not tell."""
 
 
 @dataclass(frozen=True)

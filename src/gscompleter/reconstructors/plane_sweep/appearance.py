@@ -20,9 +20,9 @@ from gscompleter.types import SH_C0, Gaussians, View
 
 @dataclass(frozen=True)
 class AppearanceConfig:
-    opacity_steps: int = 20
+    opacity_steps: int = 15
     """Steps of Adam on the opacities; 0 leaves them."""
-    learning_rate: float = 0.3
+    learning_rate: float = 0.4
     """Step of Adam, on the logit."""
     removal_penalty: float = 0.01
     """Cost of an opacity taken away, so that what no photograph objects to stays."""

@@ -13,7 +13,7 @@ from gscompleter.types import Gaussians, View, observed, sh_from_rgb
 
 @dataclass(frozen=True)
 class DiscConfig:
-    sigma: float = 0.7
+    sigma: float = 0.6
     """Standard deviation across the line of sight, in pixels."""
     thickness: float = 0.15
     """Standard deviation along the surface's normal, relative to that across the line of sight."""

@@ -103,7 +103,7 @@ class PlaneSweep:
         )
 
     def depths(self, views: Sequence[View]) -> list[DepthMap]:
-        """z-depth of all pixels of `views`, valid where it was measured."""
+        """z-depth of all pixels of `views`, valid where it was measured, and how sure of it."""
         frames, unit = frames_of(views)
         near, far = depth_range(views)
         transforms = transforms_among(frames, self.epipolar)
@@ -116,8 +116,11 @@ class PlaneSweep:
             measured, weight = self.with_background(number, sweeps, confidences, transforms)
             heights = fit_surfaces(measured, weight, frame.image, self.surfaces)
             depth = torch.from_numpy(np.float32(unit) / sweep.inverse(heights))
-            valid = torch.from_numpy(confidences[number] > 0)
-            depths.append(DepthMap(depth.to(view.image.device), valid.to(view.image.device)))
+            confidence = torch.from_numpy(confidences[number])
+            device = view.image.device
+            depths.append(
+                DepthMap(depth.to(device), (confidence > 0).to(device), confidence.to(device))
+            )
         return depths
 
     def sweep(

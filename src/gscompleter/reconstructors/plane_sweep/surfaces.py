@@ -20,6 +20,9 @@ from gscompleter.kernels import variation
 
 Image = Float32[np.ndarray, "h w 3"]
 Map = Float32[np.ndarray, "h w"]
+AnyMap = Float32[np.ndarray, "_ _"]
+Level = tuple[AnyMap, AnyMap, AnyMap, Float32[np.ndarray, "_ _ 3"]]
+"""Where to begin, measurements, their weights, and the image, all of one size."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ def fit_surfaces(
     if not known.any():
         return measured
     start = fill_smoothly(torch.from_numpy(measured), torch.from_numpy(known)).numpy()
-    levels = [(start, measured, confidence, image)]
+    levels: list[Level] = [(start, measured, confidence, image)]
     while len(levels) < config.levels and min(levels[-1][0].shape) > 4:
         levels.append(halved(*levels[-1]))
     heights = levels[-1][0].copy()
@@ -92,12 +95,12 @@ def step_costs(image: Image, config: SurfaceConfig) -> tuple[Map, Map]:
     return cost(across), cost(down)
 
 
-def halved(start: Map, data: Map, weight: Map, image: Image) -> tuple[Map, Map, Map, Image]:
+def halved(start: Map, data: Map, weight: Map, image: Image) -> Level:
     """A level of half the size; measurements are averaged by their weights."""
     h, w = start.shape
     size = (h + 1) // 2, (w + 1) // 2
 
-    def sums(values: Map) -> Map:
+    def sums(values: Map) -> AnyMap:
         padded = np.pad(values, ((0, size[0] * 2 - h), (0, size[1] * 2 - w)))
         return padded.reshape(size[0], 2, size[1], 2).sum(axis=(1, 3))
 
@@ -108,5 +111,5 @@ def halved(start: Map, data: Map, weight: Map, image: Image) -> tuple[Map, Map, 
     return sums(start) / area, mean, total / area, smaller
 
 
-def doubled(values: Map, shape: tuple[int, ...]) -> Map:
+def doubled(values: AnyMap, shape: tuple[int, ...]) -> AnyMap:
     return cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)

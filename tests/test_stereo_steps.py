@@ -1,0 +1,271 @@
+"""The steps of plane-sweep stereo after the sweep, each on geometry that is known."""
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from gscompleter.evaluation.metrics import psnr
+from gscompleter.kernels import stereo
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.appearance import AppearanceConfig, fit_appearance
+from gscompleter.reconstructors.plane_sweep.confidence import (
+    ConfidenceConfig,
+    confidence_of,
+    without_specks,
+)
+from gscompleter.reconstructors.plane_sweep.epipolar import distances, turned_to_matches
+from gscompleter.reconstructors.plane_sweep.features import features_of, matches
+from gscompleter.reconstructors.plane_sweep.frames import Frame, frames_of, transform_between
+from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
+from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
+from gscompleter.render import load_renderer
+from gscompleter.types import View, merge
+from scenes import Room, camera_at, gaussians_of, view_of
+
+SIZE = 128
+
+
+def pair(baseline: float = 0.4) -> list[View]:
+    return [view_of(Room(), camera_at(x, size=SIZE)) for x in (-baseline / 2, baseline / 2)]
+
+
+def pitched(view: View, degrees: float) -> View:
+    """The photograph with a pose that is wrong by a turn about the camera's horizontal axis."""
+    angle = np.deg2rad(degrees)
+    turn = torch.eye(4)
+    turn[1, 1] = turn[2, 2] = float(np.cos(angle))
+    turn[1, 2], turn[2, 1] = -float(np.sin(angle)), float(np.sin(angle))
+    return replace(view, camera=replace(view.camera, c2w=view.camera.c2w @ turn))
+
+
+def median_error(views: list[View]) -> float:
+    found, truth = PlaneSweep().depths(views)[0].depth, views[0].depth
+    return ((found - truth).abs() / truth).median().item()
+
+
+# Poses
+
+
+def frames_and_matches(views: list[View]) -> tuple[Frame, Frame, np.ndarray, np.ndarray]:
+    (left, right), _ = frames_of(views)
+    return left, right, *matches(features_of(left), features_of(right))
+
+
+def test_a_pose_that_misses_its_epipolar_lines_is_turned_back():
+    left, right = pair()
+    frames = frames_and_matches([left, pitched(right, 0.6)])
+    reference, source, pixels, matched = frames
+    before, _ = distances(*frames)
+    turned = turned_to_matches(*frames)
+    after, _ = distances(reference, turned, pixels, matched)
+    assert np.median(np.abs(before)) > 1
+    assert np.median(np.abs(after)) < 0.15
+    assert np.array_equal(turned.center, source.center)
+    assert median_error([left, pitched(right, 0.6)]) < 2 * median_error([left, right])
+
+
+def test_a_right_pose_stays():
+    reference, source, pixels, matched = frames_and_matches(pair())
+    turned = turned_to_matches(reference, source, pixels, matched)
+    assert np.abs(turned.rotation - source.rotation).max() < 1e-3
+
+
+def test_false_matches_do_not_turn_the_camera():
+    reference, source, pixels, matched = frames_and_matches(pair())
+    false = matched.copy()
+    false[::3] += [3.0, 5.0]
+    turned = turned_to_matches(reference, source, pixels, false)
+    assert np.abs(turned.rotation - source.rotation).max() < 2e-3
+
+
+def test_few_matches_leave_the_pose():
+    reference, source, pixels, matched = frames_and_matches(pair())
+    for few in (0, 5):
+        assert turned_to_matches(reference, source, pixels[:few], matched[:few]) is source
+
+
+# Confidence and occlusion
+
+
+def test_specks_are_not_trusted_and_surfaces_are():
+    index = np.full((40, 40), 20.0, np.float32)
+    index[5:8, 5:8] = 60
+    agrees = np.ones((40, 40), bool)
+    agrees[:, 30:] = False
+    agrees[20, 35] = True
+    solid = without_specks(index, agrees, 60, 2.0)
+    assert not solid[5:8, 5:8].any()
+    assert not solid[:, 31:].any()
+    assert solid[:, :29].sum() == 40 * 29 - 9
+
+
+def test_confidence_grows_with_the_margin():
+    index, agrees = np.full((10, 10), 3.0, np.float32), np.ones((10, 10), bool)
+    margin = np.linspace(0, 80, 100, dtype=np.float32).reshape(10, 10)
+    confidence = confidence_of(index, margin, agrees, ConfidenceConfig())
+    assert (np.diff(confidence.ravel()) >= 0).all()
+    assert confidence.min() == 0
+    assert confidence.max() == 1
+
+
+def test_an_unknown_gap_takes_the_farther_side():
+    values = np.full((40, 30), 5.0, np.float32)
+    values[:, 20:] = 1.0
+    known = np.ones((40, 30), bool)
+    known[:, 12:20] = False
+    filled = stereo.background(values, known)
+    assert (filled[10:30, 12:20] == 1).all()
+    assert np.array_equal(filled[known], values[known])
+    assert np.array_equal(stereo.background(values, np.zeros_like(known)), values)
+
+
+def test_what_only_one_view_sees_past_an_object_is_found_occluded():
+    """The pillar in the room hides a strip of the back wall from the right camera."""
+    views = pair()
+    (left, right), unit = frames_of(views)
+    inverse = [(unit / view.depth).float().numpy() for view in views]
+    there, back = transform_between(left, right), transform_between(right, left)
+    visible, _ = stereo.reproject(inverse[0], inverse[1], there, back)
+    hidden = hidden_from_others(inverse[0], [Neighbour(inverse[1], there, back)], 1.5)
+    assert hidden.sum() > 50
+    assert not hidden[(visible >= 0) & (visible < 1.5)].any()
+    assert not hidden[visible < 0].any()
+
+
+# Surfaces
+
+
+def slanted(h: int = 48, w: int = 64) -> np.ndarray:
+    rows, columns = np.mgrid[:h, :w]
+    return (10 + 0.15 * columns - 0.1 * rows).astype(np.float32)
+
+
+def blank(heights: np.ndarray) -> np.ndarray:
+    return np.full((*heights.shape, 3), 0.5, np.float32)
+
+
+def test_planes_go_on_where_nothing_was_measured():
+    truth = slanted()
+    known = np.zeros(truth.shape, np.float32)
+    known[:, :40] = 1
+    found = fit_surfaces(np.where(known > 0, truth, 99.0).astype(np.float32), known, blank(truth))
+    assert np.abs(found - truth)[:, :40].max() < 0.2
+    assert np.abs(found - truth)[:, 40:].max() < 0.5
+
+
+def test_false_measurements_are_outvoted():
+    truth, random = slanted(), np.random.default_rng(0)
+    false = random.random(truth.shape) < 0.2
+    measured = np.where(false, random.uniform(0, 40, truth.shape), truth).astype(np.float32)
+    found = fit_surfaces(measured, np.ones_like(truth), blank(truth))
+    assert np.abs(found - truth).mean() < 0.15
+
+
+def test_steps_stand_at_the_edges_of_the_image():
+    """The border of an object lies in a gap of the measurements, and the image shows where."""
+    truth = np.where(np.arange(64) < 30, 20.0, 5.0)[None].repeat(48, 0).astype(np.float32)
+    known = np.ones_like(truth)
+    known[:, 24:40] = 0
+    image = np.where(truth[..., None] > 10, 0.9, 0.2).astype(np.float32).repeat(3, -1)
+    found = fit_surfaces(np.where(known > 0, truth, 0).astype(np.float32), known, image)
+    assert (found[:, :29] > 17).all()
+    assert (found[:, 31:] < 8).all()
+
+
+def test_without_any_measurement_nothing_is_made_up():
+    measured = slanted()
+    found = fit_surfaces(measured, np.zeros_like(measured), blank(measured))
+    assert np.array_equal(found, measured)
+
+
+def test_surfaces_do_not_depend_on_the_number_of_threads():
+    truth = slanted()
+    noisy = truth + np.random.default_rng(1).normal(size=truth.shape).astype(np.float32)
+    found = fit_surfaces(noisy, np.ones_like(truth), blank(truth))
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        assert np.array_equal(fit_surfaces(noisy, np.ones_like(truth), blank(truth)), found)
+    finally:
+        numba.set_num_threads(threads)
+
+
+def test_a_blank_wall_is_completed_as_a_plane():
+    """A window without any texture in the middle of the back wall."""
+    views = []
+    for view in pair():
+        seen = view.camera.center + view.depth[..., None] * view.camera.z_rays()
+        wall = (
+            (seen[..., 2] > 4.9) & (seen[..., 0] + 1.2).abs().lt(0.7) & seen[..., 1].abs().lt(0.7)
+        )
+        views.append(replace(view, image=torch.where(wall[..., None], 0.5, view.image)))
+    found, truth = PlaneSweep().depths(views)[0].depth, views[0].depth
+    blank_wall = (views[0].image == 0.5).all(dim=-1)
+    assert blank_wall.sum() > 200
+    error = ((found - truth).abs() / truth)[blank_wall]
+    assert error.quantile(0.9) < 0.08
+
+
+# Appearance
+
+
+def with_floater(views: list[View]) -> torch.Tensor:
+    """Gaussians of the room at their true depth, and a grey sheet before the left camera."""
+    scene = merge([gaussians_of(view) for view in views])
+    rays = views[0].camera.z_rays()[40:60, 40:60]
+    sheet = gaussians_of(views[0], torch.full((SIZE, SIZE), 1.0))
+    sheet = sheet[torch.arange(SIZE * SIZE).reshape(SIZE, SIZE)[40:60, 40:60].flatten()]
+    assert len(sheet) == rays[..., 0].numel()
+    return merge([scene, replace(sheet, sh=torch.zeros_like(sheet.sh))])
+
+
+def test_what_photographs_object_to_fades_and_the_rest_stays():
+    views, renderer = pair(), load_renderer("cpu")
+    scene = with_floater(views)
+    fitted = fit_appearance(scene, views, renderer, AppearanceConfig(colour_steps=0))
+    assert fitted.opacities[-400:].mean() < 0.4
+    for view in views:
+        assert renderer.render(fitted, view.camera).alpha.mean() > 0.97
+        assert psnr(renderer.render(fitted, view.camera).image, view.image) > 25
+    for name in ("means", "scales", "quats", "sh"):
+        assert torch.equal(getattr(fitted, name), getattr(scene, name))
+
+
+def test_colours_get_back_what_drawing_blurs():
+    views, renderer = pair(), load_renderer("cpu")
+    scene = merge([gaussians_of(view) for view in views])
+    config = AppearanceConfig(opacity_steps=0)
+    fitted = fit_appearance(scene, views, renderer, config)
+    assert torch.equal(fitted.opacities, scene.opacities)
+    for view in views:
+        before = psnr(renderer.render(scene, view.camera).image, view.image)
+        after = psnr(renderer.render(fitted, view.camera).image, view.image)
+        assert after > before + 2
+
+
+def test_no_step_changes_nothing():
+    views = pair()
+    scene = gaussians_of(views[0])
+    fitted = fit_appearance(scene, views, load_renderer("cpu"), AppearanceConfig(0, 0.3, 0.0, 0))
+    assert torch.equal(fitted.sh, scene.sh)
+    assert torch.allclose(fitted.opacities, scene.opacities, atol=1e-6)
+
+
+@pytest.mark.parametrize("x", [0.35, -0.35])
+def test_an_unseen_view_profits_too(x):
+    views, renderer = pair(), load_renderer("cpu")
+    unseen = view_of(Room(), camera_at(x, size=SIZE))
+    plain = PlaneSweep(appearance=AppearanceConfig(opacity_steps=0, colour_steps=0))(views)
+    fitted = PlaneSweep()(views)
+    covered = renderer.render(plain.gaussians, unseen.camera).alpha > 0.9
+    scores = [
+        psnr(
+            renderer.render(r.gaussians, unseen.camera).image[covered][None],
+            unseen.image[covered][None],
+        )
+        for r in (plain, fitted)
+    ]
+    assert scores[1] > scores[0] + 0.3
