@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numba
 import numpy as np
 import pytest
@@ -269,3 +270,13 @@ def test_an_unseen_view_profits_too(x):
         for r in (plain, fitted)
     ]
     assert scores[1] > scores[0] + 0.3
+
+
+def test_no_pinholes_when_the_camera_moves_on_by_a_baseline():
+    """What is thin there is part of a hole that is at least three pixels wide."""
+    moved = camera_at(0.6, size=SIZE)
+    render = load_renderer("cpu").render(PlaneSweep()(pair()).gaussians, moved)
+    thin = (render.alpha < 0.5).numpy().astype(np.uint8)
+    holes = cv2.morphologyEx(thin, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    assert holes.mean() > 0.05
+    assert (thin - holes).mean() < 0.005
