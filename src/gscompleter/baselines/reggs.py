@@ -1,0 +1,227 @@
+"""Registration by a similarity, after RegGS (Cheng et al., RegGS: Unposed Sparse Views Gaussian
+Splatting with 3DGS Registration, 2025).
+
+What was lifted is brought to the scene as a whole: one scale, one rotation, one translation, fitted
+to colour, depth and an entropic Mixture-2-Wasserstein distance; then everything is added. RegGS
+estimates poses along the way; here they are known, and only its registration is compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.cluster.vq import kmeans2
+from torch import Tensor
+
+from gscompleter.baselines.mixture_wasserstein import (
+    Mixture,
+    SinkhornConfig,
+    mixture_wasserstein,
+    reduced,
+)
+from gscompleter.progress import track
+from gscompleter.render import Renderer
+from gscompleter.types import Camera, Gaussians, View
+
+
+@dataclass(frozen=True)
+class RegGSConfig:
+    iterations: int = 400
+    """Steps of Adam (amsgrad)."""
+    scale_rate: float = 1e-3
+    """Step of the scale."""
+    rotation_rate: float = 2e-4
+    """Step of the rotation's quaternion."""
+    translation_rate: float = 2e-3
+    """Step of the translation, in scene units."""
+    colour_weight: float = 1.0
+    depth_weight: float = 0.1
+    mixture_weight: float = 0.1
+    components: int = 1000
+    """Clusters that each set of Gaussians is reduced to."""
+    patience: int = 10
+    """The mixture distance is left out for good once it is no smaller than the largest of its
+    last values, so many of them."""
+    sinkhorn: SinkhornConfig = SinkhornConfig()
+    """The mixture distance."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x -> R^T (scale-about-the-camera(x) - t): where the lifted Gaussians go."""
+
+    scale: Float[Tensor, ""]
+    quaternion: Float[Tensor, "4"]
+    """wxyz, of the rotation R that carries the scene towards the lifted Gaussians."""
+    translation: Float[Tensor, "3"]
+    """t, in scene units."""
+
+    @property
+    def rotation(self) -> Float[Tensor, "3 3"]:
+        return rotation_matrix(self.quaternion)
+
+
+@dataclass(frozen=True)
+class Registered:
+    """The lifted Gaussians in the scene's frame, and how they came there."""
+
+    gaussians: Gaussians
+    similarity: Similarity
+    losses: tuple[float, ...]
+
+
+def register_by_similarity(
+    lifted: Gaussians,
+    scene: Gaussians,
+    reference: View,
+    renderer: Renderer,
+    seed: int = 42,
+    config: RegGSConfig = RegGSConfig(),
+) -> Registered:
+    """Fit one similarity between `lifted` and `scene` at the camera of `reference`.
+
+    Args:
+        lifted: Gaussians lifted from `reference`.
+        scene: What they are to agree with.
+        reference: The synthesized image and its camera.
+        renderer: Draws both, differentiably.
+        seed: Of the clustering.
+        config: Weights and steps; the defaults are those of RegGS.
+    """
+    camera = reference.camera
+    own = renderer.render(lifted, camera)
+    theirs = renderer.render(scene, camera)
+    both = (own.alpha > 0.5) & (theirs.alpha > 0.5)
+    ratio = (
+        (theirs.depth[both].median() / own.depth[both].median())
+        if both.any()
+        else own.depth.new_ones(())
+    )
+    scale = ratio.detach().clone().requires_grad_()
+    quaternion = torch.tensor([1.0, 0.0, 0.0, 0.0], requires_grad=True)
+    translation = torch.zeros(3, requires_grad=True)
+    optimizer = torch.optim.Adam(
+        [
+            {"params": [scale], "lr": config.scale_rate},
+            {"params": [quaternion], "lr": config.rotation_rate},
+            {"params": [translation], "lr": config.translation_rate},
+        ],
+        amsgrad=True,
+    )
+    small_lifted = clustered(lifted, camera, config.components, seed)
+    small_scene = clustered(scene, camera, config.components, seed)
+    best, best_loss = None, np.inf
+    losses: list[float] = []
+    distances: list[float] = []
+    compare_mixtures = config.mixture_weight > 0
+    for _ in track(range(config.iterations), "Registering"):
+        fit = Similarity(scale, quaternion, translation)
+        moved = renderer.render(carried(scene, fit), camera)
+        alpha = own.alpha.detach()
+        colour = ((moved.image - reference.image).abs() * alpha[..., None] ** 3).sum()
+        overlap = (alpha > 0.5) & (moved.alpha.detach() > 0.5)
+        depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
+        loss = config.colour_weight * colour + config.depth_weight * depth
+        if compare_mixtures:
+            distance = mixture_wasserstein(
+                scaled(small_lifted, scale), turned(small_scene, fit, camera), config.sinkhorn
+            )
+            recent = distances[-config.patience :]
+            if len(distances) >= config.patience and distance.item() >= max(recent):
+                compare_mixtures = False
+            else:
+                loss = loss + config.mixture_weight * distance
+            distances.append(distance.item())
+        if loss.item() < best_loss:
+            best_loss = loss.item()
+            best = Similarity(*(p.detach().clone() for p in (scale, quaternion, translation)))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    similarity = best or Similarity(scale.detach(), quaternion.detach(), translation.detach())
+    return Registered(into_scene(lifted, similarity, camera), similarity, tuple(losses))
+
+
+def carried(scene: Gaussians, fit: Similarity) -> Gaussians:
+    """The scene, turned and moved towards the lifted Gaussians; differentiable in `fit`."""
+    unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
+    means = scene.means @ fit.rotation.T + fit.translation
+    return replace(scene, means=means, quats=multiplied(unit, scene.quats), encoded=None)
+
+
+def into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
+    """The lifted Gaussians, scaled about their camera, then turned and moved back."""
+    means = camera.center + fit.scale * (lifted.means - camera.center)
+    unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
+    back = unit * unit.new_tensor([1.0, -1.0, -1.0, -1.0])
+    return replace(
+        lifted,
+        means=(means - fit.translation) @ fit.rotation,
+        quats=multiplied(back, lifted.quats),
+        scales=lifted.scales * fit.scale,
+        encoded=None,
+    )
+
+
+def clustered(gaussians: Gaussians, camera: Camera, components: int, seed: int) -> Mixture:
+    """The Gaussians in camera axes, merged into clusters of their means (k-means)."""
+    rotation = camera.c2w[:3, :3]
+    axes = rotation.T @ rotation_matrix(gaussians.quats)
+    spread = axes * gaussians.scales[:, None, :]
+    mixture = Mixture(
+        (gaussians.means - camera.center) @ rotation,
+        spread @ spread.transpose(-1, -2),
+        torch.softmax(gaussians.opacities, dim=0),
+    )
+    if len(gaussians) <= components:
+        return mixture
+    points = mixture.means.double().cpu().numpy()
+    _, labels = kmeans2(points, components, iter=10, minit="points", seed=seed)
+    return reduced(mixture, torch.from_numpy(labels.astype(np.int64)))
+
+
+def scaled(mixture: Mixture, scale: Float[Tensor, ""]) -> Mixture:
+    return Mixture(scale * mixture.means, scale**2 * mixture.covariances, mixture.weights)
+
+
+def turned(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
+    """A mixture of the scene in camera axes, moved as `carried` moves the scene."""
+    c2w = camera.c2w[:3, :3]
+    rotation = c2w.T @ fit.rotation @ c2w
+    offset = (fit.rotation @ camera.center + fit.translation - camera.center) @ c2w
+    return Mixture(
+        mixture.means @ rotation.T + offset,
+        rotation @ mixture.covariances @ rotation.T,
+        mixture.weights,
+    )
+
+
+def rotation_matrix(quaternions: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
+    """Rotations of wxyz quaternions of any length but 0."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, dim=-2)
+
+
+def multiplied(
+    first: Float[Tensor, "4"], quaternions: Float[Tensor, "n 4"]
+) -> Float[Tensor, "n 4"]:
+    """wxyz products first * q: the rotation q, then `first`."""
+    w, x, y, z = first.unbind()
+    matrix = torch.stack(
+        [
+            torch.stack([w, -x, -y, -z]),
+            torch.stack([x, w, -z, y]),
+            torch.stack([y, z, w, -x]),
+            torch.stack([z, -y, x, w]),
+        ]
+    )
+    return quaternions @ matrix.T
