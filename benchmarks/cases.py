@@ -3,7 +3,8 @@
     python benchmarks/cases.py path/to/cases.json [--config NAME_OR_YAML] [--pictures FOLDER]
 
 Every row is one case: PSNR (dB) at the target, at the frames beside it and at the context views
-before and after, and the error of depth (AbsRel) against true depth where the data has it.
+before and after, the error of depth (AbsRel) against true depth where the data has it, and the
+difference of depth from the context at the rim of the holes.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ COLUMNS: list[Row] = [
     ("worst", lambda s: min(c.gain for c in s.context_psnr)),
     ("depth seen", lambda s: s.depth_observed),
     ("in hole", lambda s: s.depth_hole),
+    ("rim", lambda s: s.depth_rim),
     ("s", lambda s: s.seconds),
 ]
 

@@ -21,7 +21,7 @@ from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics import psnr, ssim
 from gscompleter.io.scene import load_views
 from gscompleter.render import Renderer
-from gscompleter.types import Completion, Gaussians, View
+from gscompleter.types import Completion, Gaussians, TargetCompletion, View
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,9 @@ class CaseScores:
     """AbsRel at the target where the context covers it."""
     depth_hole: float | None
     """AbsRel at the target where the context has a hole and the completion fills it."""
+    depth_rim: float | None
+    """Median relative difference of depth between what was added, drawn alone, and the context,
+    where both cover the target: the step at the border of the holes."""
     hole_psnr: float | None
     """PSNR at the target over the pixels of the hole only, after completion."""
     seconds: float
@@ -137,9 +140,21 @@ def score(
         context_psnr=tuple(change(completion, view, renderer) for view in views),
         depth_observed=absrel(after.depth, target.depth, ~hole & (after.alpha >= 0.5)),
         depth_hole=absrel(after.depth, target.depth, hole & (after.alpha >= 0.5)),
+        depth_rim=rim_error(result, renderer),
         hole_psnr=psnr(after.image[hole][None], target.image[hole][None]) if hole.any() else None,
         seconds=completion.seconds["total"],
     )
+
+
+def rim_error(result: TargetCompletion, renderer: Renderer, min_pixels: int = 50) -> float | None:
+    """Median of |D_added - D_context| / D_context where both cover the target."""
+    if len(result.added) == 0:
+        return None
+    added, context = renderer.render(result.added, result.target), result.before
+    both = (added.alpha >= 0.5) & (context.alpha >= 0.5)
+    if both.sum() < min_pixels:
+        return None
+    return ((added.depth - context.depth).abs() / context.depth)[both].median().item()
 
 
 def change(completion: Completion, view: View, renderer: Renderer) -> Change:
