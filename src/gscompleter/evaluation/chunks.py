@@ -52,9 +52,7 @@ class ChunkClip:
     def __len__(self) -> int:
         return len(self.images)
 
-    def views(
-        self, frames: Sequence[int], resolution: tuple[int, int] | None = None
-    ) -> list[View]:
+    def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
         """The photographs of `frames`, resized to cover `resolution` (height, width), cropped.
 
         Raises:

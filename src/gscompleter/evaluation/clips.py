@@ -39,9 +39,7 @@ class Clip(Protocol):
     def __len__(self) -> int:
         """How many frames it has."""
 
-    def views(
-        self, frames: Sequence[int], resolution: tuple[int, int] | None = None
-    ) -> list[View]:
+    def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
         """The photographs of `frames`, resized to cover `resolution` (height, width), cropped.
 
         Raises:
