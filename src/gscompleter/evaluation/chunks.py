@@ -223,6 +223,8 @@ def _load_chunk(path: Path) -> list[Any]:
             content = torch.load(path, map_location="cpu", weights_only=True)
     except MemoryError:
         raise
+    except PermissionError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
     # On damaged bytes the unpickler raises whatever the next instruction leads to.
     except Exception as error:
         raise InputError(_cannot_load(path, error)) from error
@@ -291,7 +293,7 @@ def _clip(example: dict[str, Any], name: str, path: Path) -> ChunkClip:
                 f"Image {number} of the {called} is {_described(image)}; the bytes of a JPEG or "
                 "PNG file are needed, uint8 of one dimension."
             )
-    return ChunkClip(name, path, cameras, tuple(images))
+    return ChunkClip(name, path, cameras.detach(), tuple(images))
 
 
 def _described(value: Any) -> str:

@@ -54,9 +54,7 @@ class SceneClip:
     def __len__(self) -> int:
         return self.num_frames
 
-    def views(
-        self, frames: Sequence[int], resolution: tuple[int, int] | None = None
-    ) -> list[View]:
+    def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
         """The photographs of `frames`, as `load_views` has them.
 
         Raises:
@@ -98,9 +96,7 @@ class RealEstateClip:
     def __len__(self) -> int:
         return len(self.timestamps)
 
-    def views(
-        self, frames: Sequence[int], resolution: tuple[int, int] | None = None
-    ) -> list[View]:
+    def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
         """The photographs of `frames`, resized to cover `resolution` (height, width), cropped.
 
         Raises:

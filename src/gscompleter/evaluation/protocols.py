@@ -230,7 +230,7 @@ def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
         name: [{"context": list(s.context), "target": list(s.targets)} for s in splits]
         for name, splits in index.scenes.items()
     }
-    scenes |= {name: None for name in index.skipped}
+    scenes |= dict.fromkeys(index.skipped)
     rows = [f"  {json.dumps(name)}: {json.dumps(splits)}" for name, splits in scenes.items()]
     text = (
         f'{{\n "version": {VERSION},\n "protocol": {json.dumps(index.name)},\n "scenes": {{\n'
