@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import zlib
@@ -85,6 +86,33 @@ def read_pixels(path: Path | str) -> UInt8[np.ndarray, "h w 3"]:
             raise InputError(f"The image {path} is damaged ({error}); copy it again.") from error
 
 
+def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
+    """The image that the bytes of a PNG or JPEG file hold, as `read_pixels` has it.
+
+    Args:
+        data: The bytes.
+        name: What error messages call the image.
+
+    Raises:
+        InputError: where they are truncated or no image.
+    """
+    with _decoded(data, name) as image:
+        try:
+            return _over_black(image)
+        except _DAMAGED as error:
+            raise InputError(f"{name} is damaged ({error}); copy its file again.") from error
+
+
+def decoded_size(data: bytes, name: str) -> tuple[int, int]:
+    """Width and height of an image in memory, from the first of its bytes.
+
+    Raises:
+        InputError: where they are no image.
+    """
+    with _decoded(data, name) as image:
+        return image.size
+
+
 def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     """The z-depth in a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown.
 
@@ -123,6 +151,15 @@ def _opened(path: Path | str) -> Image.Image:
     except _DAMAGED as error:
         raise InputError(
             f"{path} is not an image that can be read; a PNG or JPEG file is needed."
+        ) from error
+
+
+def _decoded(data: bytes, name: str) -> Image.Image:
+    try:
+        return Image.open(io.BytesIO(data))
+    except _DAMAGED as error:
+        raise InputError(
+            f"{name} is not an image that can be read; the bytes of a PNG or JPEG file are needed."
         ) from error
 
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from PIL import Image
 
 from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
+from gscompleter.io.framing import check_resolution, covering, resize
 from gscompleter.io.image import as_image, read_depth, read_pixels
 from gscompleter.io.lens import Distortion, Pinhole, remap, undistorted, undistortion_map
 from gscompleter.io.transforms import (
@@ -168,51 +168,12 @@ def _entry(camera: Camera) -> dict[str, object]:
     }
 
 
-@dataclass(frozen=True)
-class _Framing:
-    """Resize to `resized`, then keep what begins at `corner` and is as large as `size`."""
-
-    resized: tuple[int, int]
-    corner: tuple[int, int]
-    size: tuple[int, int]
-
-    def camera(self, pinhole: Pinhole) -> Pinhole:
-        return pinhole.resized(*self.resized).cropped(*self.corner, *self.size)
-
-    def image(
-        self, image: Shaped[np.ndarray, "h w *c"], filtering: Image.Resampling
-    ) -> Shaped[np.ndarray, "h2 w2 *c"]:
-        left, top = self.corner
-        width, height = self.size
-        resized = _resized(image, self.resized, filtering)
-        return np.ascontiguousarray(resized[top : top + height, left : left + width])
-
-
-def _covering(width: int, height: int, resolution: tuple[int, int] | None) -> _Framing:
-    """How an image is resized to cover `resolution` (height, width) and cropped in its centre."""
-    if resolution is None:
-        return _Framing((width, height), (0, 0), (width, height))
-    scale = max(resolution[0] / height, resolution[1] / width)
-    new_width = max(round(width * scale), resolution[1])
-    new_height = max(round(height * scale), resolution[0])
-    corner = (new_width - resolution[1]) // 2, (new_height - resolution[0]) // 2
-    return _Framing((new_width, new_height), corner, (resolution[1], resolution[0]))
-
-
-def _resized(
-    image: Shaped[np.ndarray, "h w *c"], size: tuple[int, int], filtering: Image.Resampling
-) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    if image.shape[1::-1] == size:
-        return image
-    return np.array(Image.fromarray(image).resize(size, filtering))
-
-
 def _camera(
     frame: Frame, resolution: tuple[int, int] | None, near: float | None, far: float | None
 ) -> Camera:
     width, height = frame.size()
     pinhole = _undistorted(frame, frame.intrinsics.at(width, height))
-    final = _covering(width, height, resolution).camera(pinhole)
+    final = covering(width, height, resolution).camera(pinhole)
     return Camera(as_tensor(frame.c2w), final.K, final.width, final.height, near, far)
 
 
@@ -244,7 +205,7 @@ def _load_view(
     height, width = pixels.shape[:2]
     depth = None if frame.depth_path is None else read_depth(frame.depth_path, frame.depth_unit)
     if depth is not None:
-        depth = _resized(depth, (width, height), Image.Resampling.NEAREST)
+        depth = resize(depth, (width, height), Image.Resampling.NEAREST)
 
     distortion = frame.intrinsics.distortion
     if distortion:
@@ -254,7 +215,7 @@ def _load_view(
         pixels = remap(pixels, maps[lens], cv2.INTER_CUBIC)
         depth = None if depth is None else remap(depth, maps[lens], cv2.INTER_NEAREST)
 
-    framing = _covering(width, height, resolution)
+    framing = covering(width, height, resolution)
     image = as_image(framing.image(pixels, Image.Resampling.LANCZOS))
     if depth is not None:
         depth = framing.image(depth, Image.Resampling.NEAREST)
@@ -269,11 +230,7 @@ def _load_view(
 def _check_arguments(
     resolution: tuple[int, int] | None, near: float | None, far: float | None
 ) -> None:
-    if resolution is not None and min(resolution) <= 0:
-        raise InputError(
-            f"The resolution {resolution[0]} × {resolution[1]} is impossible; height and width "
-            "have to be positive."
-        )
+    check_resolution(resolution)
     for name, value in (("near", near), ("far", far)):
         if value is not None and not (math.isfinite(value) and value > 0):
             raise InputError(

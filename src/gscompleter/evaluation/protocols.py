@@ -1,0 +1,291 @@
+"""Which frames of a clip are given and which are to be synthesized.
+
+Three protocols: a published evaluation index (`{scene: {"context", "target"} or null}`), the
+extrapolation `n-k` (frames n and n + k show what frame n + 2k is completed from, and the same
+backwards) and a stress test far outside of what the context sees.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from gscompleter.errors import InputError
+from gscompleter.evaluation.clips import Clip
+from gscompleter.io.files import replacing
+from gscompleter.types import View
+
+VERSION = 1
+"""Of the files that `write_evaluation_index` writes."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Frames of one clip."""
+
+    context: tuple[int, ...]
+    """What is given."""
+    targets: tuple[int, ...]
+    """What is to be synthesized, each by itself."""
+
+
+@runtime_checkable
+class EvaluationProtocol(Protocol):
+    """A rule that chooses frames. It is deterministic."""
+
+    @property
+    def name(self) -> str:
+        """What `parse_protocol` or a table calls it."""
+
+    def splits(self, clip: Clip) -> tuple[Split, ...]:
+        """The splits of a clip; none where it is skipped."""
+
+
+@dataclass(frozen=True)
+class Extrapolation:
+    """n, n + k → n + 2k and n + 2k, n + k → n, for n = 0, stride, 2 stride, …"""
+
+    k: int
+    stride: int | None = None
+    """From one n to the next; 2k + 1 if left out, so that no two n share a frame."""
+
+    def __post_init__(self) -> None:
+        if self.k < 1 or (self.stride is not None and self.stride < 1):
+            raise InputError(
+                f"An extrapolation over {self.k} frames with a stride of {self.stride} is "
+                "impossible; both have to be at least 1."
+            )
+
+    @property
+    def name(self) -> str:
+        return f"n-{self.k}" + ("" if self.stride is None else f"-stride-{self.stride}")
+
+    def splits(self, clip: Clip) -> tuple[Split, ...]:
+        k, stride = self.k, self.stride or 2 * self.k + 1
+        return tuple(
+            split
+            for n in range(0, len(clip) - 2 * k, stride)
+            for split in (Split((n, n + k), (n + 2 * k,)), Split((n + 2 * k, n + k), (n,)))
+        )
+
+
+@dataclass(frozen=True)
+class StressTest:
+    """Frames 0 and 30 → 99: most of the target lies outside of what the context sees."""
+
+    name: str = "stress"
+
+    def splits(self, clip: Clip) -> tuple[Split, ...]:
+        split = Split((0, 30), (99,))
+        return (split,) if len(clip) > max(split.targets) else ()
+
+
+@dataclass(frozen=True)
+class EvaluationIndex:
+    """The splits of each scene, written down."""
+
+    name: str
+    """Of the protocol; for a published file, its stem."""
+    scenes: Mapping[str, tuple[Split, ...]]
+    skipped: tuple[str, ...] = ()
+    """Scenes with no split: null in a published file, clips that are too short in ours."""
+
+    def splits(self, clip: Clip) -> tuple[Split, ...]:
+        """The splits of a clip; none where the index skips or lacks its scene."""
+        return self.scenes.get(clip.name, ())
+
+
+@dataclass(frozen=True)
+class ClipCase:
+    """One completion task in a clip."""
+
+    clip: Clip
+    context: tuple[int, ...]
+    target: int
+    neighbours: tuple[int, ...]
+    """Frames beside the target, for scoring only."""
+    resolution: tuple[int, int] | None = None
+    """Height and width; those of the photographs if left out."""
+
+    @property
+    def scene(self) -> str:
+        """Name of the clip."""
+        return self.clip.name
+
+    @property
+    def name(self) -> str:
+        return f"{self.scene} {'+'.join(map(str, self.context))}>{self.target}"
+
+    def load(self, frames: Sequence[int]) -> list[View]:
+        """Photographs of `frames`."""
+        return self.clip.views(frames, self.resolution)
+
+
+def parse_protocol(text: str) -> EvaluationProtocol:
+    """The protocol of that name: `n-10`, `n-10-stride-5`, `stress`, or the path of an index.
+
+    Raises:
+        InputError: where it is none of these, or the index is damaged.
+    """
+    match = re.fullmatch(r"n-([0-9]{1,6})(?:-stride-([0-9]{1,6}))?", text)
+    if match:
+        return Extrapolation(int(match[1]), None if match[2] is None else int(match[2]))
+    if text == "stress":
+        return StressTest()
+    if Path(text).is_file():
+        return read_evaluation_index(text)
+    raise InputError(
+        f"There is no protocol {text!r}; give n-K for a number of frames K (as n-10), stress, or "
+        "the path of an evaluation index."
+    )
+
+
+def cases_of(
+    protocol: EvaluationProtocol, clip: Clip, resolution: tuple[int, int] | None = None
+) -> list[ClipCase]:
+    """The cases of a clip, one for each target.
+
+    Raises:
+        InputError: where a frame of the protocol is not in the clip.
+    """
+    cases = []
+    for split in protocol.splits(clip):
+        for frame in (*split.context, *split.targets):
+            if frame >= len(clip):
+                raise InputError(
+                    f"The protocol {protocol.name} asks for frame {frame} of {clip.name}, which "
+                    f"has {len(clip)} frames; use the index that was made for this data set."
+                )
+        for target in split.targets:
+            beside = neighbours(target, split.context, len(clip))
+            cases.append(ClipCase(clip, split.context, target, beside, resolution))
+    return cases
+
+
+def neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:
+    """The frames before and after `target`, where they exist and are not context."""
+    return tuple(
+        frame
+        for frame in (target - 1, target + 1)
+        if 0 <= frame < num_frames and frame not in context
+    )
+
+
+def index_of(protocol: EvaluationProtocol, clips: Iterable[Clip]) -> EvaluationIndex:
+    """What a protocol chooses in each of `clips`, written down.
+
+    Raises:
+        InputError: where two clips have the same name.
+    """
+    scenes: dict[str, tuple[Split, ...]] = {}
+    for clip in clips:
+        if clip.name in scenes:
+            raise InputError(f"Two clips are called {clip.name}; rename one of them.")
+        scenes[clip.name] = protocol.splits(clip)
+    chosen = {name: splits for name, splits in scenes.items() if splits}
+    return EvaluationIndex(protocol.name, chosen, tuple(n for n in scenes if not scenes[n]))
+
+
+def n_k_index(clips: Iterable[Clip], k: int, stride: int | None = None) -> EvaluationIndex:
+    """The extrapolations over k frames in each of `clips`; those too short are skipped.
+
+    Raises:
+        InputError: where k or the stride is not positive, or two clips have the same name.
+    """
+    return index_of(Extrapolation(k, stride), clips)
+
+
+def read_evaluation_index(path: Path | str) -> EvaluationIndex:
+    """An evaluation index, as published or as `write_evaluation_index` writes it.
+
+    Raises:
+        InputError: where it is missing or damaged, or from a later version.
+    """
+    path = Path(path)
+    content = _read_json(path)
+    if "version" not in content:
+        return _index(path.stem, content, path)
+    if content["version"] != VERSION:
+        raise InputError(
+            f"{path} is of version {content['version']!r} and version {VERSION} can be read; "
+            "update gscompleter, or write the index again."
+        )
+    name, scenes = content.get("protocol"), content.get("scenes")
+    if not isinstance(name, str) or not isinstance(scenes, dict):
+        raise InputError(f"{path} is damaged: `protocol` and `scenes` are needed; write it again.")
+    return _index(name, scenes, path)
+
+
+def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
+    """Write an index that `read_evaluation_index` reads back as it was, all at once.
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    scenes: dict[str, list[dict[str, list[int]]] | None] = {
+        name: [{"context": list(s.context), "target": list(s.targets)} for s in splits]
+        for name, splits in index.scenes.items()
+    }
+    scenes |= dict.fromkeys(index.skipped)
+    rows = [f"  {json.dumps(name)}: {json.dumps(splits)}" for name, splits in scenes.items()]
+    text = (
+        f'{{\n "version": {VERSION},\n "protocol": {json.dumps(index.name)},\n "scenes": {{\n'
+        + ",\n".join(rows)
+        + "\n }\n}\n"
+    )
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"Cannot read the evaluation index {path}: {error.strerror}.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not JSON ({error}); download it again.") from error
+    if not isinstance(content, dict):
+        raise InputError(
+            f"{path} is no evaluation index: it has to map the name of each scene to its context "
+            "and target frames, or to null."
+        )
+    return content
+
+
+def _index(name: str, content: Mapping[str, Any], path: Path) -> EvaluationIndex:
+    scenes = {
+        scene: _splits(entry, scene, path) for scene, entry in content.items() if entry is not None
+    }
+    return EvaluationIndex(name, scenes, tuple(s for s, entry in content.items() if entry is None))
+
+
+def _splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
+    """A scene has one split in a published file, and a list of them in ours."""
+    rows = entry if isinstance(entry, list) else [entry]
+    if not rows or not all(isinstance(row, dict) for row in rows):
+        raise InputError(
+            f"The entry of the scene {scene} in {path} is {entry!r}; context and target, or null, "
+            "are needed."
+        )
+    return tuple(
+        Split(_frames(row, "context", scene, path), _frames(row, "target", scene, path))
+        for row in rows
+    )
+
+
+def _frames(row: dict[str, Any], key: str, scene: str, path: Path) -> tuple[int, ...]:
+    frames = row.get(key)
+    if (
+        not isinstance(frames, list)
+        or not frames
+        or not all(type(frame) is int and frame >= 0 for frame in frames)
+    ):
+        raise InputError(
+            f"The `{key}` of the scene {scene} in {path} is {frames!r}; a list of frame numbers, "
+            "at least one, is needed."
+        )
+    return tuple(frames)
