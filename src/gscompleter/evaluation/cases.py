@@ -9,7 +9,8 @@ cannot satisfy. A file of cases is JSON: `{"resolution": [h, w], "cases": [{"sce
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -21,7 +22,7 @@ from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics import psnr, ssim
 from gscompleter.io.scene import load_views
 from gscompleter.render import Renderer
-from gscompleter.types import Completion, Gaussians, TargetCompletion, View
+from gscompleter.types import Camera, Completion, Gaussians, Render, View
 
 
 @dataclass(frozen=True)
@@ -114,57 +115,116 @@ class CaseScores:
     seconds: float
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What a method, ours or another, made of a scene."""
+
+    before: Gaussians
+    """The context."""
+    after: Gaussians
+    added: Gaussians | None
+    """What stands in `after` beside the context; None where the context itself was changed."""
+    hole_mask: Bool[Tensor, "h w"]
+    """True where the context has a hole, seen from the target."""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Photographs to score against. Their cameras have the depth range of the scene."""
+
+    views: tuple[View, ...]
+    """The context views."""
+    target: View
+    neighbours: tuple[View, ...] = ()
+
+
 def run_case(case: Case, completer: GSCompleter) -> tuple[Completion, View, CaseScores]:
     """Complete a case and score it; the target's photograph is looked at afterwards only."""
     views = case.load(case.context)
     (target,) = case.load((case.target,))
     completion = completer(views, target.camera)
-    scores = score(case, completion, views, target, completer.renderer)
-    return completion, target, scores
-
-
-def score(
-    case: Case, completion: Completion, views: list[View], target: View, renderer: Renderer
-) -> CaseScores:
-    """All scores of one completed case."""
     (result,) = completion.targets
-    before, after = result.before, result.after
-    hole = result.hole_mask
-    neighbours = [change(completion, v, renderer) for v in case.load(case.neighbours)]
-    return CaseScores(
-        name=case.name,
-        hole_fraction=result.hole_fraction,
-        target_psnr=Change(psnr(before.image, target.image), psnr(after.image, target.image)),
-        target_ssim=Change(ssim(before.image, target.image), ssim(after.image, target.image)),
-        neighbours_psnr=mean_change(neighbours),
-        context_psnr=tuple(change(completion, view, renderer) for view in views),
-        depth_observed=absrel(after.depth, target.depth, ~hole & (after.alpha >= 0.5)),
-        depth_hole=absrel(after.depth, target.depth, hole & (after.alpha >= 0.5)),
-        depth_rim=rim_error(result, renderer),
-        hole_psnr=psnr(after.image[hole][None], target.image[hole][None]) if hole.any() else None,
-        seconds=completion.seconds["total"],
+    outcome = Outcome(
+        completion.context,
+        completion.scene,
+        result.added,
+        result.hole_mask,
+        completion.seconds["total"],
+    )
+    camera = result.target
+    truth = ranged_truth(views, target, case.load(case.neighbours), camera.near, camera.far)
+    return completion, target, score(case.name, outcome, truth, completer.renderer)
+
+
+def ranged_truth(
+    views: Sequence[View],
+    target: View,
+    neighbours: Sequence[View],
+    near: float | None,
+    far: float | None,
+) -> Truth:
+    """Photographs whose cameras have the depth range (scene units) that the method worked with."""
+
+    def with_range(view: View) -> View:
+        return replace(view, camera=replace(view.camera, near=near, far=far))
+
+    return Truth(
+        tuple(with_range(view) for view in views),
+        with_range(target),
+        tuple(with_range(view) for view in neighbours),
     )
 
 
-def rim_error(result: TargetCompletion, renderer: Renderer, min_pixels: int = 50) -> float | None:
-    """Median of |D_added - D_context| / D_context where both cover the target."""
-    if len(result.added) == 0:
+@torch.no_grad()
+def score(name: str, outcome: Outcome, truth: Truth, renderer: Renderer) -> CaseScores:
+    """All scores of one completed case, called `name`."""
+    target, hole = truth.target, outcome.hole_mask
+    before = renderer.render(outcome.before, target.camera)
+    after = renderer.render(outcome.after, target.camera)
+    covered = after.alpha >= 0.5
+    return CaseScores(
+        name=name,
+        hole_fraction=hole.float().mean().item(),
+        target_psnr=Change(psnr(before.image, target.image), psnr(after.image, target.image)),
+        target_ssim=Change(ssim(before.image, target.image), ssim(after.image, target.image)),
+        neighbours_psnr=mean_change([change(outcome, v, renderer) for v in truth.neighbours]),
+        context_psnr=tuple(change(outcome, view, renderer) for view in truth.views),
+        depth_observed=absrel(after.depth, target.depth, ~hole & covered),
+        depth_hole=absrel(after.depth, target.depth, hole & covered),
+        depth_rim=rim_error(outcome.added, before, target.camera, renderer),
+        hole_psnr=psnr(after.image[hole][None], target.image[hole][None]) if hole.any() else None,
+        seconds=outcome.seconds,
+    )
+
+
+def rim_error(
+    added: Gaussians | None,
+    context: Render,
+    target: Camera,
+    renderer: Renderer,
+    min_pixels: int = 50,
+) -> float | None:
+    """Median of |D_added - D_context| / D_context where both cover the target.
+
+    None where fewer than `min_pixels` are covered by both, or nothing can be told from the context.
+    """
+    if added is None or len(added) == 0:
         return None
-    added, context = renderer.render(result.added, result.target), result.before
-    both = (added.alpha >= 0.5) & (context.alpha >= 0.5)
+    alone = renderer.render(added, target)
+    both = (alone.alpha >= 0.5) & (context.alpha >= 0.5)
     if both.sum() < min_pixels:
         return None
-    return ((added.depth - context.depth).abs() / context.depth)[both].median().item()
+    return ((alone.depth - context.depth).abs() / context.depth)[both].median().item()
 
 
-def change(completion: Completion, view: View, renderer: Renderer) -> Change:
+def change(outcome: Outcome, view: View, renderer: Renderer) -> Change:
     """PSNR of a photograph before and after."""
 
     def of(scene: Gaussians) -> float:
-        with torch.no_grad():
-            return psnr(renderer.render(scene, view.camera).image, view.image)
+        return psnr(renderer.render(scene, view.camera).image, view.image)
 
-    return Change(of(completion.context), of(completion.scene))
+    return Change(of(outcome.before), of(outcome.after))
 
 
 def mean_change(changes: list[Change]) -> Change | None:
