@@ -11,11 +11,20 @@ import tyro
 
 from gscompleter import __version__
 from gscompleter.errors import InputError
-from gscompleter.options import CompleteOptions, DemoOptions
+from gscompleter.options import (
+    CompleteOptions,
+    DemoOptions,
+    EvaluateOptions,
+    IndexOptions,
+    TablesOptions,
+)
 
 Command = (
     Annotated[CompleteOptions, tyro.conf.subcommand("complete")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
+    | Annotated[EvaluateOptions, tyro.conf.subcommand("evaluate")]
+    | Annotated[TablesOptions, tyro.conf.subcommand("tables")]
+    | Annotated[IndexOptions, tyro.conf.subcommand("index")]
 )
 
 # Where each command lives. Its module is imported once the arguments are known to be right, so
@@ -23,6 +32,9 @@ Command = (
 COMMANDS = {
     CompleteOptions: ("gscompleter.run", "run_completion"),
     DemoOptions: ("gscompleter.demo", "run_demo"),
+    EvaluateOptions: ("gscompleter.evaluation.commands", "run_evaluation"),
+    TablesOptions: ("gscompleter.evaluation.commands", "run_tables"),
+    IndexOptions: ("gscompleter.evaluation.commands", "run_index"),
 }
 
 
@@ -46,5 +58,7 @@ def main() -> None:
         print(f"gscompleter: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("gscompleter: interrupted; nothing was written.", file=sys.stderr)
+        goes_on = isinstance(options, EvaluateOptions)
+        state = "the same command goes on from here" if goes_on else "nothing was written"
+        print(f"gscompleter: interrupted; {state}.", file=sys.stderr)
         sys.exit(130)

@@ -73,3 +73,66 @@ class DemoOptions:
     """Replace what an earlier run left in the output folder."""
     quiet: bool = False
     """Say nothing but errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Run methods on cases of which the truth is known, and score them.
+
+    Run again with the same options, it goes on where it was stopped. The tables are printed and
+    written at the end; `gscompleter tables OUT` writes them at any time.
+    """
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """A cases.json; or, with --protocol, scenes: a folder with a transforms.json or of such
+    folders, chunks of pixelSplat, or camera files of RealEstate10K."""
+    out: Path
+    """Folder for the results, a new one or that of an earlier run to go on with."""
+    protocol: str | None = None
+    """Which frames are given and which are the target: n-10 (frames n and n + 10 for n + 20),
+    stress (0 and 30 for 99), or the path of an evaluation index. A cases.json needs none."""
+    methods: tuple[str, ...] = ("context", "full", "paper")
+    """What to compare: context, full, paper, an ablation such as no-sa, densify-100, densify-800,
+    distill, reggs."""
+    shard: str | None = None
+    """i/n does every n-th case from the i-th on, i from 0 to n - 1: n processes share the work."""
+    resolution: tuple[int, int] | None = None
+    """Height and width to work at. If not given, that of the cases or of the photographs."""
+    limit: int | None = None
+    """Most cases to do, in all shards together."""
+    reconstructor: str = "plane-sweep"
+    """The model that turns views into Gaussians."""
+    generator: str = "warp-inpaint"
+    """The model that synthesizes the image at the target."""
+    device: Device = "auto"
+    """Where to run."""
+    seed: int = 0
+    """Of everything random."""
+    quiet: bool = False
+    """Say nothing but errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TablesOptions:
+    """Write the tables of what `evaluate` has done so far, and print them."""
+
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Folder that `evaluate` wrote. tables.md, .tex, .json and timings.md, .json go there."""
+    quiet: bool = False
+    """Say nothing but errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IndexOptions:
+    """Write down which frames a protocol chooses in a data set."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """Scenes, as `evaluate` takes them."""
+    protocol: str
+    """As `evaluate` takes it."""
+    out: Path
+    """The evaluation index, a JSON file."""
+    overwrite: bool = False
+    """Replace the file where there is one."""
+    quiet: bool = False
+    """Say nothing but errors."""
