@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 from zipfile import BadZipFile
 
 import numpy as np
@@ -50,6 +50,7 @@ CASES = "cases"
 _FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 
 
+@runtime_checkable
 class EvaluationCase(Protocol):
     """A completion task: of a `cases.json`, or chosen by a protocol in a clip."""
 
@@ -206,7 +207,7 @@ class Bench:
         (target,) = (view.to(device) for view in case.load((case.target,)))
         neighbours = [view.to(device) for view in case.load(case.neighbours)]
         parts = self.config.parts(target)
-        path = self.folder / "context.npz"
+        path = self.folder / "start.npz"
         saved = load_arrays(path)
         if saved is None:
             start = start_of(views, target.camera, parts)

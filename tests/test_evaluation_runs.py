@@ -1,0 +1,257 @@
+"""Runs of methods over cases: what is written, what a stopped run leaves, what is refused."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gscompleter import InputError
+from gscompleter.cli import main
+from gscompleter.evaluation import runs
+from gscompleter.evaluation.cases import Case
+from gscompleter.evaluation.methods import METHODS, check_methods
+from gscompleter.evaluation.protocols import read_evaluation_index
+from gscompleter.evaluation.runs import RunConfig, Tally, evaluate, read_json
+from gscompleter.evaluation.tables import tables
+from gscompleter.io.image import write_image
+from gscompleter.io.scene import write_cameras
+from scenes import Room, camera_at, view_of
+
+SIZE = 32
+METHOD_NAMES = ("context", "full", "no-rc", "densify-100")
+CONFIG = RunConfig(baseline_iterations=6)
+TABLES = ("tables.md", "tables.tex", "tables.json")
+ROOMS = {"box": Room(), "wide": Room(boxes=(((-4.0, -1.5, -1.0), (4.0, 1.5, 6.0)),))}
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory) -> Path:
+    """Two rooms photographed from four places, frames 2 and 3 beyond what 0 and 1 see."""
+    root = tmp_path_factory.mktemp("rooms")
+    places = ((-0.3, 0), (0.1, 0), (0.7, 12), (0.8, 14))
+    cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in places]
+    names = [f"{i}.png" for i in range(len(cameras))]
+    for scene, room in ROOMS.items():
+        (root / scene).mkdir()
+        for name, camera in zip(names, cameras, strict=True):
+            write_image(root / scene / name, view_of(room, camera).image)
+        write_cameras(root / scene / "transforms.json", cameras, names)
+    rows = [
+        {
+            "scene": scene,
+            "context": [0, 1],
+            "target": 2,
+            "neighbours": [3],
+            "near": 0.5,
+            "far": 20.0,
+        }
+        for scene in ROOMS
+    ]
+    (root / "cases.json").write_text(json.dumps({"resolution": [SIZE, SIZE], "cases": rows}))
+    return root
+
+
+@pytest.fixture(scope="module")
+def cases(scenes) -> list[Case]:
+    return [Case(scenes / s, (0, 1), 2, (3,), (SIZE, SIZE), 0.5, 20.0) for s in ROOMS]
+
+
+@pytest.fixture(scope="module")
+def finished(cases, tmp_path_factory) -> Path:
+    """An uninterrupted run and its tables."""
+    out = tmp_path_factory.mktemp("runs") / "out"
+    assert evaluate(cases, METHOD_NAMES, out, CONFIG) == Tally(8, 0, 0)
+    tables(out)
+    return out
+
+
+def same_tables(out: Path, other: Path) -> None:
+    tables(out)
+    for name in TABLES:
+        assert (out / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
+    content = read_json(finished / "tables.json")
+    assert list(content["methods"]) == list(METHOD_NAMES)
+    assert (content["cases"], len(content["common"]), content["failures"]) == (2, 2, [])
+    scores = {name: row["target_psnr"]["value"] for name, row in content["methods"].items()}
+    before = content["methods"]["context"]["target_psnr_before"]["value"]
+    assert scores["context"] == before
+    assert scores["full"] > before + 1
+    assert content["methods"]["context"]["context_change"]["value"] == 0
+    for row in content["methods"].values():
+        assert row["target_psnr_before"]["value"] == before
+    assert "seconds" not in json.dumps(content)
+    assert set(read_json(finished / "timings.json")) == set(METHOD_NAMES)
+
+
+def test_rows_that_are_lost_are_made_again_from_what_is_saved(finished, cases, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    for path in (out / "cases").glob("*/*.json"):
+        path.unlink()
+    saved = {path: path.read_bytes() for path in (out / "cases").glob("*/*.npz")}
+    assert evaluate(cases, METHOD_NAMES, out, CONFIG) == Tally(8, 0, 0)
+    assert saved == {path: path.read_bytes() for path in (out / "cases").glob("*/*.npz")}
+    for path in (out / "cases").glob("*/*.json"):
+        assert path.read_bytes() == (finished / path.relative_to(out)).read_bytes()
+    same_tables(out, finished)
+
+
+def test_a_run_goes_on_where_it_was_stopped(finished, cases, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    original = runs.write_json
+
+    def stopped(path, content):
+        if path.parent.name.startswith("wide") and path.name == "full.json":
+            raise KeyboardInterrupt
+        original(path, content)
+
+    monkeypatch.setattr(runs, "write_json", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(cases, METHOD_NAMES, out, CONFIG)
+    monkeypatch.setattr(runs, "write_json", original)
+    (wide,) = (out / "cases").glob("wide*")
+    (wide / "start.npz").write_bytes(b"half")
+    (wide / "full.npz").unlink()
+    assert evaluate(cases, METHOD_NAMES, out, CONFIG) == Tally(3, 0, 5)
+    same_tables(out, finished)
+    assert evaluate(cases, METHOD_NAMES, out, CONFIG) == Tally(0, 0, 8)
+
+
+def test_shards_add_up(finished, cases, tmp_path):
+    out = tmp_path / "out"
+    for number in (1, 0):
+        assert evaluate(cases, METHOD_NAMES, out, CONFIG, (number, 2)) == Tally(4, 0, 0)
+    same_tables(out, finished)
+
+
+def test_a_broken_case_is_a_row_with_its_reason(scenes, cases, tmp_path, monkeypatch):
+    broken = Case(scenes / "box", (0, 9), 2, (), (SIZE, SIZE), 0.5, 20.0)
+    out = tmp_path / "out"
+
+    def defect(start, parts):
+        raise RuntimeError("out of\nmemory")
+
+    monkeypatch.setitem(METHODS, "no-rc", defect)
+    methods = ("context", "no-rc")
+    assert evaluate([broken, cases[0]], methods, out, CONFIG) == Tally(1, 3, 0)
+    summary = tables(out)
+    reasons = {(case, method): reason for case, method, reason in summary.failures}
+    assert "no frame 9" in reasons[broken.name, "context"]
+    assert reasons[cases[0].name, "no-rc"] == "RuntimeError: out of memory"
+    assert (summary.cases, summary.common) == (2, ())
+    assert "RuntimeError" in (out / "tables.md").read_text()
+
+
+def test_baselines_run(cases, tmp_path):
+    out = tmp_path / "out"
+    config = RunConfig(baseline_iterations=2)
+    assert evaluate(cases[:1], ("distill", "reggs"), out, config) == Tally(2, 0, 0)
+    rows = {path.stem: read_json(path) for path in (out / "cases").glob("*/*.json")}
+    assert rows["distill"]["gaussians"]["after"] == rows["distill"]["gaussians"]["context"]
+    assert rows["reggs"]["gaussians"]["after"] > rows["reggs"]["gaussians"]["context"]
+    assert rows["distill"]["scores"]["depth_rim"] is None
+
+
+def test_wrong_runs_are_refused(finished, cases, tmp_path):
+    with pytest.raises(InputError, match="no method 'nope'; choose of context, full"):
+        check_methods(["context", "nope"])
+    with pytest.raises(InputError, match="twice"):
+        check_methods(["full", "full"])
+    with pytest.raises(InputError, match="no shard 2/2"):
+        evaluate(cases, ["context"], tmp_path / "out", CONFIG, (2, 2))
+    with pytest.raises(InputError, match="same name"):
+        evaluate([cases[0]] * 2, ["context"], tmp_path / "out", CONFIG)
+    with pytest.raises(InputError, match="no case to run"):
+        evaluate([], ["context"], tmp_path / "out", CONFIG)
+    with pytest.raises(InputError, match="no generator"):
+        evaluate(cases, ["context"], tmp_path / "out", RunConfig(generator="dall-e"))
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="seed 0, and 1"):
+        evaluate(cases, ["context"], finished, RunConfig(seed=1, baseline_iterations=6))
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(InputError, match="something other than a run"):
+        evaluate(cases, ["context"], tmp_path, CONFIG)
+    with pytest.raises(InputError, match="holds no run"):
+        tables(tmp_path)
+
+
+def run(monkeypatch, *arguments) -> int:
+    """Run the command in this process; returns its exit code."""
+    monkeypatch.setattr(sys, "argv", ["gscompleter", *map(str, arguments)])
+    try:
+        main()
+    except SystemExit as stop:
+        return stop.code or 0
+    return 0
+
+
+def test_the_commands_run_end_to_end(scenes, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    arguments = ["evaluate", scenes / "cases.json", "--methods", "context", "--device", "cpu"]
+    assert run(monkeypatch, *arguments, "--out", out, "--shard", "0/2") == 0
+    assert run(monkeypatch, *arguments, "--out", out, "--shard", "1/2") == 0
+    assert "Over 2 of 2 cases" in capsys.readouterr().out
+    assert run(monkeypatch, "tables", out, "--quiet") == 0
+    assert capsys.readouterr().out == ""
+
+    index = tmp_path / "n-1.json"
+    assert run(monkeypatch, "index", scenes / "box", "--protocol", "n-1", "--out", index) == 0
+    assert "2 cases in 1 scenes" in capsys.readouterr().out
+    assert list(read_evaluation_index(index).scenes) == ["box"]
+    by_index = ["evaluate", scenes / "box", "--protocol", index, "--methods", "context"]
+    more = ["--out", tmp_path / "more", "--limit", 1, "--quiet", "--device", "cpu"]
+    assert run(monkeypatch, *by_index, *more, "--resolution", 24, 24) == 0
+    (row,) = (tmp_path / "more" / "cases").glob("*/context.json")
+    assert read_json(row)["error"] is None
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (("--methods", "nope"), "no method 'nope'"),
+        (("--shard", "1"), "i/n"),
+        (("--shard", "3/2"), "no shard 3/2"),
+        (("--protocol", "m-1"), "no protocol 'm-1'"),
+        (("--protocol", "stress"), "no case to run"),
+        (("--limit", "0"), "--limit"),
+        (("--generator", "dall-e"), "no generator"),
+    ],
+)
+def test_wrong_options_are_refused(scenes, tmp_path, monkeypatch, capsys, more, sentence):
+    out = tmp_path / "out"
+    assert run(monkeypatch, "evaluate", scenes / "cases.json", "--out", out, *more) == 2
+    assert sentence in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_scenes_need_a_protocol_and_an_index_is_kept(scenes, tmp_path, monkeypatch, capsys):
+    assert run(monkeypatch, "evaluate", scenes / "box", "--out", tmp_path / "out") == 2
+    assert "--protocol" in capsys.readouterr().err
+    file = tmp_path / "mine.json"
+    file.write_text("precious")
+    assert run(monkeypatch, "index", scenes, "--protocol", "n-1", "--out", file) == 2
+    assert file.read_text() == "precious"
+    assert run(monkeypatch, "tables", tmp_path) == 2
+
+
+def test_full_is_what_the_completer_does_by_itself(cases):
+    from gscompleter import GSCompleter
+
+    config = RunConfig()
+    case = cases[0]
+    views, (target,) = case.load(case.context), case.load((case.target,))
+    from gscompleter.evaluation.methods import start_of, synthesized
+
+    parts = config.parts(target)
+    start = start_of(views, target.camera, parts)
+    alone = GSCompleter()(views, target.camera)
+    predicted = METHODS["full"](start, parts)
+    assert torch.equal(predicted.scene.means, alone.scene.means)
+    assert torch.equal(predicted.scene.opacities, alone.scene.opacities)
+    assert torch.equal(synthesized(start, parts).image, alone.targets[0].reference.image)
