@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from gscompleter import InputError
+from gscompleter import GSCompleter, InputError
 from gscompleter.cli import main
 from gscompleter.evaluation import runs
 from gscompleter.evaluation.cases import Case
-from gscompleter.evaluation.methods import METHODS, check_methods
+from gscompleter.evaluation.methods import METHODS, check_methods, start_of, synthesized
 from gscompleter.evaluation.protocols import read_evaluation_index
 from gscompleter.evaluation.runs import RunConfig, Tally, evaluate, read_json
 from gscompleter.evaluation.tables import tables
@@ -241,14 +241,9 @@ def test_scenes_need_a_protocol_and_an_index_is_kept(scenes, tmp_path, monkeypat
 
 
 def test_full_is_what_the_completer_does_by_itself(cases):
-    from gscompleter import GSCompleter
-
-    config = RunConfig()
     case = cases[0]
     views, (target,) = case.load(case.context), case.load((case.target,))
-    from gscompleter.evaluation.methods import start_of, synthesized
-
-    parts = config.parts(target)
+    parts = RunConfig().parts(target)
     start = start_of(views, target.camera, parts)
     alone = GSCompleter()(views, target.camera)
     predicted = METHODS["full"](start, parts)
