@@ -149,7 +149,7 @@ def alignment(
     is made of the target's pixels that each covers when it is rendered alone (alpha of at least
     `min_alpha`).
 
-    - AbsRel compares the two rendered z-depths there; the context is the reference.
+    - AbsRel compares the two rendered z-depths there; the context's is the reference.
     - A point of the first cloud is the mean of an added Gaussian that projects into the overlap.
       It is matched with all of the context.
     - A point of the second cloud is the mean of a context Gaussian that projects into the
@@ -157,7 +157,10 @@ def alignment(
       surface hides was never to be reproduced. It is matched with all that was added.
 
     The overlap thus restricts which points are judged, not what they may be matched with: the
-    border of the overlap adds no error of its own, and Gaussians that coincide score 0.
+    border of the overlap adds no error of its own, and Gaussians that coincide score 0. A true
+    completion made of other Gaussians does not quite: primitives are spaced, and where the hole
+    borders on a depth edge each render mixes two depths. Compare methods on the same cases, in
+    which this floor is the same.
 
     Args:
         result: The completed target.
