@@ -112,6 +112,28 @@ def test_a_smooth_continuation_keeps_a_ramp_going_and_knows_its_border():
     assert (filled[8:-8, 40:48] - ramp[8:-8, 40:48]).abs().max() < 0.05
 
 
+@pytest.mark.parametrize(("h", "w"), [(64, 64), (63, 64), (51, 77), (9, 200), (3, 5)])
+def test_a_smooth_continuation_takes_images_of_any_size(h, w):
+    values = torch.rand(h, w, 4, generator=torch.Generator().manual_seed(0))
+    weight = torch.ones(h, w)
+    weight[:, w // 2 :] = 0
+    filled = continued(values, weight)
+    assert torch.equal(filled[:, : w // 2], values[:, : w // 2])
+    assert torch.isfinite(filled).all()
+    assert filled.min() >= values.min() - 1e-4
+    assert filled.max() <= values.max() + 1e-4
+
+
+def test_an_image_of_odd_size_is_completed():
+    target = replace(TARGET, width=SIZE - 7, height=SIZE - 15)
+    context = known_room()
+    scene = merge([gaussians_of(view) for view in context.views])
+    odd = replace(context, at_target=load_renderer("cpu").render(scene, target))
+    image = WarpInpaint()(context.views[1], target, odd)
+    assert image.shape == (SIZE - 15, SIZE - 7, 3)
+    assert torch.isfinite(image).all()
+
+
 def test_a_crack_is_no_hole():
     hole = torch.zeros(40, 40, dtype=torch.bool)
     hole[:, 10:13] = True

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from gscompleter.baselines.reggs import rotation_matrix
+from gscompleter.geometry import rotations_from
 from gscompleter.progress import track
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, View, merge, observed
@@ -194,7 +194,7 @@ def densified(
         children = []
         for _ in range(2):
             offset = parents.scales * torch.randn(len(parents), 3, generator=random)
-            moved = parents.means + (rotation_matrix(parents.quats) @ offset[..., None])[..., 0]
+            moved = parents.means + (rotations_from(parents.quats) @ offset[..., None])[..., 0]
             children.append(replace(parents, means=moved, scales=parents.scales / 1.6))
         dense = merge([kept, clones, *children])
         return dense[dense.opacities >= config.min_opacity]

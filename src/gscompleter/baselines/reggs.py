@@ -22,6 +22,7 @@ from gscompleter.baselines.mixture_wasserstein import (
     mixture_wasserstein,
     reduced,
 )
+from gscompleter.geometry import rotations_from
 from gscompleter.progress import track
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, View
@@ -61,7 +62,7 @@ class Similarity:
 
     @property
     def rotation(self) -> Float[Tensor, "3 3"]:
-        return rotation_matrix(self.quaternion)
+        return rotations_from(self.quaternion)
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ def into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
 def clustered(gaussians: Gaussians, camera: Camera, components: int, seed: int) -> Mixture:
     """The Gaussians in camera axes, merged into clusters of their means (k-means)."""
     rotation = camera.c2w[:3, :3]
-    axes = rotation.T @ rotation_matrix(gaussians.quats)
+    axes = rotation.T @ rotations_from(gaussians.quats)
     spread = axes * gaussians.scales[:, None, :]
     mixture = Mixture(
         (gaussians.means - camera.center) @ rotation,
@@ -198,17 +199,6 @@ def turned(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
         rotation @ mixture.covariances @ rotation.T,
         mixture.weights,
     )
-
-
-def rotation_matrix(quaternions: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
-    """Rotations of wxyz quaternions of any length but 0."""
-    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, dim=-2)
 
 
 def multiplied(

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from gscompleter.completer import GSCompleter
 from gscompleter.errors import InputError
-from gscompleter.evaluation.metrics import psnr, ssim
+from gscompleter.evaluation.geometry_metrics import abs_rel
+from gscompleter.evaluation.metrics import masked_psnr, psnr, ssim
 from gscompleter.io.scene import load_views
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Completion, Gaussians, Render, View
@@ -193,7 +194,7 @@ def score(name: str, outcome: Outcome, truth: Truth, renderer: Renderer) -> Case
         depth_observed=absrel(after.depth, target.depth, ~hole & covered),
         depth_hole=absrel(after.depth, target.depth, hole & covered),
         depth_rim=rim_error(outcome.added, before, target.camera, renderer),
-        hole_psnr=psnr(after.image[hole][None], target.image[hole][None]) if hole.any() else None,
+        hole_psnr=masked_psnr(after.image, target.image, hole),
         seconds=outcome.seconds,
     )
 
@@ -238,10 +239,5 @@ def mean_change(changes: list[Change]) -> Change | None:
 def absrel(
     depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]
 ) -> float | None:
-    """Mean of |depth - truth| / truth over pixels of `where` with known (non-zero) truth."""
-    if truth is None:
-        return None
-    known = where & (truth > 0)
-    if not known.any():
-        return None
-    return ((depth - truth).abs() / truth.clamp_min(1e-12))[known].mean().item()
+    """`abs_rel` over `where`; None where no truth is known."""
+    return None if truth is None else abs_rel(depth, truth, where)

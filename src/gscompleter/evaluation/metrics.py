@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -16,6 +16,16 @@ def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     """Peak signal-to-noise ratio in dB: -10 log10(mean((clip(image) - truth)^2)), peak 1."""
     error = (image.clamp(0, 1) - truth).double().square().mean().item()
     return min(-10 * math.log10(error), MAX_PSNR) if error > 0 else MAX_PSNR
+
+
+def masked_psnr(
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
+) -> float | None:
+    """PSNR in dB over the pixels of `where` only; None where there are none.
+
+    With the hole mask it judges what was generated, with its complement what was observed.
+    """
+    return psnr(image[where][None], truth[where][None]) if where.any() else None
 
 
 def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:

@@ -60,7 +60,9 @@ def mean_pyramid(weighted: Float32[ndarray, "h w c"]) -> Float32[ndarray, "level
         if min(weighted.shape[:2]) <= 8:
             break
         half = ((weighted.shape[1] + 1) // 2, (weighted.shape[0] + 1) // 2)
-        weighted = cv2.resize(blurred, half, interpolation=cv2.INTER_AREA)
+        # Of odd sizes OpenCV averages four channels at most, so that each goes by itself.
+        planes = [cv2.resize(p, half, interpolation=cv2.INTER_AREA) for p in cv2.split(blurred)]
+        weighted = np.stack(planes, axis=-1)
 
     total = sums[0].sum(axis=(0, 1))
     wider = np.broadcast_to(total[:-1] / total[-1], (h, w, len(total) - 1))

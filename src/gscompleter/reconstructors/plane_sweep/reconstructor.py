@@ -111,9 +111,15 @@ class PlaneSweep:
             self.sweep(i, frames, transforms, near / unit, far / unit) for i in range(len(frames))
         ]
         confidences = self.confidences(sweeps, transforms)
+        sure = [
+            np.where(confidence > 0, sweep.inverse(sweep.index), UNKNOWN)
+            for sweep, confidence in zip(sweeps, confidences, strict=True)
+        ]
         depths = []
         for number, (view, frame, sweep) in enumerate(zip(views, frames, sweeps, strict=True)):
-            measured, weight = self.with_background(number, sweeps, confidences, transforms)
+            measured, weight = self.with_background(
+                number, sweep, confidences[number], sure, transforms
+            )
             heights = fit_surfaces(measured, weight, frame.image, self.surfaces)
             depth = torch.from_numpy(np.float32(unit) / sweep.inverse(heights))
             confidence = torch.from_numpy(confidences[number])
@@ -155,20 +161,19 @@ class PlaneSweep:
     def with_background(
         self,
         number: int,
-        sweeps: Sequence[Sweep],
-        confidences: Sequence[Map],
+        sweep: Sweep,
+        confidence: Map,
+        sure: Sequence[Map],
         transforms: Transforms,
     ) -> tuple[Map, Map]:
-        """The planes of view `number` and how much each counts, those of occluded pixels too."""
-        sweep, confidence = sweeps[number], confidences[number]
+        """The planes of view `number` and how much each counts, those of occluded pixels too.
+
+        `sure` are the inverse depths of all views, next to 0 where a view is not sure of them.
+        """
         background = stereo.background(sweep.index, confidence > 0)
         neighbours = [
-            Neighbour(
-                np.where(confidences[i] > 0, other.inverse(other.index), UNKNOWN),
-                transforms[number, i],
-                transforms[i, number],
-            )
-            for i, other in enumerate(sweeps)
+            Neighbour(inverse, transforms[number, i], transforms[i, number])
+            for i, inverse in enumerate(sure)
             if i != number
         ]
         occluded = (confidence == 0) & hidden_from_others(

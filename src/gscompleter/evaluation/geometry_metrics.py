@@ -1,0 +1,199 @@
+"""How well generated geometry agrees with the context: AbsRel, Chamfer distance and F-score.
+
+The paper reports the three as "the alignment error between the generated target primitives and
+the context primitives" and gives neither formulas nor thresholds. Ours are below, each with its
+reason. They can rank methods and ablations scored alike; they are not comparable with the
+numbers printed in the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.geometry import inside, project, sample
+from gscompleter.render import Renderer
+from gscompleter.stages.integration import keep_in_holes
+from gscompleter.types import Camera, Gaussians, TargetCompletion
+
+MIN_OPACITY = 1 / 255
+"""Gaussians of less opacity are dropped by every renderer: they are part of no surface."""
+
+
+def abs_rel(
+    depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]
+) -> float | None:
+    """Absolute relative error: mean(|depth - truth| / truth), without unit; 0 is best.
+
+    Over the pixels of `where` with known (positive) truth; None where there is none. No scale
+    is fitted beforehand: a wrong scale is one of the errors that registration has to remove.
+    """
+    known = where & (truth > 0)
+    if not known.any():
+        return None
+    d, t = depth[known].double(), truth[known].double()
+    return ((d - t).abs() / t).mean().item()
+
+
+@dataclass(frozen=True)
+class CloudDistances:
+    """Distance of each point of a cloud A to the nearest of a cloud B, and of each of B to A."""
+
+    a_to_b: Float[np.ndarray, "n"]
+    b_to_a: Float[np.ndarray, "m"]
+
+    @property
+    def chamfer(self) -> float:
+        """(mean_a min_b |a - b| + mean_b min_a |a - b|) / 2, in scene units; 0 is best.
+
+        Distances are not squared, so that a few floaters do not decide the number, and the two
+        means are averaged rather than added, so that it reads as a length: a cloud moved along
+        its normals by x has a Chamfer distance of x.
+        """
+        return float(self.a_to_b.mean() + self.b_to_a.mean()) / 2
+
+    def f_score(self, threshold: float) -> float:
+        """2 P R / (P + R), in [0, 1]; 1 is best, and 0 where P = R = 0.
+
+        The precision P is the share of A within `threshold` (scene units) of B, the recall R
+        the share of B within `threshold` of A.
+        """
+        precision = float((self.a_to_b <= threshold).mean())
+        recall = float((self.b_to_a <= threshold).mean())
+        total = precision + recall
+        return 2 * precision * recall / total if total > 0 else 0.0
+
+
+def chamfer_distance(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> float:
+    """Symmetric Chamfer distance of two point sets, in scene units (`CloudDistances.chamfer`)."""
+    return cloud_distances(a, b).chamfer
+
+
+def f_score(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"], threshold: float) -> float:
+    """F-score of `a` against `b`; `threshold` is in scene units (`CloudDistances.f_score`)."""
+    return cloud_distances(a, b).f_score(threshold)
+
+
+def cloud_distances(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> CloudDistances:
+    """Exact nearest-neighbour distances between two point sets, both ways.
+
+    Raises:
+        InputError: where a set is empty or holds a point that is not finite.
+    """
+    return CloudDistances(nearest(a, b), nearest(b, a))
+
+
+def nearest(points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]) -> Float[np.ndarray, "n"]:
+    """Euclidean distance of each point to the nearest of `others`, in float64.
+
+    A k-d tree: n log m, which a million points on both sides do not mind. Each query stands for
+    itself, so the number of threads cannot change a result. Splitting at the middle of a cell
+    instead of at the median keeps the tree fast where many points coincide.
+
+    Raises:
+        InputError: where a set is empty or holds a point that is not finite.
+    """
+    if len(points) == 0 or len(others) == 0:
+        raise InputError(
+            "Distances between point sets need points on both sides, "
+            f"got {len(points)} and {len(others)}."
+        )
+    queries, targets = (p.detach().cpu().double().numpy() for p in (points, others))
+    if not (np.isfinite(queries).all() and np.isfinite(targets).all()):
+        raise InputError("Distances between point sets need finite points; some are not.")
+    distances, _ = cKDTree(targets, balanced_tree=False).query(queries, workers=-1)
+    return np.asarray(distances, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class AlignmentConfig:
+    min_alpha: float = 0.5
+    """A pixel is covered where alpha is at least this, as for the holes (paper, Eq. 10)."""
+    threshold: float = 0.05
+    """Distance that counts as matched, as a share of the median context depth at the target.
+    Relative, so that scenes of any unit and size can be averaged; 5 % is wider than the spacing
+    of the primitives and well below the depth of a room."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How generated primitives continue the context where the two overlap. None: nowhere."""
+
+    overlap: float
+    """Share of the target's pixels that both cover."""
+    scale: float | None
+    """Median z-depth of the context at the target, in scene units."""
+    abs_rel: float | None
+    """Of the generated z-depth against the context's, over the overlap."""
+    chamfer: float | None
+    """In scene units. Divide by `scale` to average over scenes."""
+    f_score: float | None
+
+
+@torch.no_grad()
+def alignment(
+    result: TargetCompletion,
+    context: Gaussians,
+    renderer: Renderer,
+    config: AlignmentConfig = AlignmentConfig(),
+) -> Alignment:
+    """AbsRel, Chamfer distance and F-score between what one target added and the context.
+
+    Completion adds primitives in the dilated hole only, so the two meet at its rim. The overlap
+    is made of the target's pixels that each covers when it is rendered alone (alpha of at least
+    `min_alpha`).
+
+    - AbsRel compares the two rendered z-depths there; the context's is the reference.
+    - A point of the first cloud is the mean of an added Gaussian that projects into the overlap.
+      It is matched with all of the context.
+    - A point of the second cloud is the mean of a context Gaussian that projects into the
+      overlap and lies on the surface seen from the target, within the threshold; what the
+      surface hides was never to be reproduced. It is matched with all that was added.
+
+    The overlap thus restricts which points are judged, not what they may be matched with: the
+    border of the overlap adds no error of its own, and Gaussians that coincide score 0. A true
+    completion made of other Gaussians does not quite: primitives are spaced, and where the hole
+    borders on a depth edge each render mixes two depths. Compare methods on the same cases, in
+    which this floor is the same.
+
+    Args:
+        result: The completed target.
+        context: The scene as it was before, usually `Completion.context`.
+        renderer: Draws both.
+        config: What counts as covered and as matched.
+    """
+    added = result.added[result.added.opacities >= MIN_OPACITY]
+    context = context[context.opacities >= MIN_OPACITY]
+    camera = result.target
+    generated = renderer.render(added, camera).depth_map(config.min_alpha)
+    reference = renderer.render(context, camera).depth_map(config.min_alpha)
+    overlap = generated.valid & reference.valid
+    share = overlap.double().mean().item()
+    if not overlap.any():
+        return Alignment(share, None, None, None, None)
+
+    scale = reference.depth[reference.valid].double().median().item()
+    threshold = config.threshold * scale
+    judged = keep_in_holes(added, None, overlap, camera).means
+    surface = keep_in_holes(context, None, overlap, camera).means
+    surface = surface[on_surface(surface, reference.depth, camera, threshold)]
+    error = abs_rel(generated.depth, reference.depth, overlap)
+    if len(judged) == 0 or len(surface) == 0:
+        return Alignment(share, scale, error, None, None)
+    distances = CloudDistances(nearest(judged, context.means), nearest(surface, added.means))
+    return Alignment(share, scale, error, distances.chamfer, distances.f_score(threshold))
+
+
+def on_surface(
+    points: Float[Tensor, "n 3"], depth: Float[Tensor, "h w"], camera: Camera, tolerance: float
+) -> Bool[Tensor, "n"]:
+    """Points whose z-depth is that of their pixel, within `tolerance` in scene units."""
+    pixels, z = project(points, camera)
+    at_pixel = sample(depth[..., None], pixels, "nearest")[..., 0]
+    return inside(pixels, z, camera) & ((z - at_pixel).abs() <= tolerance)

@@ -1,0 +1,340 @@
+"""LPIPS, the learned perceptual distance of Zhang et al. (CVPR 2018), version 0.1.
+
+Both images run through a network trained on ImageNet. At five depths l the features of each
+pixel are scaled to unit length, and the squared differences of the channels c are weighted by
+learned, non-negative numbers w:
+
+    LPIPS = sum_l mean_{y,x} sum_c w_lc (f_lc(y, x) - g_lc(y, x))²
+
+The modules are ours, in plain PyTorch; their parameters carry the names of the published files,
+two per network: the backbone as torchvision publishes it, and the linear weights of
+github.com/richzhang/PerceptualSimilarity. Other weights would give another metric, so a file is
+only read where its SHA-256 is that of the published one, and without weights there is no number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.errors import InputError
+
+NetworkName = Literal["vgg", "alex"]
+
+
+class WeightsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in a sentence)
+    """The published weights are not on this machine."""
+
+
+@dataclass(frozen=True)
+class WeightsFile:
+    """A published file of weights."""
+
+    name: str
+    url: str
+    sha256: str
+    cache: str
+    """Its folder within that of torch.hub."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """A backbone, where its features are read, and the files that fill it."""
+
+    layers: tuple[tuple[int, int, int, int] | str, ...]
+    """A convolution as (channels, kernel, stride, padding), or `relu` or `pool`."""
+    pool: int
+    """Side of the max-pooling windows, which are 2 pixels apart."""
+    taps: tuple[int, int, int, int, int]
+    """Layers whose output is compared."""
+    channels: tuple[int, int, int, int, int]
+    """Channels of those outputs."""
+    min_side: int
+    """Fewest pixels per side of which something reaches the last tap."""
+    backbone: WeightsFile
+    linear: WeightsFile
+
+
+def vgg_layers() -> tuple[tuple[int, int, int, int] | str, ...]:
+    """Layers of VGG16: blocks of 3 x 3 convolutions with pooling after each."""
+    layers: list[tuple[int, int, int, int] | str] = []
+    for channels, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        for _ in range(depth):
+            layers += [(channels, 3, 1, 1), "relu"]
+        layers.append("pool")
+    return tuple(layers)
+
+
+TORCHVISION = "https://download.pytorch.org/models/"
+# A commit and not a branch: what the address means cannot change.
+LINEAR = (
+    "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/"
+    "082bb24f84c091ea94de2867d34c4544f68e0963/lpips/weights/v0.1/"
+)
+
+# The SHA-256 of the backbones begin with the digits in their names. Those of the linear weights
+# have no publisher's statement; several independent projects record the same ones.
+NETWORKS: dict[str, Network] = {
+    "vgg": Network(
+        layers=vgg_layers(),
+        pool=2,
+        taps=(3, 8, 15, 22, 29),
+        channels=(64, 128, 256, 512, 512),
+        min_side=16,
+        backbone=WeightsFile(
+            "vgg16-397923af.pth",
+            TORCHVISION + "vgg16-397923af.pth",
+            "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
+            "checkpoints",
+        ),
+        linear=WeightsFile(
+            "vgg.pth",
+            LINEAR + "vgg.pth",
+            "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
+            "checkpoints/lpips_v0.1",
+        ),
+    ),
+    "alex": Network(
+        layers=(
+            *((64, 11, 4, 2), "relu", "pool"),
+            *((192, 5, 1, 2), "relu", "pool"),
+            *((384, 3, 1, 1), "relu"),
+            *((256, 3, 1, 1), "relu"),
+            *((256, 3, 1, 1), "relu"),
+        ),
+        pool=3,
+        taps=(1, 4, 7, 9, 11),
+        channels=(64, 192, 384, 256, 256),
+        min_side=31,
+        backbone=WeightsFile(
+            "alexnet-owt-7be5be79.pth",
+            TORCHVISION + "alexnet-owt-7be5be79.pth",
+            "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
+            "checkpoints",
+        ),
+        linear=WeightsFile(
+            "alex.pth",
+            LINEAR + "alex.pth",
+            "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
+            "checkpoints/lpips_v0.1",
+        ),
+    ),
+}
+
+
+class LinearWeights(nn.Module):
+    """w_l: one weight per channel, as a 1 x 1 convolution without bias."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        # The published names count the dropout that stood in front during training.
+        self.model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
+
+    def forward(self, x: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 1 h w"]:
+        return self.model(x)
+
+
+class Lpips(nn.Module):
+    """The metric as a module; `load_lpips` fills it with the published weights."""
+
+    shift: Float[Tensor, "3 1 1"]
+    scale: Float[Tensor, "3 1 1"]
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        self.network = network
+        self.features = backbone(network)
+        for i, channels in enumerate(network.channels):
+            self.add_module(f"lin{i}", LinearWeights(channels))
+        # ImageNet's mean and deviation, for colours in [-1, 1].
+        for name, values in (
+            ("shift", (-0.030, -0.088, -0.188)),
+            ("scale", (0.458, 0.448, 0.450)),
+        ):
+            self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
+
+    def forward(
+        self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
+    ) -> Float[Tensor, ""]:
+        """LPIPS between two images in [0, 1]; 0 for equal ones, greater is worse.
+
+        `image` is clipped to [0, 1] first, as it is for PSNR.
+
+        Raises:
+            InputError: where the images are too small for the network.
+        """
+        height, width = image.shape[:2]
+        if min(height, width) < self.network.min_side:
+            raise InputError(
+                f"LPIPS needs images of at least {self.network.min_side} pixels per side, "
+                f"got {height} x {width}."
+            )
+        pairs = zip(self.unit_features(image.clamp(0, 1)), self.unit_features(truth), strict=True)
+        terms = [
+            self.get_submodule(f"lin{i}")((a - b).square()).mean() for i, (a, b) in enumerate(pairs)
+        ]
+        return torch.stack(terms).sum()
+
+    def unit_features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "1 _ _ _"]]:
+        """Features at the five taps, of unit length along the channels."""
+        x = image.to(self.shift).permute(2, 0, 1) * 2 - 1
+        x = ((x - self.shift) / self.scale)[None]
+        found = []
+        for i, layer in enumerate(self.features):
+            x = layer(x)
+            if i in self.network.taps:
+                length = x.square().sum(dim=1, keepdim=True).sqrt()
+                found.append(x / (length + 1e-10))
+        return found
+
+
+def backbone(network: Network) -> nn.Sequential:
+    """The layers up to the last tap, numbered as torchvision numbers them."""
+    modules: list[nn.Module] = []
+    channels = 3
+    for layer in network.layers[: network.taps[-1] + 1]:
+        if layer == "relu":
+            modules.append(nn.ReLU())
+        elif layer == "pool":
+            modules.append(nn.MaxPool2d(network.pool, stride=2))
+        else:
+            assert not isinstance(layer, str)
+            out, kernel, stride, padding = layer
+            modules.append(nn.Conv2d(channels, out, kernel, stride, padding))
+            channels = out
+    return nn.Sequential(*modules)
+
+
+def load_lpips(
+    network: NetworkName = "vgg", folder: Path | None = None, download: bool = True
+) -> Lpips:
+    """The metric with its published weights, in evaluation mode and without gradients.
+
+    VGG16 is what MVSplat and DepthSplat report; the metric's authors recommend AlexNet for
+    comparing images, which is also several times faster.
+
+    Args:
+        network: `vgg` or `alex`.
+        folder: Where the two files lie, under their published names. None looks into the cache
+            of torch.hub: `checkpoints` for the backbone, `checkpoints/lpips_v0.1` for the linear
+            weights.
+        download: Fetch missing files into that cache (vgg: 530 MB, alex: 240 MB). A folder that
+            was given is taken as it is.
+
+    Raises:
+        WeightsNotAvailable: where a file is missing and cannot be fetched.
+        InputError: where a file is not the published one, or the network is unknown.
+    """
+    if network not in NETWORKS:
+        raise InputError(f"There is no LPIPS network {network!r}; choose {' or '.join(NETWORKS)}.")
+    wanted = NETWORKS[network]
+    paths = [
+        locate(file, wanted, folder, download and folder is None)
+        for file in (wanted.backbone, wanted.linear)
+    ]
+    of_backbone, of_linear = (
+        read_weights(path, file.sha256)
+        for path, file in zip(paths, (wanted.backbone, wanted.linear), strict=True)
+    )
+    metric = Lpips(wanted)
+    # The classifier behind the features is not part of the metric, nor are later layers.
+    weights = {k: v for k, v in of_backbone.items() if k.startswith("features.")} | dict(of_linear)
+    try:
+        metric.load_state_dict(weights, strict=True)
+    except RuntimeError as error:
+        raise InputError(
+            f"{paths[0]} and {paths[1]} do not fit the LPIPS network {network}: {error}"
+        ) from error
+    return metric.eval().requires_grad_(False)
+
+
+def place_of(file: WeightsFile, folder: Path | None) -> Path:
+    """Where a file is expected: in the given folder, else in the cache of torch.hub."""
+    return (Path(torch.hub.get_dir()) / file.cache if folder is None else folder) / file.name
+
+
+def locate(file: WeightsFile, network: Network, folder: Path | None, download: bool) -> Path:
+    """The path of a weights file that exists, after a download where that is allowed.
+
+    Raises:
+        WeightsNotAvailable: where there is none.
+    """
+    path = place_of(file, folder)
+    if path.is_file():
+        return path
+    failure = ""
+    if download:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Checked against the hash before it gets its name.
+            torch.hub.download_url_to_file(file.url, str(path), file.sha256, progress=False)
+            return path
+        except (OSError, RuntimeError) as error:
+            failure = f" (the download failed: {error})"
+    needed = " and ".join(
+        f"{f.name} (from {f.url}) into {place_of(f, folder).parent}"
+        for f in (network.backbone, network.linear)
+    )
+    raise WeightsNotAvailable(f"LPIPS lacks {path.name}{failure}; put {needed}.")
+
+
+def read_weights(path: Path, sha256: str) -> Mapping[str, Tensor]:
+    """The tensors of a file, once its hash is the expected one; never any other object.
+
+    Raises:
+        InputError: where the file is another one, is damaged, or holds more than tensors.
+    """
+    with path.open("rb") as stream:
+        digest = hashlib.sha256()
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    if digest.hexdigest() != sha256:
+        raise InputError(
+            f"{path} is not the published file: its SHA-256 begins with "
+            f"{digest.hexdigest()[:8]} instead of {sha256[:8]}; delete it and fetch it again."
+        )
+    try:
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+        raise InputError(f"{path} holds no plain weights; fetch it again.") from error
+    if not isinstance(weights, Mapping):
+        raise InputError(f"{path} holds no named weights; fetch it again.")
+    return weights
+
+
+@dataclass(frozen=True)
+class LpipsScore:
+    """An entry of a table: a value, or the reason why there is none."""
+
+    value: float | None
+    reason: str | None = None
+
+
+@torch.no_grad()
+def try_lpips(
+    image: Float[Tensor, "h w 3"],
+    truth: Float[Tensor, "h w 3"],
+    network: NetworkName = "vgg",
+    folder: Path | None = None,
+) -> LpipsScore:
+    """LPIPS where its weights lie on this machine, else no value; nothing is downloaded."""
+    try:
+        metric = cached_lpips(network, folder)
+    except WeightsNotAvailable:
+        return LpipsScore(None, "weights not available")
+    return LpipsScore(metric(image, truth).item())
+
+
+@lru_cache(maxsize=2)
+def cached_lpips(network: NetworkName, folder: Path | None) -> Lpips:
+    """`load_lpips` without a download; the last two are kept, as tables ask again and again."""
+    return load_lpips(network, folder, download=False)

@@ -1,0 +1,298 @@
+"""What judges the results is judged here, against plain recomputation."""
+
+import sys
+from dataclasses import replace
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.evaluation.fid import fid
+from gscompleter.evaluation.geometry_metrics import (
+    Alignment,
+    abs_rel,
+    alignment,
+    chamfer_distance,
+    cloud_distances,
+    f_score,
+)
+from gscompleter.evaluation.metrics import MAX_PSNR, masked_psnr, psnr, ssim
+from gscompleter.render import load_renderer
+from gscompleter.stages.integration import dilate, hole_mask, keep_in_holes
+from gscompleter.types import Camera, DepthAffine, Gaussians, TargetCompletion
+from scenes import Room, camera_at, gaussians_of, scaled, view_of
+
+
+def images(seed: int = 0, size: int = 32) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    truth = torch.rand(size, size + 8, 3, generator=generator)
+    noise = torch.randn(truth.shape, generator=generator) * 0.1
+    return (truth + noise).clamp(0, 1), truth
+
+
+# Images
+
+
+def test_psnr_is_that_of_scikit_image():
+    image, truth = images()
+    expected = peak_signal_noise_ratio(truth.double().numpy(), image.double().numpy(), data_range=1)
+    assert psnr(image, truth) == pytest.approx(expected, rel=1e-6)
+
+
+def test_ssim_of_an_image_with_itself_is_one_and_noise_lowers_it():
+    image, truth = images()
+    assert ssim(truth, truth) == pytest.approx(1.0)
+    expected = np.mean(
+        [
+            structural_similarity(
+                image[..., c].numpy(),
+                truth[..., c].numpy(),
+                win_size=11,
+                gaussian_weights=True,
+                data_range=1.0,
+            )
+            for c in range(3)
+        ]
+    )
+    assert ssim(image, truth) == pytest.approx(expected, abs=1e-5)
+    assert ssim(image, truth) < 0.99
+
+
+def test_masked_psnr_sees_its_pixels_only():
+    image, truth = images()
+    hole = torch.zeros(truth.shape[:2], dtype=torch.bool)
+    hole[4:20, 10:30] = True
+    difference = (image.double() - truth.double()).numpy()[hole.numpy()]
+    assert masked_psnr(image, truth, hole) == pytest.approx(
+        -10 * np.log10(np.mean(difference**2)), rel=1e-6
+    )
+    patched = torch.where(hole[..., None], truth, image)
+    assert masked_psnr(patched, truth, hole) == MAX_PSNR
+    assert masked_psnr(patched, truth, ~hole) == masked_psnr(image, truth, ~hole)
+
+
+def test_masked_psnr_of_no_pixel_is_none():
+    image, truth = images()
+    assert masked_psnr(image, truth, torch.zeros(truth.shape[:2], dtype=torch.bool)) is None
+
+
+# Depth
+
+
+def test_abs_rel_is_the_mean_relative_error_where_truth_is_known():
+    generator = torch.Generator().manual_seed(1)
+    truth = torch.rand(12, 15, generator=generator) * 5 + 1
+    truth[3] = 0
+    depth = truth + torch.randn(12, 15, generator=generator) * 0.3
+    where = torch.rand(12, 15, generator=generator) > 0.3
+    d, t = depth.double().numpy(), truth.double().numpy()
+    mask = where.numpy() & (t > 0)
+    assert abs_rel(depth, truth, where) == pytest.approx(np.mean(abs(d - t)[mask] / t[mask]))
+
+
+def test_a_depth_ten_percent_too_great_has_an_abs_rel_of_a_tenth():
+    truth = torch.linspace(1, 4, 12).reshape(3, 4)
+    everywhere = torch.ones(3, 4, dtype=torch.bool)
+    assert abs_rel(1.1 * truth, truth, everywhere) == pytest.approx(0.1, abs=1e-6)
+    assert abs_rel(truth, 0 * truth, everywhere) is None
+
+
+# Point sets
+
+
+def brute_force(a: Tensor, b: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    x, y = a.double().numpy(), b.double().numpy()
+    distances = np.sqrt(((x[:, None] - y[None]) ** 2).sum(-1))
+    return distances.min(1), distances.min(0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_chamfer_and_f_score_agree_with_brute_force(seed: int):
+    generator = torch.Generator().manual_seed(seed)
+    a = torch.randn(150, 3, generator=generator)
+    b = torch.randn(220, 3, generator=generator) * 1.2 + 0.2
+    there, back = brute_force(a, b)
+    assert chamfer_distance(a, b) == pytest.approx((there.mean() + back.mean()) / 2, rel=1e-12)
+    for threshold in (0.2, 0.4, 0.8):
+        precision, recall = (there <= threshold).mean(), (back <= threshold).mean()
+        expected = 2 * precision * recall / (precision + recall)
+        assert f_score(a, b, threshold) == pytest.approx(expected)
+        assert f_score(b, a, threshold) == pytest.approx(expected)
+
+
+def test_a_plane_moved_along_its_normal_is_that_far_away():
+    y, x = torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij")
+    plane = torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3)
+    moved = plane + torch.tensor([0.0, 0.0, 0.25])
+    assert chamfer_distance(plane, moved) == pytest.approx(0.25)
+    assert f_score(plane, moved, 0.2) == 0.0
+    assert f_score(plane, moved, 0.3) == 1.0
+
+
+def test_coinciding_points_are_at_distance_zero():
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).repeat(20, 1)
+    assert chamfer_distance(points, points[:50]) == 0.0
+    assert f_score(points, points[:50], 1e-9) == 1.0
+
+
+def test_hundreds_of_thousands_of_points_are_no_trouble():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.rand(200_000, 3, generator=generator) for _ in range(2))
+    distances = cloud_distances(a, b)
+    assert distances.a_to_b.shape == distances.b_to_a.shape == (200_000,)
+    # A Poisson process of density n: mean nearest distance 0.554 n^(-1/3), more at the border.
+    assert distances.chamfer == pytest.approx(0.554 * 200_000 ** (-1 / 3), rel=0.05)
+    few = torch.arange(0, 200_000, 4_000)
+    assert distances.a_to_b[few] == pytest.approx(torch.cdist(a[few], b).amin(1).numpy(), abs=1e-4)
+
+
+def test_an_empty_or_endless_set_of_points_is_refused():
+    points = torch.zeros(5, 3)
+    with pytest.raises(InputError, match="points on both sides, got 5 and 0"):
+        chamfer_distance(points, points[:0])
+    with pytest.raises(InputError, match="finite"):
+        chamfer_distance(points, points.log())
+
+
+# Alignment of a completion with its context
+
+
+TARGET = camera_at(x=0.8, yaw=12.0, size=48)
+RENDERER = load_renderer("cpu")
+
+
+def room_context(unit: float = 1.0) -> Gaussians:
+    return gaussians_of(view_of(Room(unit=unit), camera_at(size=64, unit=unit)))
+
+
+def completed(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> TargetCompletion:
+    """A result that added `added` to `context`."""
+    before = RENDERER.render(context, target)
+    mask = hole_mask(before)
+    return TargetCompletion(target, before, before, mask, None, 0, False, DepthAffine(), added)
+
+
+def filling(context: Gaussians, factor: float = 1.0, dilation: int = 3) -> Gaussians:
+    """The truth at the target in the dilated hole, its depths multiplied by `factor`."""
+    hole = dilate(hole_mask(RENDERER.render(context, TARGET)), dilation)
+    assert 0.05 < hole.double().mean() < 0.7
+    view = view_of(Room(), TARGET)
+    assert view.depth is not None
+    return gaussians_of(view, factor * view.depth)[hole.flatten()]
+
+
+def score_of(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> Alignment:
+    return alignment(completed(context, added, target), context, RENDERER)
+
+
+def test_generated_gaussians_that_coincide_with_the_context_are_aligned():
+    context = room_context()
+    score = score_of(context, context)
+    assert (score.abs_rel, score.chamfer, score.f_score) == (0.0, 0.0, 1.0)
+    assert score.overlap > 0.5
+    assert score.scale is not None
+    assert 2.0 < score.scale < 6.0
+
+
+def test_copies_of_part_of_the_context_are_aligned_wherever_their_border_is():
+    context = room_context()
+    part = torch.zeros(TARGET.height, TARGET.width, dtype=torch.bool)
+    part[10:30, 12:26] = True
+    score = score_of(context, keep_in_holes(context, None, part, TARGET))
+    assert score.abs_rel is not None
+    assert score.chamfer is not None
+    assert score.f_score is not None
+    assert 0.0 < score.overlap < 0.3
+    assert score.abs_rel < 0.02
+    assert score.chamfer < 0.02
+    assert score.f_score > 0.98
+
+
+def test_alignment_gets_worse_the_further_the_generated_gaussians_are_shifted():
+    context = room_context()
+    scores = [
+        score_of(context, replace(context, means=context.means + shift * TARGET.forward))
+        for shift in (0.0, 0.1, 0.3, 0.9)
+    ]
+    for metric in ("abs_rel", "chamfer"):
+        values = [getattr(score, metric) for score in scores]
+        assert values == sorted(values)
+        assert values[-1] > 3 * values[1] > 0
+    f_scores = [score.f_score for score in scores]
+    assert f_scores == sorted(f_scores, reverse=True)
+    assert f_scores[0] == 1.0
+    assert f_scores[-1] < 0.6
+
+
+def test_alignment_is_measured_at_the_rim_of_a_filled_hole():
+    context = room_context()
+    true = score_of(context, filling(context))
+    far = score_of(context, filling(context, 1.15))
+    assert 0.005 < true.overlap < 0.4
+    # Not 0: the hole borders on the edge of a box, where a render mixes two depths.
+    assert true.abs_rel < 0.06
+    assert 0.12 < far.abs_rel < 0.22
+    assert true.chamfer < 0.4 * far.chamfer
+    assert true.f_score > 0.9 > far.f_score
+
+
+def test_alignment_in_another_unit_of_length_is_the_same_but_for_the_unit():
+    context = room_context()
+    added = filling(context, 1.05)
+    metres = score_of(context, added)
+    K, c2w = TARGET.K, TARGET.c2w.clone()
+    c2w[:3, 3] *= 1000
+    camera = replace(TARGET, c2w=c2w, K=K, near=500.0, far=20000.0)
+    millimetres = score_of(scaled(context, 1000.0), scaled(added, 1000.0), camera)
+    assert millimetres.abs_rel == pytest.approx(metres.abs_rel, rel=1e-3)
+    assert millimetres.chamfer == pytest.approx(1000 * metres.chamfer, rel=1e-2)
+    assert millimetres.f_score == pytest.approx(metres.f_score, rel=1e-2)
+
+
+def test_where_nothing_overlaps_there_is_no_alignment():
+    context = room_context()
+    nothing = score_of(context, context[:0])
+    assert nothing == Alignment(0.0, None, None, None, None)
+    unseen = replace(context, opacities=torch.full_like(context.opacities, 0.001))
+    assert score_of(context, unseen) == nothing
+
+
+# FID
+
+
+def test_fid_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "torchmetrics", None)
+    image, truth = images()
+    with pytest.raises(InputError, match=r"pip install gscompleter\[evaluation\]"):
+        fid([image], [truth])
+
+
+def test_fid_hands_over_batches_of_channels_first(monkeypatch: pytest.MonkeyPatch):
+    seen: list[tuple[tuple[int, ...], bool]] = []
+
+    class Metric:
+        def __init__(self, feature: int, normalize: bool) -> None:
+            assert (feature, normalize) == (2048, True)
+
+        def to(self, device: str) -> "Metric":
+            return self
+
+        def update(self, batch: Tensor, real: bool) -> None:
+            seen.append((tuple(batch.shape), real))
+
+        def compute(self) -> Tensor:
+            return torch.tensor(7.0)
+
+    parts = ("torchmetrics", "torchmetrics.image", "torchmetrics.image.fid")
+    for name in parts:
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    sys.modules[parts[-1]].__dict__.update(vars(SimpleNamespace(FrechetInceptionDistance=Metric)))
+    image, truth = images()
+    assert fid([image, image], [truth, truth]) == 7.0
+    assert seen == [((1, 3, 32, 40), True)] * 2 + [((1, 3, 32, 40), False)] * 2
+    with pytest.raises(InputError, match="at least two photographs, got 1"):
+        fid([image, image], [truth])
