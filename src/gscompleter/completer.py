@@ -95,7 +95,7 @@ class GSCompleter:
                 "frames, or bring a scene."
             )
 
-        clock = Clock()
+        clock = Clock(STAGES)
         with clock("context"):
             near, far = self.depth_range(views, scene)
             views = [replace(v, camera=ranged(v.camera, near, far)) for v in views]
@@ -259,12 +259,16 @@ def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
     return tuple(notes)
 
 
+STAGES = ("context", "generate", "lift", "register", "integrate")
+"""What a completion spends its time on."""
+
+
 class Clock:
     """Wall time by stage."""
 
-    def __init__(self) -> None:
+    def __init__(self, stages: Sequence[str] = ()) -> None:
         self._start = time.perf_counter()
-        self._seconds = dict.fromkeys(("context", "generate", "lift", "register", "integrate"), 0.0)
+        self._seconds = dict.fromkeys(stages, 0.0)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
@@ -274,7 +278,8 @@ class Clock:
         finally:
             if torch.cuda.is_available():
                 torch.cuda.synchronize()
-            self._seconds[stage] += time.perf_counter() - start
+            spent = time.perf_counter() - start
+            self._seconds[stage] = self._seconds.get(stage, 0.0) + spent
 
     def seconds(self) -> dict[str, float]:
         """Seconds of each stage so far, and of all of it."""

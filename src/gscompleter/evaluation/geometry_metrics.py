@@ -20,7 +20,7 @@ from gscompleter.errors import InputError
 from gscompleter.geometry import inside, project, sample
 from gscompleter.render import Renderer
 from gscompleter.stages.integration import keep_in_holes
-from gscompleter.types import Camera, Gaussians, TargetCompletion
+from gscompleter.types import Camera, Gaussians
 
 MIN_OPACITY = 1 / 255
 """Gaussians of less opacity are dropped by every renderer: they are part of no surface."""
@@ -132,14 +132,20 @@ class Alignment:
     abs_rel: float | None
     """Of the generated z-depth against the context's, over the overlap."""
     chamfer: float | None
-    """In scene units. Divide by `scale` to average over scenes."""
+    """In scene units."""
     f_score: float | None
+
+    @property
+    def relative_chamfer(self) -> float | None:
+        """The Chamfer distance as a share of `scale`, to average over scenes."""
+        return self.chamfer / self.scale if self.chamfer is not None and self.scale else None
 
 
 @torch.no_grad()
 def alignment(
-    result: TargetCompletion,
+    added: Gaussians,
     context: Gaussians,
+    target: Camera,
     renderer: Renderer,
     config: AlignmentConfig = AlignmentConfig(),
 ) -> Alignment:
@@ -163,16 +169,16 @@ def alignment(
     which this floor is the same.
 
     Args:
-        result: The completed target.
+        added: What completion added for one target.
         context: The scene as it was before, usually `Completion.context`.
+        target: The camera it was completed for.
         renderer: Draws both.
         config: What counts as covered and as matched.
     """
-    added = result.added[result.added.opacities >= MIN_OPACITY]
+    added = added[added.opacities >= MIN_OPACITY]
     context = context[context.opacities >= MIN_OPACITY]
-    camera = result.target
-    generated = renderer.render(added, camera).depth_map(config.min_alpha)
-    reference = renderer.render(context, camera).depth_map(config.min_alpha)
+    generated = renderer.render(added, target).depth_map(config.min_alpha)
+    reference = renderer.render(context, target).depth_map(config.min_alpha)
     overlap = generated.valid & reference.valid
     share = overlap.double().mean().item()
     if not overlap.any():
@@ -180,9 +186,9 @@ def alignment(
 
     scale = reference.depth[reference.valid].double().median().item()
     threshold = config.threshold * scale
-    judged = keep_in_holes(added, None, overlap, camera).means
-    surface = keep_in_holes(context, None, overlap, camera).means
-    surface = surface[on_surface(surface, reference.depth, camera, threshold)]
+    judged = keep_in_holes(added, None, overlap, target).means
+    surface = keep_in_holes(context, None, overlap, target).means
+    surface = surface[on_surface(surface, reference.depth, target, threshold)]
     error = abs_rel(generated.depth, reference.depth, overlap)
     if len(judged) == 0 or len(surface) == 0:
         return Alignment(share, scale, error, None, None)

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from gscompleter.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.baselines.reggs import RegGSConfig, register_by_similarity
-from gscompleter.completer import GSCompleter, ranged
+from gscompleter.completer import Clock, GSCompleter, ranged
 from gscompleter.config import ABLATIONS, CompleterConfig, named_config
 from gscompleter.errors import InputError
+from gscompleter.evaluation.scores import Outcome
 from gscompleter.generators import Generator
 from gscompleter.geometry import widened
 from gscompleter.reconstructors import Reconstructor
@@ -71,24 +72,7 @@ class Start:
     """What Ψ took."""
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """What a method made of the context."""
-
-    context: Gaussians
-    scene: Gaussians
-    """The scene after it."""
-    seconds: float
-    """Wall time without that of the context."""
-    hole_mask: Bool[Tensor, "h w"]
-    """True where the context has a hole, seen from the target; the same for all methods."""
-    added: Gaussians | None
-    """What stands in `scene` beside the context; None where the context itself was changed."""
-    notes: tuple[str, ...] = ()
-    """Fallbacks that were taken, a sentence each."""
-
-
-Method = Callable[[Start, Parts], Prediction]
+Method = Callable[[Start, Parts], Outcome]
 
 
 def start_of(views: Sequence[View], target: Camera, parts: Parts) -> Start:
@@ -113,20 +97,21 @@ def start_of(views: Sequence[View], target: Camera, parts: Parts) -> Start:
     return Start(views, target, context, holes, seconds)
 
 
-def nothing_added(start: Start, parts: Parts) -> Prediction:
+def nothing_added(start: Start, parts: Parts) -> Outcome:
     """Ψ alone."""
     none = start.context[:0]
-    return Prediction(start.context, start.context, 0.0, start.hole_mask, none)
+    return Outcome(start.context, start.context, none, start.hole_mask, {"total": 0.0})
 
 
 def completed_with(config: str) -> Method:
     """Our method with the settings called `config`."""
 
-    def method(start: Start, parts: Parts) -> Prediction:
+    def method(start: Start, parts: Parts) -> Outcome:
         done = parts.completer(config)(start.views, start.target, start.context)
         notes = done.targets[0].notes
-        seconds = done.seconds["total"]
-        return Prediction(start.context, done.scene, seconds, start.hole_mask, done.added, notes)
+        return Outcome(
+            start.context, done.scene, done.added, start.hole_mask, dict(done.seconds), notes
+        )
 
     return method
 
@@ -134,31 +119,34 @@ def completed_with(config: str) -> Method:
 def optimized_with(config: OptimizationConfig) -> Method:
     """3DGS fitted to the photographs and the synthesized image, from the context on."""
 
-    def method(start: Start, parts: Parts) -> Prediction:
-        begin = time.perf_counter()
-        views = [*start.views, synthesized(start, parts)]
+    def method(start: Start, parts: Parts) -> Outcome:
+        clock = Clock()
+        with clock("generate"):
+            views = [*start.views, synthesized(start, parts)]
         budget = replace(config, iterations=parts.iterations(config.iterations))
-        fitted = optimize(start.context, views, parts.renderer, parts.seed, budget)
-        seconds = time.perf_counter() - begin
-        return Prediction(start.context, fitted.gaussians, seconds, start.hole_mask, None)
+        with clock("optimize"):
+            fitted = optimize(start.context, views, parts.renderer, parts.seed, budget)
+        return Outcome(start.context, fitted.gaussians, None, start.hole_mask, clock.seconds())
 
     return method
 
 
-def registered_by_similarity(start: Start, parts: Parts) -> Prediction:
+def registered_by_similarity(start: Start, parts: Parts) -> Outcome:
     """RegGS: all that was lifted, brought to the context by one similarity."""
-    begin = time.perf_counter()
-    reference = synthesized(start, parts)
-    anchor = start.views[select_anchor(start.target, start.views).index]
-    lifted = lift(parts.reconstructor, reference, anchor).gaussians
-    config = RegGSConfig(iterations=parts.iterations(RegGSConfig.iterations))
-    found = register_by_similarity(
-        lifted, start.context, reference, parts.renderer, parts.seed, config
-    )
+    clock = Clock()
+    with clock("generate"):
+        reference = synthesized(start, parts)
+    with clock("lift"):
+        anchor = start.views[select_anchor(start.target, start.views).index]
+        lifted = lift(parts.reconstructor, reference, anchor).gaussians
+    with clock("register"):
+        config = RegGSConfig(iterations=parts.iterations(RegGSConfig.iterations))
+        found = register_by_similarity(
+            lifted, start.context, reference, parts.renderer, parts.seed, config
+        )
     added = replace(found.gaussians, generated=torch.ones_like(found.gaussians.generated))
     scene = merge([start.context, added])
-    seconds = time.perf_counter() - begin
-    return Prediction(start.context, scene, seconds, start.hole_mask, added)
+    return Outcome(start.context, scene, added, start.hole_mask, clock.seconds())
 
 
 def synthesized(start: Start, parts: Parts) -> View:
@@ -182,16 +170,38 @@ BASELINES: dict[str, Method] = {
 }
 """Methods that are not ours. They run on a CPU."""
 
+_ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABLATIONS}
+# By the name of the method, that of its settings. Three degrees of freedom are no ablation but
+# what the paper compares the ray constraint with.
+
 METHODS: dict[str, Method] = {
     "context": nothing_added,
     "full": completed_with("default"),
     "paper": completed_with("paper"),
-    **{name: completed_with(name) for name in ABLATIONS},
-    "unconstrained": completed_with("3-dof"),
-    **{f"paper/{name}": completed_with(f"paper/{name}") for name in ABLATIONS},
+    **{title: completed_with(name) for title, name in _ABLATIONS.items()},
+    **{f"paper/{title}": completed_with(f"paper/{name}") for title, name in _ABLATIONS.items()},
     **BASELINES,
 }
 """Every method by its name, in the order of the tables."""
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "ablations": tuple(_ABLATIONS),
+    "baselines": tuple(BASELINES),
+    "all": ("context", "full", "paper", *_ABLATIONS, *BASELINES),
+}
+"""Names that stand for several methods."""
+
+
+def methods_named(names: Sequence[str]) -> tuple[str, ...]:
+    """The methods that `names`, of methods or of groups, stand for, each once.
+
+    Raises:
+        InputError: where a name is of neither, or there is none.
+    """
+    found = [method for name in names for method in GROUPS.get(name, (name,))]
+    chosen = tuple(dict.fromkeys(found))
+    check_methods(chosen)
+    return chosen
 
 
 def check_methods(names: Sequence[str]) -> None:
@@ -200,7 +210,8 @@ def check_methods(names: Sequence[str]) -> None:
     Raises:
         InputError: where there is one.
     """
-    known = ", ".join(name for name in METHODS if not name.startswith("paper/"))
+    names_of_all = [*GROUPS, *(name for name in METHODS if not name.startswith("paper/"))]
+    known = ", ".join(names_of_all)
     if not names:
         raise InputError(f"No method was named; choose one or more of {known}.")
     for name in names:

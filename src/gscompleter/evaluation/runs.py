@@ -1,53 +1,54 @@
 """Cases times methods: predict, save, score. A run that was stopped goes on where it was.
 
-A folder of results holds `run.json` (what decided the numbers) and, for each case, a folder with
-the context, and for each method what it made of it (.npz) and its row of scores (.json). Rows
-are made from what is saved, so that to score again is to delete rows and run again.
+Rows of scores are made from what is saved, so that to score again needs no method to run again.
 """
 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
-from zipfile import BadZipFile
 
-import numpy as np
-import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.evaluation.cases import Outcome, ranged_truth, score
+from gscompleter.evaluation.memory import peak_memory
 from gscompleter.evaluation.methods import (
     BASELINES,
     METHODS,
     Parts,
-    Prediction,
     Start,
     check_methods,
     start_of,
 )
+from gscompleter.evaluation.scores import Truth, ranged_truth, score
+from gscompleter.evaluation.store import (
+    RUN,
+    OutputError,
+    Saved,
+    case_folder,
+    load_outcome,
+    load_start,
+    read_json,
+    save_outcome,
+    save_start,
+    slug,
+    write_json,
+)
 from gscompleter.generators import load_generator
-from gscompleter.io.files import replacing
+from gscompleter.io.image import write_image
 from gscompleter.progress import shown_on, track
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.types import Gaussians, View, merge
+from gscompleter.types import View
 
 T = TypeVar("T")
 
 VERSION = 1
 """Of the files in a folder of results."""
-
-RUN = "run.json"
-"""The file that says what decided the numbers of a folder."""
-
-CASES = "cases"
-"""Where the folders of the cases are."""
-
-_FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 
 
 @runtime_checkable
@@ -96,6 +97,11 @@ class RunConfig:
         )
 
 
+Again = Literal["nothing", "failures", "scores"]
+"""What an earlier call did that is to be done once more: cases that failed, or all scores, from
+what is saved."""
+
+
 @dataclass(frozen=True)
 class Tally:
     """What a call of `evaluate` did, in pairs of a case and a method."""
@@ -113,6 +119,7 @@ def evaluate(
     out: Path,
     config: RunConfig = RunConfig(),
     shard: tuple[int, int] = (0, 1),
+    again: Again = "nothing",
 ) -> Tally:
     """Run every method on every case of the shard, and write a row of scores for each.
 
@@ -124,6 +131,7 @@ def evaluate(
         out: Folder of results: a new one, or that of an earlier call.
         config: What decides the numbers; the same as in earlier calls.
         shard: (i, n) takes the cases i, i + n, i + 2n, …; n calls with i from 0 do them all.
+        again: What of an earlier call is done once more.
 
     Raises:
         InputError: a wrong name or shard, a folder that holds something else, a full disk.
@@ -139,7 +147,7 @@ def evaluate(
     claim(out, config)
 
     jobs = [(case, name) for case in cases[shard[0] :: shard[1]] for name in methods]
-    missing = [(case, name) for case, name in jobs if not row_path(out, case, name).exists()]
+    missing = [(case, name) for case, name in jobs if is_missing(row_path(out, case, name), again)]
     failed, bench = 0, None
     for case, name in track(missing, "Evaluating"):
         with shown_on(None):  # one bar is enough
@@ -151,73 +159,82 @@ def evaluate(
     return Tally(len(missing) - failed, failed, len(jobs) - len(missing))
 
 
+def is_missing(path: Path, again: Again) -> bool:
+    """Whether a row is to be made."""
+    if again == "scores" or not path.exists():
+        return True
+    return again == "failures" and read_json(path).get("error") is not None
+
+
 class Bench:
     """One case: its photographs and its context are read, or computed, once."""
 
     def __init__(self, case: EvaluationCase, out: Path, config: RunConfig) -> None:
         self.case = case
-        self.folder = case_folder(out, case)
+        self.folder = case_folder(out, case.name)
         self.config = config
-        self._ready: tuple[Start, Parts, View, list[View]] | str | None = None
+        self._ready: tuple[Start, Parts, Truth] | str | None = None
 
     def row(self, method: str) -> dict[str, Any]:
-        """The scores of a method, or why there are none."""
+        """The scores of a method, or why there are none.
+
+        Raises:
+            OutputError: where a result cannot be written.
+        """
         if self._ready is None:
             self._ready = attempt(self._prepare)
         if isinstance(self._ready, str):
             return self._row_of(method, error=self._ready)
-        start, parts, target, neighbours = self._ready
+        start, parts, truth = self._ready
         path = self.folder / f"{slug(method)}.npz"
-        saved = load_arrays(path)
+        saved = load_outcome(path, start)
         if saved is None:
-            prediction = attempt(lambda: METHODS[method](start, parts))
-            if isinstance(prediction, str):
-                return self._row_of(method, error=prediction)
-            saved = arrays_of_prediction(prediction)
-            write_arrays(path, saved)
-
-        def scored() -> dict[str, Any]:
-            prediction = prediction_of(saved, start)
-            camera = start.target
-            truth = ranged_truth(start.views, target, neighbours, camera.near, camera.far)
-            outcome = Outcome(
-                prediction.context,
-                prediction.scene,
-                prediction.added,
-                prediction.hole_mask,
-                prediction.seconds,
-            )
-            scores = asdict(score(self.case.name, outcome, truth, parts.renderer))
-            del scores["name"], scores["seconds"]
-            json.dumps(scores, allow_nan=False)
-            return self._row_of(
-                method,
-                scores=scores,
-                gaussians={"context": len(prediction.context), "after": len(prediction.scene)},
-                notes=list(prediction.notes),
-                seconds={"context": start.seconds, "method": prediction.seconds},
-            )
-
-        row = attempt(scored)
+            made = attempt(lambda: measured(method, start, parts))
+            if isinstance(made, str):
+                return self._row_of(method, error=made)
+            save_outcome(path, saved := made)
+        row = attempt(lambda: self._scored(method, saved, start, parts, truth))
         return self._row_of(method, error=row) if isinstance(row, str) else row
 
-    def _prepare(self) -> tuple[Start, Parts, View, list[View]]:
+    def _prepare(self) -> tuple[Start, Parts, Truth]:
         case, device = self.case, self.config.device
         views = [view.to(device) for view in case.load(case.context)]
         (target,) = (view.to(device) for view in case.load((case.target,)))
         neighbours = [view.to(device) for view in case.load(case.neighbours)]
         parts = self.config.parts(target)
         path = self.folder / "start.npz"
-        saved = load_arrays(path)
-        if saved is None:
+        start = load_start(path, views, target)
+        if start is None:
             start = start_of(views, target.camera, parts)
-            write_arrays(path, arrays_of_start(start))
-        else:
-            start = start_from(saved, views, target)
-        return start, parts, target, neighbours
+            save_start(path, start)
+        camera = start.target
+        truth = ranged_truth(start.views, target, neighbours, camera.near, camera.far)
+        return start, parts, truth
+
+    def _scored(
+        self, method: str, saved: Saved, start: Start, parts: Parts, truth: Truth
+    ) -> dict[str, Any]:
+        outcome = saved.outcome
+        scores, seen = score(outcome, truth, parts.renderer)
+        content = asdict(scores)
+        json.dumps(content, allow_nan=False)
+        for name, image in (
+            (slug(method), seen.after.image),
+            ("before", seen.before.image),
+            ("truth", truth.target.image),
+        ):
+            _write_image(self.folder / f"{name}.png", image)
+        return self._row_of(
+            method,
+            scores=content,
+            gaussians={"context": len(outcome.context), "after": len(outcome.scene)},
+            notes=list(outcome.notes),
+            seconds={"context": start.seconds, **outcome.seconds},
+            peak_bytes=saved.peak_bytes,
+        )
 
     def _row_of(self, method: str, error: str | None = None, **content: Any) -> dict[str, Any]:
-        empty: dict[str, Any] = {"scores": None, "gaussians": None, "notes": [], "seconds": None}
+        nothing = dict.fromkeys(("scores", "gaussians", "notes", "seconds", "peak_bytes"))
         case = {
             "name": self.case.name,
             "context": list(self.case.context),
@@ -229,9 +246,28 @@ class Bench:
             "case": case,
             "method": method,
             "error": error,
-            **empty,
+            **nothing,
             **content,
         }
+
+
+def measured(method: str, start: Start, parts: Parts) -> Saved:
+    """What a method makes of a case, and the most memory that this took."""
+    with peak_memory(start.context.means.device) as peak:
+        outcome = METHODS[method](start, parts)
+    return Saved(outcome, peak.bytes)
+
+
+def row_path(out: Path, case: EvaluationCase, method: str) -> Path:
+    """Where the row of scores of a case and a method lies."""
+    return case_folder(out, case.name) / f"{slug(method)}.json"
+
+
+def _write_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
+    try:
+        write_image(path, image)
+    except InputError as error:
+        raise OutputError(str(error)) from error
 
 
 def attempt(compute: Callable[[], T]) -> T | str:
@@ -248,10 +284,6 @@ def attempt(compute: Callable[[], T]) -> T | str:
         return str(error)
     except Exception as error:  # a defect of one case must not cost the others
         return f"{type(error).__name__}: {' '.join(str(error).split())}"
-
-
-class OutputError(InputError):
-    """A result cannot be written: the run ends."""
 
 
 def check_shard(shard: tuple[int, int]) -> None:
@@ -304,124 +336,3 @@ def claim(out: Path, config: RunConfig) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} holds something other than a run; name another folder.")
     write_json(path, wanted)
-
-
-def slug(name: str) -> str:
-    """`name` as the name of a file."""
-    return re.sub(r"[^\w.+-]+", "-", name.replace(">", "-to-"))
-
-
-def case_folder(out: Path, case: EvaluationCase) -> Path:
-    """Where everything about a case lies."""
-    return out / CASES / slug(case.name)
-
-
-def row_path(out: Path, case: EvaluationCase, method: str) -> Path:
-    """Where the row of scores of a case and a method lies."""
-    return case_folder(out, case) / f"{slug(method)}.json"
-
-
-Arrays = dict[str, np.ndarray]
-
-
-def arrays_of(gaussians: Gaussians) -> Arrays:
-    return {name: getattr(gaussians, name).detach().cpu().numpy() for name in _FIELDS}
-
-
-def gaussians_of(arrays: Mapping[str, np.ndarray], device: torch.device) -> Gaussians:
-    return Gaussians(*(torch.from_numpy(arrays[name]).to(device) for name in _FIELDS))
-
-
-def arrays_of_start(start: Start) -> Arrays:
-    """The context, its hole mask, and the depth range that it was made with."""
-    numbers = [start.seconds, start.target.near, start.target.far]
-    mask = start.hole_mask.cpu().numpy()
-    return {
-        **arrays_of(start.context),
-        "hole_mask": mask,
-        "seconds_near_far": np.array(numbers, dtype=np.float64),
-    }
-
-
-def start_from(arrays: Arrays, views: Sequence[View], target: View) -> Start:
-    """What `arrays_of_start` saved, with the photographs that are not saved."""
-    seconds, near, far = arrays["seconds_near_far"].tolist()
-    ranged = ranged_truth(views, target, (), near, far)
-    device = target.image.device
-    mask = torch.from_numpy(arrays["hole_mask"]).to(device)
-    context = gaussians_of(arrays, device)
-    return Start(ranged.views, ranged.target.camera, context, mask, seconds)
-
-
-def arrays_of_prediction(prediction: Prediction) -> Arrays:
-    """What differs from the context: what was added, or else the whole scene."""
-    whole = prediction.added is None
-    return {
-        **arrays_of(prediction.scene if prediction.added is None else prediction.added),
-        "whole": np.array(whole),
-        "seconds": np.array(prediction.seconds, dtype=np.float64),
-        "notes": np.array(prediction.notes, dtype=np.str_),
-    }
-
-
-def prediction_of(arrays: Arrays, start: Start) -> Prediction:
-    """What `arrays_of_prediction` saved."""
-    changed = gaussians_of(arrays, start.context.means.device)
-    whole = bool(arrays["whole"])
-    return Prediction(
-        context=start.context,
-        scene=changed if whole else merge([start.context, changed]),
-        seconds=arrays["seconds"].item(),
-        hole_mask=start.hole_mask,
-        added=None if whole else changed,
-        notes=tuple(arrays["notes"].tolist()),
-    )
-
-
-def load_arrays(path: Path) -> Arrays | None:
-    """The arrays of a file; None where there is none that is whole."""
-    try:
-        with np.load(path, allow_pickle=False) as saved:
-            return dict(saved)
-    except (OSError, ValueError, EOFError, BadZipFile):
-        return None
-
-
-def write_arrays(path: Path, arrays: Arrays) -> None:
-    """All at once, so that no reader sees half a file."""
-    _make_folder(path.parent)
-    try:
-        with replacing(path) as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-    except InputError as error:
-        raise OutputError(str(error)) from error
-
-
-def write_json(path: Path, content: Any) -> None:
-    """All at once, so that a file that is there is complete."""
-    _make_folder(path.parent)
-    with replacing(path) as file:
-        file.write((json.dumps(content, indent=1) + "\n").encode())
-
-
-def read_json(path: Path) -> Any:
-    """The content of a file of results.
-
-    Raises:
-        InputError: where it cannot be read.
-    """
-    try:
-        return json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
-    except ValueError as error:
-        raise InputError(f"{path} is damaged ({error}); delete it and run again.") from error
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"Cannot make the folder {folder}: {error.strerror}; choose another place."
-        ) from error

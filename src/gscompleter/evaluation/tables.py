@@ -15,7 +15,7 @@ from typing import Any
 
 from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import METHODS
-from gscompleter.evaluation.runs import CASES, RUN, read_json
+from gscompleter.evaluation.store import CASES, RUN, read_json
 from gscompleter.io.files import replacing
 
 Row = dict[str, Any]
