@@ -1,5 +1,6 @@
 """Evaluation data: every format gives the same views, and what is wrong is said."""
 
+import gc
 import io
 import json
 import os
@@ -116,6 +117,22 @@ def test_a_chunk_gives_back_the_views_it_was_made_of(tmp_path):
         assert np.array_equal(pixels_of(view), pixels_of(truth))
         assert torch.allclose(view.camera.c2w, truth.camera.c2w, atol=1e-6)
         assert torch.allclose(view.camera.K, truth.camera.K, atol=1e-4)
+
+
+def test_clips_that_are_held_keep_one_chunk_in_memory(tmp_path):
+    noise = torch.randint(0, 256, (100_000,), dtype=torch.uint8)
+    for number in range(4):
+        one = {**example(str(number)), "images": [noise.clone() for _ in VIEWS]}
+        save_chunk(tmp_path / f"{number:06}.torch", one)
+    clips = list(open_chunks(tmp_path))
+    gc.collect()
+    held = sum(
+        value.numel()
+        for value in gc.get_objects()
+        if type(value) is torch.Tensor and value.dtype == torch.uint8
+    )
+    assert [clip.name for clip in clips] == ["0", "1", "2", "3"]
+    assert held < 2 * len(VIEWS) * 100_000
 
 
 def test_jpeg_bytes_are_photographs_too(tmp_path):

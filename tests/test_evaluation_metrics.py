@@ -267,7 +267,7 @@ def test_where_nothing_overlaps_there_is_no_alignment():
 def test_fid_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "torchmetrics", None)
     image, truth = images()
-    with pytest.raises(InputError, match=r"pip install gscompleter\[evaluation\]"):
+    with pytest.raises(InputError, match=r"pip install gscompleter\[fid\]"):
         fid([image], [truth])
 
 

@@ -2,21 +2,37 @@
 
 import json
 import shutil
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
+from random import Random
 
 import pytest
 import torch
 
 from gscompleter import GSCompleter, InputError
 from gscompleter.cli import main
+from gscompleter.completer import STAGES
 from gscompleter.evaluation import runs
 from gscompleter.evaluation.cases import Case
-from gscompleter.evaluation.methods import METHODS, check_methods, start_of, synthesized
+from gscompleter.evaluation.memory import peak_memory
+from gscompleter.evaluation.methods import (
+    BASELINES,
+    METHODS,
+    check_methods,
+    methods_named,
+    start_of,
+    synthesized,
+)
+from gscompleter.evaluation.metrics import psnr
+from gscompleter.evaluation.plots import plots
 from gscompleter.evaluation.protocols import read_evaluation_index
-from gscompleter.evaluation.runs import RunConfig, Tally, evaluate, read_json
-from gscompleter.evaluation.tables import tables
-from gscompleter.io.image import write_image
+from gscompleter.evaluation.runs import RunConfig, Tally, evaluate
+from gscompleter.evaluation.store import read_json
+from gscompleter.evaluation.tables import gap_of, summarize, tables
+from gscompleter.io.image import read_image, write_image
 from gscompleter.io.scene import write_cameras
 from scenes import Room, camera_at, view_of
 
@@ -78,13 +94,17 @@ def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
     content = read_json(finished / "tables.json")
     assert list(content["methods"]) == list(METHOD_NAMES)
     assert (content["cases"], len(content["common"]), content["failures"]) == (2, 2, [])
-    scores = {name: row["target_psnr"]["value"] for name, row in content["methods"].items()}
-    before = content["methods"]["context"]["target_psnr_before"]["value"]
-    assert scores["context"] == before
-    assert scores["full"] > before + 1
+    scores = {name: row["psnr"]["value"] for name, row in content["methods"].items()}
+    gains = {name: row["gain"]["value"] for name, row in content["methods"].items()}
+    assert gains["context"] == 0
+    assert gains["full"] > 1
+    for name, score in scores.items():
+        assert score - gains[name] == pytest.approx(scores["context"])
     assert content["methods"]["context"]["context_change"]["value"] == 0
-    for row in content["methods"].values():
-        assert row["target_psnr_before"]["value"] == before
+    assert content["methods"]["full"]["align_f_score"]["value"] > 0.5
+    assert content["methods"]["densify-100"]["align_f_score"]["value"] is None
+    without = content["methods"]["full"]["lpips_vgg"]["value"] is None
+    assert ("LPIPS: weights not available" in (finished / "tables.md").read_text()) == without
     assert "seconds" not in json.dumps(content)
     assert set(read_json(finished / "timings.json")) == set(METHOD_NAMES)
 
@@ -100,6 +120,135 @@ def test_rows_that_are_lost_are_made_again_from_what_is_saved(finished, cases, t
     for path in (out / "cases").glob("*/*.json"):
         assert path.read_bytes() == (finished / path.relative_to(out)).read_bytes()
     same_tables(out, finished)
+
+
+LIFE = """
+import json, sys
+from pathlib import Path
+from gscompleter.evaluation.cases import read_cases
+from gscompleter.evaluation.runs import RunConfig, evaluate
+cases, out, methods, iterations = sys.argv[1:]
+config = RunConfig(baseline_iterations=int(iterations))
+evaluate(read_cases(Path(cases)), methods.split(), Path(out), config)
+"""
+
+
+def test_a_run_killed_five_times_ends_as_one_that_was_not(finished, scenes, cases, tmp_path):
+    """Each life begins, writes something new, and is killed a random moment later."""
+    out, random = tmp_path / "out", Random(0)
+    arguments = [scenes / "cases.json", out, " ".join(METHOD_NAMES), CONFIG.baseline_iterations]
+
+    def written() -> set[Path]:
+        return {path for path in out.rglob("*") if path.suffix in (".npz", ".json")}
+
+    for _ in range(5):
+        before = written()
+        life = subprocess.Popen([sys.executable, "-c", LIFE, *map(str, arguments)])
+        while written() == before:
+            assert life.poll() is None, "the run ended by itself"
+            time.sleep(0.005)
+        time.sleep(random.uniform(0, 0.2))
+        life.kill()
+        assert life.wait() == -signal.SIGKILL
+    assert len(list((out / "cases").glob("*/*.json"))) < 8
+    tally = evaluate(cases, METHOD_NAMES, out, CONFIG)
+    assert tally.failed == 0
+    assert tally.done > 0
+    same_tables(out, finished)
+
+
+def test_failures_and_scores_can_be_done_again(cases, tmp_path, monkeypatch):
+    out, original = tmp_path / "out", METHODS["no-rc"]
+
+    def defect(start, parts):
+        raise RuntimeError("a bad day")
+
+    monkeypatch.setitem(METHODS, "no-rc", defect)
+    methods = ("context", "no-rc")
+    assert evaluate(cases[:1], methods, out, CONFIG) == Tally(1, 1, 0)
+    assert evaluate(cases[:1], methods, out, CONFIG) == Tally(0, 0, 2)
+    monkeypatch.setitem(METHODS, "no-rc", original)
+    assert evaluate(cases[:1], methods, out, CONFIG, again="failures") == Tally(1, 0, 1)
+
+    monkeypatch.setitem(METHODS, "no-rc", defect)  # what is saved is scored, and nothing run
+    assert evaluate(cases[:1], methods, out, CONFIG, again="scores") == Tally(2, 0, 0)
+
+
+def test_pictures_are_saved_and_plots_are_drawn(finished):
+    (box,) = (finished / "cases").glob("box*")
+    before, after, truth = (read_image(box / f"{name}.png") for name in ("before", "full", "truth"))
+    assert psnr(after, truth) > psnr(before, truth)
+    assert read_image(box / "context.png").equal(before)
+    drawn = plots(tables(finished), finished)
+    assert [path.name for path in drawn] == ["gain_by_hole.png", "seconds.png"]
+    for path in drawn:
+        ink = read_image(path) < 0.9
+        assert ink.any(dim=-1).float().mean() > 0.005
+    again = plots(tables(finished), finished)
+    assert again == drawn
+
+
+def test_time_and_memory_are_told_apart_from_scores(finished):
+    timings = read_json(finished / "timings.json")
+    full = timings["full"]["seconds"]
+    assert list(full) == ["reconstruct", *STAGES, "total"]
+    assert 0.9 * full["total"] < sum(full[stage] for stage in STAGES) <= full["total"]
+    assert list(timings["densify-100"]["seconds"])[1:] == ["generate", "optimize", "total"]
+    if sys.platform == "linux":
+        assert all(row["peak_bytes"] > 2**26 for row in timings.values())
+
+
+def test_gains_by_distance_are_grouped_by_the_nearest_context_frame(finished):
+    rows = [json.loads(p.read_text()) for p in sorted((finished / "cases").glob("*/full.json"))]
+    assert [gap_of(row) for row in rows] == [1, 1]
+    rows[1]["case"]["target"] = 6
+    summary = summarize(rows)
+    gains = [
+        row["scores"]["target_after"]["psnr"] - row["scores"]["target_before"]["psnr"]
+        for row in rows
+    ]
+    assert {gap: cells["full"].value for gap, cells in summary.gains.items()} == pytest.approx(
+        {1: gains[0], 5: gains[1]}
+    )
+
+
+def test_fid_is_a_number_or_a_reason(finished, monkeypatch):
+    tables(finished, with_fid=True)
+    text = (finished / "tables.md").read_text()
+    reason = read_json(finished / "tables.json")["fid"]["reason"]
+    if reason is None:
+        assert "### FID" in text
+    else:
+        assert "FID: not available (" in text
+    calls = []
+
+    def stand_in(images, truths):
+        calls.append([image.shape for image in images])
+        return float(len(calls))
+
+    monkeypatch.setattr("gscompleter.evaluation.tables.fid", stand_in)
+    tables(finished, with_fid=True)
+    assert calls == [[(SIZE, SIZE, 3)] * 2] * len(METHOD_NAMES)
+    assert "| full | 2.00 |" in (finished / "tables.md").read_text()
+    tables(finished)
+    assert "FID: not asked for" in (finished / "tables.md").read_text()
+
+
+def test_groups_of_methods():
+    assert methods_named(["full", "baselines", "reggs"])[0] == "full"
+    assert methods_named(["full", "baselines"])[1:] == tuple(BASELINES)
+    everything = methods_named(["all"])
+    assert {"context", "full", "paper", "unconstrained", "no-sa", *BASELINES} <= set(everything)
+    assert set(everything) <= set(METHODS)
+
+
+def test_peak_memory_sees_what_was_let_go_of():
+    with peak_memory() as nothing:
+        pass
+    with peak_memory() as much:
+        torch.ones(2**26).sum()  # 256 MiB
+    if sys.platform == "linux":
+        assert much.bytes - nothing.bytes > 2**27
 
 
 def test_a_run_goes_on_where_it_was_stopped(finished, cases, tmp_path, monkeypatch):
@@ -159,7 +308,9 @@ def test_baselines_run(cases, tmp_path):
 
 
 def test_wrong_runs_are_refused(finished, cases, tmp_path):
-    with pytest.raises(InputError, match="no method 'nope'; choose of context, full"):
+    with pytest.raises(
+        InputError, match="no method 'nope'; choose of ablations, baselines, all, context, full"
+    ):
         check_methods(["context", "nope"])
     with pytest.raises(InputError, match="twice"):
         check_methods(["full", "full"])

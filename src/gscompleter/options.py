@@ -83,17 +83,21 @@ class EvaluateOptions:
     written at the end; `gscompleter tables OUT` writes them at any time.
     """
 
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """A cases.json; or, with --protocol, scenes: a folder with a transforms.json or of such
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """A cases.json; or, with --protocol, scenes: folders with a transforms.json or of such
     folders, chunks of pixelSplat, or camera files of RealEstate10K."""
     out: Path
     """Folder for the results, a new one or that of an earlier run to go on with."""
-    protocol: str | None = None
+    protocol: tuple[str, ...] = ()
     """Which frames are given and which are the target: n-10 (frames n and n + 10 for n + 20),
-    stress (0 and 30 for 99), or the path of an evaluation index. A cases.json needs none."""
+    stress (0 and 30 for 99), or the path of an evaluation index; one or several. A cases.json
+    needs none."""
     methods: tuple[str, ...] = ("context", "full", "paper")
     """What to compare: context, full, paper, an ablation such as no-sa, densify-100, densify-800,
-    distill, reggs."""
+    distill, reggs; or a group of them: ablations, baselines, all."""
+    again: Literal["nothing", "failures", "scores"] = "nothing"
+    """What of an earlier run is done once more: cases that failed, or all scores, from the
+    predictions that were saved."""
     shard: str | None = None
     """i/n does every n-th case from the i-th on, i from 0 to n - 1: n processes share the work."""
     resolution: tuple[int, int] | None = None
@@ -117,7 +121,9 @@ class TablesOptions:
     """Write the tables of what `evaluate` has done so far, and print them."""
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """Folder that `evaluate` wrote. tables.md, .tex, .json and timings.md, .json go there."""
+    """Folder that `evaluate` wrote. The tables and plots go there."""
+    fid: bool = False
+    """Compare the pictures of each method with the photographs by FID, too."""
     quiet: bool = False
     """Say nothing but errors."""
 

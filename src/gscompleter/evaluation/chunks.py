@@ -2,8 +2,8 @@
 
 A folder holds `000000.torch`, `000001.torch`, … and an `index.json` that maps the key of each
 scene to its chunk. A chunk is a list of scenes: `key`, `cameras` [n, 18] and `images`, a list of
-n tensors with the bytes of JPEG or PNG files. One chunk is in memory at a time, and an image is
-decoded only when its frame is asked for.
+n tensors with the bytes of JPEG or PNG files. One chunk is in memory at a time, however many clips
+are held, and an image is decoded only when its frame is asked for.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
@@ -40,17 +41,17 @@ _KEYS = ("key", "cameras", "images")
 
 @dataclass(frozen=True, eq=False)
 class ChunkClip:
-    """One scene of a chunk."""
+    """One scene of a chunk: its cameras, and where its images are, which it does not hold."""
 
     name: str
     path: Path
     """The chunk."""
+    position: int
+    """Which of the chunk's scenes it is."""
     cameras: Float[Tensor, "n 18"]
-    images: tuple[UInt8[Tensor, "_"], ...]
-    """The bytes of an image file each."""
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self.cameras)
 
     def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
         """The photographs of `frames`, resized to cover `resolution` (height, width), cropped.
@@ -76,8 +77,8 @@ class ChunkClip:
         reason = cameras_to_skip([self._camera(number) for number in range(len(self))])
         if reason is not None or size is None:
             return reason
-        for number, image in enumerate(self.images):
-            found = decoded_size(image.numpy().tobytes(), self._name_of(number))
+        for number in range(len(self)):
+            found = decoded_size(self._image(number), self._name_of(number))
             reason = size_to_skip(number, found, size)
             if reason is not None:
                 return reason
@@ -85,8 +86,13 @@ class ChunkClip:
 
     def _view(self, number: int, resolution: tuple[int, int] | None) -> View:
         name = self._name_of(number)
-        pixels = decode_pixels(self.images[number].numpy().tobytes(), name)
+        pixels = decode_pixels(self._image(number), name)
         return view_of(pixels, self._camera(number), number, name, resolution)
+
+    def _image(self, number: int) -> bytes:
+        """The image file of a frame."""
+        example = _load_chunk(self.path)[self.position]
+        return example["images"][number].numpy().tobytes()
 
     def _camera(self, number: int) -> StoredCamera:
         return StoredCamera.of_numbers(self.cameras[number].double().numpy())
@@ -140,14 +146,13 @@ class Chunks:
         )
 
     def _clips_of(self, path: Path) -> Iterator[ChunkClip]:
-        """The scenes of one chunk, each let go of before the next."""
+        """The scenes of one chunk."""
         examples = _load_chunk(path)
         names = [_key_of(example, i, path) for i, example in enumerate(examples)]
         if self.index is not None:
             self._check_index(set(names), path)
-        for i in range(len(examples)):
-            example, examples[i] = examples[i], None
-            yield _clip(example, names[i], path)
+        for position, (example, name) in enumerate(zip(examples, names, strict=True)):
+            yield _clip(example, name, path, position)
 
     def _check_index(self, names: set[str], path: Path) -> None:
         assert self.index is not None
@@ -214,6 +219,17 @@ def _read_index(path: Path) -> Chunks:
 
 
 def _load_chunk(path: Path) -> list[Any]:
+    """The scenes of a chunk, not checked one by one."""
+    try:
+        written = path.stat().st_mtime_ns
+    except OSError:
+        written = 0  # what is wrong with it is found out by reading it
+    return _read_chunk(path, written)
+
+
+@lru_cache(maxsize=1)
+def _read_chunk(path: Path, _written: int) -> list[Any]:
+    """The last one stays in memory, for the frames that are asked for one after the other."""
     if not os.path.isfile(path):
         raise InputError(f"There is no chunk {path}; download it, or take it out of the index.")
     try:
@@ -263,7 +279,7 @@ def _key_of(example: Any, position: int, path: Path) -> str:
     return name
 
 
-def _clip(example: dict[str, Any], name: str, path: Path) -> ChunkClip:
+def _clip(example: dict[str, Any], name: str, path: Path, position: int) -> ChunkClip:
     """A scene, checked as far as that goes without decoding its images."""
     called = f"scene {name} of {path}"
     for key in _KEYS:
@@ -293,7 +309,8 @@ def _clip(example: dict[str, Any], name: str, path: Path) -> ChunkClip:
                 f"Image {number} of the {called} is {_described(image)}; the bytes of a JPEG or "
                 "PNG file are needed, uint8 of one dimension."
             )
-    return ChunkClip(name, path, cameras.detach(), tuple(images))
+    # A copy, so that a clip keeps nothing of its chunk in memory.
+    return ChunkClip(name, path, position, cameras.detach().clone())
 
 
 def _described(value: Any) -> str:

@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 from gscompleter.errors import InputError
-from gscompleter.evaluation.cases import Case, read_cases
+from gscompleter.evaluation.cases import read_cases
 from gscompleter.evaluation.clips import Skipped, usable
 from gscompleter.evaluation.folders import open_clips
-from gscompleter.evaluation.methods import check_methods
+from gscompleter.evaluation.methods import methods_named
+from gscompleter.evaluation.plots import PlotsNotAvailable, plots
 from gscompleter.evaluation.protocols import (
-    ClipCase,
     cases_of,
     index_of,
     parse_protocol,
     write_evaluation_index,
 )
-from gscompleter.evaluation.runs import RunConfig, evaluate
-from gscompleter.evaluation.tables import COLUMNS, Summary, score_cells, tables
+from gscompleter.evaluation.runs import EvaluationCase, RunConfig, evaluate
+from gscompleter.evaluation.tables import (
+    COLUMNS,
+    Summary,
+    present,
+    score_cells,
+    seconds_of,
+    tables,
+)
 from gscompleter.io.framing import check_resolution
 from gscompleter.options import EvaluateOptions, IndexOptions, TablesOptions
 from gscompleter.progress import shown_on
@@ -31,13 +40,13 @@ from gscompleter.render import choose_device
 
 
 def run_evaluation(options: EvaluateOptions) -> None:
-    """Run the methods on the cases, write rows and tables, and say what was done.
+    """Run the methods on the cases, write rows, tables and plots, and say what was done.
 
     Raises:
         InputError: anything about the input that the user can mend.
     """
     console = Console(stderr=True, quiet=options.quiet)
-    check_methods(options.methods)
+    methods = methods_named(options.methods)
     shard = parse_shard(options.shard)
     if options.limit is not None and options.limit < 1:
         raise InputError(f"--limit is {options.limit}, and at least one case is needed.")
@@ -46,40 +55,56 @@ def run_evaluation(options: EvaluateOptions) -> None:
     cases = chosen_cases(options, skipped)
     for clip in skipped:
         console.print(f"Left out {clip.name}: {clip.reason}.", highlight=False)
-    source = {
-        "path": options.path.resolve().name,
-        "protocol": options.protocol,
-        "resolution": None if options.resolution is None else list(options.resolution),
-    }
     config = RunConfig(
         options.reconstructor,
         options.generator,
         choose_device(options.device),
         options.seed,
-        source=source,
+        source=source_of(options),
     )
     with shown_on(None if options.quiet else console):
-        tally = evaluate(cases, options.methods, options.out, config, shard)
+        tally = evaluate(cases, methods, options.out, config, shard, options.again)
     console.print(
         f"Scored {tally.done}, failed {tally.failed}, there before {tally.skipped}.",
         highlight=False,
     )
     # An empty shard, where there are more shards than cases, has nothing to show.
     if tally.done + tally.failed + tally.skipped > 0:
-        summary = tables(options.out)
-        if not options.quiet:
-            tell(summary, options.out)
+        show(options.out, options.quiet)
+
+
+def source_of(options: EvaluateOptions) -> dict[str, Any]:
+    """Where the cases come from, as a folder of results remembers it."""
+    return {
+        "paths": [path.resolve().name for path in options.paths],
+        "protocols": list(options.protocol),
+        "resolution": None if options.resolution is None else list(options.resolution),
+    }
 
 
 def run_tables(options: TablesOptions) -> None:
-    """Write the tables of a run and print them.
+    """Write the tables and plots of a run and print them.
 
     Raises:
         InputError: where there is no run.
     """
-    summary = tables(options.out)
-    if not options.quiet:
-        tell(summary, options.out)
+    show(options.out, options.quiet, options.fid)
+
+
+def show(out: Path, quiet: bool, with_fid: bool = False) -> None:
+    """Write the tables and plots of a run, and print the former unless `quiet`.
+
+    Raises:
+        InputError: where there is no run.
+    """
+    summary = tables(out, with_fid)
+    try:
+        plots(summary, out)
+    except PlotsNotAvailable as missing:
+        if not quiet:
+            Console(stderr=True).print(str(missing), highlight=False, markup=False)
+    if not quiet:
+        tell(summary, out)
 
 
 def run_index(options: IndexOptions) -> None:
@@ -109,20 +134,26 @@ def run_index(options: IndexOptions) -> None:
     )
 
 
-def chosen_cases(options: EvaluateOptions, skipped: list[Skipped]) -> list[Case] | list[ClipCase]:
+def chosen_cases(options: EvaluateOptions, skipped: list[Skipped]) -> Sequence[EvaluationCase]:
     """The cases that the options ask for; clips that benchmarks leave out go to `skipped`.
 
     Raises:
         InputError: where there are none to be found, or a protocol is needed or wrong.
     """
-    if options.protocol is None:
-        cases = read_cases(cases_file(options.path))[: options.limit]
+    if not options.protocol:
+        files = [cases_file(path) for path in options.paths]
+        cases = [case for file in files for case in read_cases(file)][: options.limit]
         if options.resolution is None:
             return cases
         return [replace(case, resolution=options.resolution) for case in cases]
-    protocol = parse_protocol(options.protocol)
-    clips = usable(open_clips(options.path), skipped)
-    found = (case for clip in clips for case in cases_of(protocol, clip, options.resolution))
+    protocols = [parse_protocol(text) for text in options.protocol]
+    clips = (clip for path in options.paths for clip in usable(open_clips(path), skipped))
+    found = (
+        case
+        for clip in clips
+        for protocol in protocols
+        for case in cases_of(protocol, clip, options.resolution)
+    )
     return list(islice(found, options.limit))
 
 
@@ -160,11 +191,12 @@ def parse_shard(text: str | None) -> tuple[int, int]:
 def tell(summary: Summary, out: Path) -> None:
     """Print the tables, turned on their side: a column per method."""
     table = Table("", *summary.methods, box=None)
-    cells = score_cells(summary)
-    for number, column in enumerate(COLUMNS, start=1):
+    columns = present(summary, COLUMNS)
+    cells = score_cells(summary, columns)
+    for number, column in enumerate(columns, start=1):
         table.add_row(column.title, *(row[number] for row in cells))
-    seconds = (summary.seconds[method][0] for method in summary.methods)
-    table.add_row("seconds", *("–" if value is None else f"{value:.1f}" for value in seconds))
+    seconds = seconds_of(summary)
+    table.add_row("seconds", *(f"{seconds[m]['total']:.1f}" for m in summary.methods))
     console = Console()
     console.print(table)
     for case, method, reason in summary.failures:

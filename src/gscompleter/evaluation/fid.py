@@ -1,4 +1,4 @@
-"""Fréchet inception distance, through torchmetrics (`pip install gscompleter[evaluation]`)."""
+"""Fréchet inception distance, through torchmetrics (`pip install gscompleter[fid]`)."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def load_metric():  # type: ignore[no-untyped-def]
     except ImportError as error:
         raise InputError(
             f"FID needs torchmetrics and torch-fidelity ({error}); "
-            "run `pip install gscompleter[evaluation]`."
+            "run `pip install gscompleter[fid]`."
         ) from error
     except OSError as error:
         raise InputError(

@@ -229,7 +229,7 @@ class Bench:
             scores=content,
             gaussians={"context": len(outcome.context), "after": len(outcome.scene)},
             notes=list(outcome.notes),
-            seconds={"context": start.seconds, **outcome.seconds},
+            seconds={"reconstruct": start.seconds, **outcome.seconds},
             peak_bytes=saved.peak_bytes,
         )
 

@@ -1,0 +1,147 @@
+"""Pictures of a run: gain against the size of the hole, gain against distance, time by stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gscompleter.config import ABLATIONS
+from gscompleter.errors import InputError
+from gscompleter.evaluation.tables import Row, Summary, seconds_of, stage_place
+from gscompleter.io.files import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MARKERS = "osD^vP*X<>"
+"""One for each method, again from the first where they run out."""
+
+
+class PlotsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in a sentence)
+    """The library that draws is missing."""
+
+
+def plots(summary: Summary, out: Path) -> list[Path]:
+    """Draw the plots of a run into `out`, as far as there is something to show.
+
+    `gain_by_hole.png`, `gain_by_distance.png` and `seconds.png`. Where methods are compared with
+    ours, its ablations are left out of the first two, which they would fill.
+
+    Raises:
+        PlotsNotAvailable: where matplotlib is missing.
+        InputError: where a file cannot be written.
+    """
+    if not summary.common:
+        return []
+    drawn = [save_plot(out / "gain_by_hole.png", lambda a: draw_gain_by_hole(a, summary))]
+    if len(summary.gains) > 1:
+        drawn.append(
+            save_plot(out / "gain_by_distance.png", lambda a: draw_gain_by_distance(a, summary))
+        )
+    height = 1.5 + 0.28 * len(summary.methods)
+    drawn.append(save_plot(out / "seconds.png", lambda a: draw_seconds(a, summary), height))
+    return drawn
+
+
+def save_plot(path: Path, draw: Callable[[Axes], None], height: float = 4.5) -> Path:
+    """A PNG of what `draw` draws, 8 inches wide. The same values give the same bytes.
+
+    Raises:
+        PlotsNotAvailable: where matplotlib is missing.
+        InputError: where the file cannot be written.
+    """
+    figure = new_figure(height)
+    draw(figure.add_subplot())
+    with replacing(path) as file:
+        figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
+    return path
+
+
+def new_figure(height: float) -> Figure:
+    """An empty figure that needs no display.
+
+    Raises:
+        PlotsNotAvailable: where matplotlib is missing.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise PlotsNotAvailable(
+            f"Plots need matplotlib ({error}); run `pip install gscompleter[evaluation]`."
+        ) from error
+    return Figure(figsize=(8, height), layout="constrained")
+
+
+def compared(methods: Sequence[str]) -> list[str]:
+    """The methods whose gains are worth a curve: not the context, and not every ablation."""
+    ablations = {*ABLATIONS, "unconstrained", *(f"paper/{name}" for name in ABLATIONS)}
+    others = [name for name in methods if name != "context" and name not in ablations]
+    return others or [name for name in methods if name != "context"] or list(methods)
+
+
+def draw_gain_by_hole(axes: Axes, summary: Summary) -> None:
+    """A point for each case: how much of the target was a hole, and what was gained there."""
+    for number, method in enumerate(compared(summary.methods)):
+        rows = summary.rows[method]
+        axes.plot(
+            [100 * row["scores"]["hole_fraction"] for row in rows],
+            [gain_of(row) for row in rows],
+            linestyle="none",
+            label=method,
+            **_style(number),
+        )
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set_xlabel("hole at the target (% of its pixels)")
+    _finish_gain(axes)
+
+
+def draw_gain_by_distance(axes: Axes, summary: Summary) -> None:
+    """Mean gain against the frames between the target and the nearest context frame."""
+    for number, method in enumerate(compared(summary.methods)):
+        gains = {
+            gap: value
+            for gap, cells in summary.gains.items()
+            if (value := cells[method].value) is not None
+        }
+        axes.plot(list(gains), list(gains.values()), linewidth=1, label=method, **_style(number))
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set_xticks(list(summary.gains))
+    axes.set_xlabel("frames from the target to the nearest context frame")
+    _finish_gain(axes)
+
+
+def draw_seconds(axes: Axes, summary: Summary) -> None:
+    """Median seconds of each stage, one bar for each method."""
+    seconds = seconds_of(summary)
+    stages = sorted(
+        {s for found in seconds.values() for s in found if s != "total"}, key=stage_place
+    )
+    left = [0.0] * len(summary.methods)
+    places = range(len(summary.methods))
+    for stage in stages:
+        widths = [seconds[method].get(stage, 0.0) for method in summary.methods]
+        axes.barh(places, widths, left=left, label=stage, height=0.7)
+        left = [start + width for start, width in zip(left, widths, strict=True)]
+    axes.set_yticks(places, summary.methods)
+    axes.invert_yaxis()
+    axes.set_xlabel("median seconds per case")
+    axes.legend(fontsize="small")
+
+
+def gain_of(row: Row) -> float:
+    """PSNR at the target after less before, in dB."""
+    scores = row["scores"]
+    return float(scores["target_after"]["psnr"] - scores["target_before"]["psnr"])
+
+
+def _style(number: int) -> dict[str, Any]:
+    marker = MARKERS[number % len(MARKERS)]
+    return {"color": f"C{number % 10}", "marker": marker, "markersize": 5, "alpha": 0.8}
+
+
+def _finish_gain(axes: Axes) -> None:
+    axes.set_ylabel("gain at the target (dB PSNR)")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
