@@ -9,7 +9,7 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH_INDEX := $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url $(TORCH_CPU_INDEX))
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow lint format types cases bench clean
+.PHONY: demo test test-slow lint format types evaluate bench clean
 
 demo: $(VENV)/installed
 	$(BIN)/gscompleter demo --out demo --overwrite
@@ -31,10 +31,12 @@ format: $(VENV)/installed-dev
 types: $(VENV)/installed-dev
 	$(BIN)/mypy
 
-# Completes every case of a cases.json: make cases CASES=path/to/cases.json
+# Compares methods on every case of a cases.json: make evaluate CASES=path/to/cases.json METHODS=all
 CASES ?= ../shared/data/cases.json
-cases: $(VENV)/installed
-	$(BIN)/python benchmarks/cases.py $(CASES)
+METHODS ?= context full paper
+RESULTS ?= results
+evaluate: $(VENV)/installed-evaluation
+	$(BIN)/gscompleter evaluate $(CASES) --methods $(METHODS) --out $(RESULTS)
 
 bench: $(VENV)/installed-test
 	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
@@ -51,6 +53,10 @@ $(VENV)/installed: pyproject.toml | $(VENV)/torch
 	$(PIP) -e .
 	touch $@
 
+$(VENV)/installed-evaluation: pyproject.toml | $(VENV)/torch
+	$(PIP) -e '.[evaluation]'
+	touch $@ $(VENV)/installed
+
 $(VENV)/installed-test: pyproject.toml | $(VENV)/torch
 	$(PIP) -e '.[test]'
 	touch $@ $(VENV)/installed
@@ -60,4 +66,4 @@ $(VENV)/installed-dev: pyproject.toml | $(VENV)/torch
 	touch $@ $(VENV)/installed $(VENV)/installed-test
 
 clean:
-	rm -rf $(VENV) demo build dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) demo results build dist .pytest_cache .mypy_cache .ruff_cache

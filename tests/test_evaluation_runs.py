@@ -12,6 +12,7 @@ from random import Random
 import pytest
 import torch
 
+from chunk_files import as_tensor, example, save_chunk
 from gscompleter import GSCompleter, InputError
 from gscompleter.cli import main
 from gscompleter.completer import STAGES
@@ -360,6 +361,30 @@ def test_the_commands_run_end_to_end(scenes, tmp_path, monkeypatch, capsys):
     assert run(monkeypatch, *by_index, *more, "--resolution", 24, 24) == 0
     (row,) = (tmp_path / "more" / "cases").glob("*/context.json")
     assert read_json(row)["error"] is None
+
+
+def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
+    tmp_path, monkeypatch, capsys
+):
+    broken = {**example("broken"), "key": "broken"}
+    broken["images"][4] = as_tensor(b"no image")
+    wide = {**example("wide"), "key": "wide"}
+    wide["cameras"][0, 0] = 0.1
+    chunk = save_chunk(tmp_path / "data" / "000000.torch", example("whole"), broken, wide)
+    out = tmp_path / "out"
+    arguments = ["evaluate", chunk.parent, "--protocol", "n-1", "n-2", "--out", out]
+    assert run(monkeypatch, *arguments, "--methods", "context", "--device", "cpu") == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert "Left out wide: frame 0: its opening angle" in told
+    rows = [read_json(path) for path in (out / "cases").glob("*/*.json")]
+    reasons = {row["case"]["name"]: row["error"] for row in rows}
+    assert len(reasons) == 8
+    for name, reason in reasons.items():
+        needs = name.startswith("broken") and "4" in name
+        assert ("Frame 4 of the scene broken" in reason) if needs else (reason is None)
+    gaps = read_json(out / "tables.json")["gain_by_distance"]
+    assert list(gaps) == ["1", "2"]
+    assert (out / "gain_by_distance.png").exists()
 
 
 @pytest.mark.parametrize(

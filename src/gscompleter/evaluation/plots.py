@@ -54,6 +54,7 @@ def save_plot(path: Path, draw: Callable[[Axes], None], height: float = 4.5) -> 
     """
     figure = new_figure(height)
     draw(figure.add_subplot())
+    figure.legend(loc="outside right upper", fontsize="small")
     with replacing(path) as file:
         figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
     return path
@@ -127,7 +128,6 @@ def draw_seconds(axes: Axes, summary: Summary) -> None:
     axes.set_yticks(places, summary.methods)
     axes.invert_yaxis()
     axes.set_xlabel("median seconds per case")
-    axes.legend(fontsize="small")
 
 
 def gain_of(row: Row) -> float:
@@ -144,4 +144,3 @@ def _style(number: int) -> dict[str, Any]:
 def _finish_gain(axes: Axes) -> None:
     axes.set_ylabel("gain at the target (dB PSNR)")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
