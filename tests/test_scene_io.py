@@ -412,6 +412,18 @@ def test_paths_without_an_extension_are_found(tmp_path):
     assert len(load_views(scene)) == 2
 
 
+def test_downscaled_copies_take_the_place_of_photographs_that_are_not_there(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise(40, 60)})
+    changed(scene, lambda c: c["frames"][0].update(file_path="images/a.png"))
+    for factor in (8, 4):
+        (scene / f"images_{factor}").mkdir()
+        pixels = noise(40 // factor, 60 // factor, seed=factor)
+        Image.fromarray(pixels).save(scene / f"images_{factor}" / "a.png")
+    (view,) = load_views(scene)
+    assert np.array_equal((view.image * 255).round().numpy(), noise(10, 15, seed=4))
+    assert view.camera.K[0].tolist() == [12.5, 0.0, 7.5]
+
+
 def image_of(tmp_path: Path, pixels: np.ndarray, mode: str | None = None) -> list[float]:
     """The top-left colour of a picture that is saved and loaded as a scene of one frame."""
     scene = write_scene(tmp_path / "s", {"a.png": noise(*pixels.shape[:2])})

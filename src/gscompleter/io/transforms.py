@@ -30,6 +30,9 @@ MAX_RIGID_ERROR = 1e-3
 FLOAT_NOISE = 1e-6
 """Rotations this close to exact are taken as they are."""
 
+DOWNSCALED = (2, 4, 8)
+"""By how much the copies of photographs are smaller that folders such as `images_4` hold."""
+
 _INTRINSICS = (
     *("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy"),
     *("camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2"),
@@ -79,11 +82,22 @@ class Frame:
 
     @property
     def photograph(self) -> Path | None:
-        """The image file of the frame; None where there is none."""
+        """The image file of the frame; None where there is none.
+
+        Where its folder `images` lacks it, the largest copy in `images_2`, `images_4` or `images_8`,
+        as nerfstudio writes and DL3DV publishes them, takes its place.
+        """
         if self.file_path is None:
             return None
         path = self.folder / self.file_path
-        candidates = [path] + [path.with_name(path.name + end) for end in (".png", ".jpg", ".jpeg")]
+        folders = [path.parent]
+        if path.parent.name:
+            folders += [path.parent.with_name(f"{path.parent.name}_{n}") for n in DOWNSCALED]
+        candidates = [
+            folder / (path.name + end)
+            for folder in folders
+            for end in ("", ".png", ".jpg", ".jpeg")
+        ]
         return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
     def size(self) -> tuple[int, int]:
