@@ -84,8 +84,8 @@ class Frame:
     def photograph(self) -> Path | None:
         """The image file of the frame; None where there is none.
 
-        Where its folder `images` lacks it, the largest copy in `images_2`, `images_4` or `images_8`,
-        as nerfstudio writes and DL3DV publishes them, takes its place.
+        Where its folder `images` lacks it, the largest copy in `images_2`, `images_4` or
+        `images_8`, as nerfstudio writes and DL3DV publishes them, takes its place.
         """
         if self.file_path is None:
             return None
@@ -93,11 +93,8 @@ class Frame:
         folders = [path.parent]
         if path.parent.name:
             folders += [path.parent.with_name(f"{path.parent.name}_{n}") for n in DOWNSCALED]
-        candidates = [
-            folder / (path.name + end)
-            for folder in folders
-            for end in ("", ".png", ".jpg", ".jpeg")
-        ]
+        names = [path.name + ending for ending in ("", ".png", ".jpg", ".jpeg")]
+        candidates = [folder / name for folder in folders for name in names]
         return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
     def size(self) -> tuple[int, int]:
