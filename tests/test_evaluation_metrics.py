@@ -7,6 +7,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
@@ -60,6 +61,25 @@ def test_ssim_of_an_image_with_itself_is_one_and_noise_lowers_it():
     )
     assert ssim(image, truth) == pytest.approx(expected, abs=1e-5)
     assert ssim(image, truth) < 0.99
+
+
+def test_ssim_is_the_formula_of_wang_et_al():
+    """Written out with scipy's Gaussian window; the covariances are those of a sample."""
+    image, truth = (values.double().numpy() for values in images(seed=3))
+
+    def blurred(values: np.ndarray) -> np.ndarray:
+        return gaussian_filter(values, sigma=1.5, truncate=3.5, axes=(0, 1))
+
+    a, b = blurred(image), blurred(truth)
+    unbiased = 121 / 120
+    aa, bb, ab = (
+        unbiased * (blurred(x * y) - blurred(x) * blurred(y))
+        for x, y in ((image, image), (truth, truth), (image, truth))
+    )
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * a * b + c1) * (2 * ab + c2) / ((a**2 + b**2 + c1) * (aa + bb + c2))
+    expected = similarity[5:-5, 5:-5].mean()
+    assert ssim(torch.tensor(image), torch.tensor(truth)) == pytest.approx(expected, abs=1e-6)
 
 
 def test_masked_psnr_sees_its_pixels_only():

@@ -45,6 +45,8 @@ def run_evaluation(options: EvaluateOptions) -> None:
     Raises:
         InputError: anything about the input that the user can mend.
     """
+    if not options.paths:
+        raise InputError("No data was named; give a cases.json, or scenes with --protocol.")
     console = Console(stderr=True, quiet=options.quiet)
     methods = methods_named(options.methods)
     shard = parse_shard(options.shard)
