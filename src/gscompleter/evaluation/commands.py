@@ -17,12 +17,17 @@ from gscompleter.evaluation.folders import open_clips
 from gscompleter.evaluation.methods import check_methods
 from gscompleter.evaluation.protocols import (
     ClipCase,
+    SequenceCase,
+    ViewByView,
     cases_of,
     index_of,
     parse_protocol,
+    sequences_of,
     write_evaluation_index,
 )
 from gscompleter.evaluation.runs import RunConfig, evaluate
+from gscompleter.evaluation.sequence_tables import overview, read_sequences, sequence_tables
+from gscompleter.evaluation.sequences import evaluate_sequences
 from gscompleter.evaluation.tables import COLUMNS, Summary, score_cells, tables
 from gscompleter.io.framing import check_resolution
 from gscompleter.options import EvaluateOptions, IndexOptions, TablesOptions
@@ -58,14 +63,21 @@ def run_evaluation(options: EvaluateOptions) -> None:
         options.seed,
         source=source,
     )
+    sequences = [case for case in cases if isinstance(case, SequenceCase)]
+    singles = [case for case in cases if not isinstance(case, SequenceCase)]
     with shown_on(None if options.quiet else console):
-        tally = evaluate(cases, options.methods, options.out, config, shard)
+        if sequences:
+            tally = evaluate_sequences(sequences, options.methods, options.out, config, shard)
+        else:
+            tally = evaluate(singles, options.methods, options.out, config, shard)
     console.print(
         f"Scored {tally.done}, failed {tally.failed}, there before {tally.skipped}.",
         highlight=False,
     )
     # An empty shard, where there are more shards than cases, has nothing to show.
-    if tally.done + tally.failed + tally.skipped > 0:
+    if sequences:
+        tell_sequences(options.out, options.quiet)
+    elif tally.done + tally.failed + tally.skipped > 0:
         summary = tables(options.out)
         if not options.quiet:
             tell(summary, options.out)
@@ -92,6 +104,11 @@ def run_index(options: IndexOptions) -> None:
         raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
     skipped: list[Skipped] = []
     protocol = parse_protocol(options.protocol)
+    if isinstance(protocol, ViewByView):
+        raise InputError(
+            f"{protocol.name} has no index, as its targets are not apart from each other; give it "
+            "to `evaluate` itself."
+        )
     index = index_of(protocol, usable(open_clips(options.path), skipped))
     index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
     write_evaluation_index(options.out, index)
@@ -109,8 +126,10 @@ def run_index(options: IndexOptions) -> None:
     )
 
 
-def chosen_cases(options: EvaluateOptions, skipped: list[Skipped]) -> list[Case] | list[ClipCase]:
-    """The cases that the options ask for; clips that benchmarks leave out go to `skipped`.
+def chosen_cases(
+    options: EvaluateOptions, skipped: list[Skipped]
+) -> list[Case] | list[ClipCase] | list[SequenceCase]:
+    """The cases that the options ask for; clips that are left out go to `skipped`.
 
     Raises:
         InputError: where there are none to be found, or a protocol is needed or wrong.
@@ -122,6 +141,9 @@ def chosen_cases(options: EvaluateOptions, skipped: list[Skipped]) -> list[Case]
         return [replace(case, resolution=options.resolution) for case in cases]
     protocol = parse_protocol(options.protocol)
     clips = usable(open_clips(options.path), skipped)
+    if isinstance(protocol, ViewByView):
+        sequences = sequences_of(protocol, clips, skipped, options.resolution)
+        return list(islice(sequences, options.limit))
     found = (case for clip in clips for case in cases_of(protocol, clip, options.resolution))
     return list(islice(found, options.limit))
 
@@ -155,6 +177,24 @@ def parse_shard(text: str | None) -> tuple[int, int]:
     if match is None:
         raise InputError(f"--shard is {text!r}; give it as i/n, as in 0/4 for the first of four.")
     return int(match[1]), int(match[2])
+
+
+def tell_sequences(out: Path, quiet: bool) -> None:
+    """Write the tables of sequences, and print their overview unless `quiet`.
+
+    Raises:
+        InputError: where a row is damaged, or a file cannot be written.
+    """
+    sequence_tables(out)
+    summary = read_sequences(out)
+    if summary is None or quiet:
+        return
+    console = Console()
+    console.print(overview(summary), highlight=False, markup=False, soft_wrap=True)
+    for name, method, steps, reason in summary.failures:
+        text = f"Failed: {name}, {method}, after {steps} steps: {reason}"
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+    console.print(f"Each step: {out / 'sequences.md'}", highlight=False, soft_wrap=True)
 
 
 def tell(summary: Summary, out: Path) -> None:
