@@ -91,7 +91,10 @@ class EvaluateOptions:
     protocol: tuple[str, ...] = ()
     """Which frames are given and which are the target: n-10 (frames n and n + 10 for n + 20),
     stress (0 and 30 for 99), or the path of an evaluation index; one or several. A cases.json
-    needs none."""
+    needs none. sequence-4 (or sequence-4-steps-6) completes each clip view after view: frames 0
+    and 4 are given, then 8, 12, … are completed one after the other into one scene, and once it is
+    completed the photograph of a frame is given too. It takes context, full, paper, ablations and
+    reggs; the paper's study of long sequences is that with --generator oracle."""
     methods: tuple[str, ...] = ("context", "full", "paper")
     """What to compare: context, full, paper, an ablation such as no-sa, densify-100, densify-800,
     distill, reggs; or a group of them: ablations, baselines, all."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -17,14 +17,20 @@ from gscompleter.evaluation.cases import read_cases
 from gscompleter.evaluation.clips import Skipped, usable
 from gscompleter.evaluation.folders import open_clips
 from gscompleter.evaluation.methods import methods_named
-from gscompleter.evaluation.plots import PlotsNotAvailable, plots
+from gscompleter.evaluation.plots import PlotsNotAvailable, plot_sequences, plots
 from gscompleter.evaluation.protocols import (
+    SequenceCase,
+    ViewByView,
     cases_of,
     index_of,
     parse_protocol,
+    sequences_of,
     write_evaluation_index,
 )
 from gscompleter.evaluation.runs import EvaluationCase, RunConfig, evaluate
+from gscompleter.evaluation.sequence_tables import overview, read_sequences, sequence_tables
+from gscompleter.evaluation.sequences import evaluate_sequences
+from gscompleter.evaluation.store import CASES, SEQUENCES
 from gscompleter.evaluation.tables import (
     COLUMNS,
     Summary,
@@ -64,14 +70,25 @@ def run_evaluation(options: EvaluateOptions) -> None:
         options.seed,
         source=source_of(options),
     )
+    sequences = [case for case in cases if isinstance(case, SequenceCase)]
+    singles = [case for case in cases if not isinstance(case, SequenceCase)]
     with shown_on(None if options.quiet else console):
-        tally = evaluate(cases, methods, options.out, config, shard, options.again)
+        tallies = []
+        if singles or not sequences:
+            tallies.append(evaluate(singles, methods, options.out, config, shard, options.again))
+        if sequences:
+            tallies.append(
+                evaluate_sequences(sequences, methods, options.out, config, shard, options.again)
+            )
+    done, failed, before = (
+        sum(getattr(tally, count) for tally in tallies) for count in ("done", "failed", "skipped")
+    )
     console.print(
-        f"Scored {tally.done}, failed {tally.failed}, there before {tally.skipped}.",
+        f"Scored {done}, failed {failed}, there before {before}.",
         highlight=False,
     )
     # An empty shard, where there are more shards than cases, has nothing to show.
-    if tally.done + tally.failed + tally.skipped > 0:
+    if done + failed + before > 0:
         show(options.out, options.quiet)
 
 
@@ -99,14 +116,23 @@ def show(out: Path, quiet: bool, with_fid: bool = False) -> None:
     Raises:
         InputError: where there is no run.
     """
+    if (out / SEQUENCES).is_dir():
+        tell_sequences(out, quiet)
+        if not (out / CASES).is_dir():
+            return
     summary = tables(out, with_fid)
+    draw(quiet, lambda: plots(summary, out))
+    if not quiet:
+        tell(summary, out)
+
+
+def draw(quiet: bool, drawing: Callable[[], object]) -> None:
+    """Do `drawing`, or say what it needs."""
     try:
-        plots(summary, out)
+        drawing()
     except PlotsNotAvailable as missing:
         if not quiet:
             Console(stderr=True).print(str(missing), highlight=False, markup=False)
-    if not quiet:
-        tell(summary, out)
 
 
 def run_index(options: IndexOptions) -> None:
@@ -119,6 +145,11 @@ def run_index(options: IndexOptions) -> None:
         raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
     skipped: list[Skipped] = []
     protocol = parse_protocol(options.protocol)
+    if isinstance(protocol, ViewByView):
+        raise InputError(
+            f"{protocol.name} has no index, as its targets are not apart from each other; give it "
+            "to `evaluate` itself."
+        )
     index = index_of(protocol, usable(open_clips(options.path), skipped))
     index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
     write_evaluation_index(options.out, index)
@@ -136,8 +167,10 @@ def run_index(options: IndexOptions) -> None:
     )
 
 
-def chosen_cases(options: EvaluateOptions, skipped: list[Skipped]) -> Sequence[EvaluationCase]:
-    """The cases that the options ask for; clips that benchmarks leave out go to `skipped`.
+def chosen_cases(
+    options: EvaluateOptions, skipped: list[Skipped]
+) -> Sequence[EvaluationCase | SequenceCase]:
+    """The cases that the options ask for; clips that are left out go to `skipped`.
 
     Raises:
         InputError: where there are none to be found, or a protocol is needed or wrong.
@@ -154,7 +187,11 @@ def chosen_cases(options: EvaluateOptions, skipped: list[Skipped]) -> Sequence[E
         case
         for clip in clips
         for protocol in protocols
-        for case in cases_of(protocol, clip, options.resolution)
+        for case in (
+            sequences_of(protocol, [clip], skipped, options.resolution)
+            if isinstance(protocol, ViewByView)
+            else cases_of(protocol, clip, options.resolution)
+        )
     )
     return list(islice(found, options.limit))
 
@@ -188,6 +225,27 @@ def parse_shard(text: str | None) -> tuple[int, int]:
     if match is None:
         raise InputError(f"--shard is {text!r}; give it as i/n, as in 0/4 for the first of four.")
     return int(match[1]), int(match[2])
+
+
+def tell_sequences(out: Path, quiet: bool) -> None:
+    """Write the tables of sequences, and print their overview unless `quiet`.
+
+    Raises:
+        InputError: where a row is damaged, or a file cannot be written.
+    """
+    sequence_tables(out)
+    summary = read_sequences(out)
+    if summary is None:
+        return
+    draw(quiet, lambda: plot_sequences(summary, out))
+    if quiet:
+        return
+    console = Console()
+    console.print(overview(summary), highlight=False, markup=False, soft_wrap=True)
+    for name, method, steps, reason in summary.failures:
+        text = f"Failed: {name}, {method}, after {steps} steps: {reason}"
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+    console.print(f"Each step: {out / 'sequences.md'}", highlight=False, soft_wrap=True)
 
 
 def tell(summary: Summary, out: Path) -> None:

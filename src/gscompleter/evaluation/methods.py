@@ -174,12 +174,17 @@ _ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABL
 # By the name of the method, that of its settings. Three degrees of freedom are no ablation but
 # what the paper compares the ray constraint with.
 
+SETTINGS: dict[str, str] = {
+    "full": "default",
+    "paper": "paper",
+    **_ABLATIONS,
+    **{f"paper/{title}": f"paper/{name}" for title, name in _ABLATIONS.items()},
+}
+"""Methods that are ours, and what `named_config` calls their settings."""
+
 METHODS: dict[str, Method] = {
     "context": nothing_added,
-    "full": completed_with("default"),
-    "paper": completed_with("paper"),
-    **{title: completed_with(name) for title, name in _ABLATIONS.items()},
-    **{f"paper/{title}": completed_with(f"paper/{name}") for title, name in _ABLATIONS.items()},
+    **{title: completed_with(name) for title, name in SETTINGS.items()},
     **BASELINES,
 }
 """Every method by its name, in the order of the tables."""

@@ -1,13 +1,16 @@
-"""Pictures of a run: gain against the size of the hole, gain against distance, time by stage."""
+"""Pictures of a run: gain against the size of the hole and against distance, time by stage, and the
+steps of sequences."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gscompleter.config import ABLATIONS
 from gscompleter.errors import InputError
+from gscompleter.evaluation.sequence_tables import SequenceSummary
+from gscompleter.evaluation.store import slug
 from gscompleter.evaluation.tables import Row, Summary, seconds_of, stage_place
 from gscompleter.io.files import replacing
 
@@ -45,6 +48,49 @@ def plots(summary: Summary, out: Path) -> list[Path]:
     return drawn
 
 
+def plot_sequences(summary: SequenceSummary, out: Path) -> list[Path]:
+    """Draw `sequence_SEQUENCE.png` for each sequence: PSNR, scale and seconds of each step.
+
+    Raises:
+        PlotsNotAvailable: where matplotlib is missing.
+        InputError: where a file cannot be written.
+    """
+    return [
+        save_curves(out / f"sequence_{slug(name)}.png", steps)
+        for name, steps in summary.steps.items()
+    ]
+
+
+CURVES: tuple[tuple[str, Callable[[dict[str, Any]], float | None]], ...] = (
+    ("PSNR after the step (dB)", lambda step: step["psnr_after"]),
+    ("depth scale", lambda step: step["depth_scale"]),
+    ("seconds", lambda step: step["seconds"]["total"]),
+)
+"""What is drawn of each step, one above the other."""
+
+
+def save_curves(path: Path, steps: Mapping[str, Sequence[dict[str, Any]]]) -> Path:
+    """A PNG of each method's steps in one sequence.
+
+    Raises:
+        PlotsNotAvailable: where matplotlib is missing.
+        InputError: where the file cannot be written.
+    """
+    figure = new_figure(7.0)
+    panels = figure.subplots(len(CURVES), sharex=True)
+    for axes, (title, of) in zip(panels, CURVES, strict=True):
+        for number, (method, found) in enumerate(steps.items()):
+            known = [(s["frame"], v) for s in found if (v := of(s)) is not None]
+            if known:
+                axes.plot(*zip(*known, strict=True), label=method, linewidth=1, **_style(number))
+        axes.set_ylabel(title)
+        axes.grid(alpha=0.3)
+    panels[-1].set_yscale("log")
+    panels[-1].set_xlabel("frame")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
+    return _write(figure, path)
+
+
 def save_plot(path: Path, draw: Callable[[Axes], None], height: float = 4.5) -> Path:
     """A PNG of what `draw` draws, 8 inches wide. The same values give the same bytes.
 
@@ -55,6 +101,10 @@ def save_plot(path: Path, draw: Callable[[Axes], None], height: float = 4.5) -> 
     figure = new_figure(height)
     draw(figure.add_subplot())
     figure.legend(loc="outside right upper", fontsize="small")
+    return _write(figure, path)
+
+
+def _write(figure: Figure, path: Path) -> Path:
     with replacing(path) as file:
         figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
     return path

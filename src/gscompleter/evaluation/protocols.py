@@ -2,20 +2,22 @@
 
 Three protocols: a published evaluation index (`{scene: {"context", "target"} or null}`), the
 extrapolation `n-k` (frames n and n + k show what frame n + 2k is completed from, and the same
-backwards) and a stress test far outside of what the context sees.
+backwards) and a stress test far outside of what the context sees. Apart from them stands
+`sequence-k`, whose targets depend on each other: they are completed one after the other.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from gscompleter.completer import MAX_TARGETS
 from gscompleter.errors import InputError
-from gscompleter.evaluation.clips import Clip
+from gscompleter.evaluation.clips import Clip, Skipped
 from gscompleter.io.files import replacing
 from gscompleter.types import View
 
@@ -100,6 +102,57 @@ class EvaluationIndex:
 
 
 @dataclass(frozen=True)
+class ViewByView:
+    """0, k → 2k, 3k, 4k, …: one target after the other, all into one scene."""
+
+    k: int
+    """Frames from one photograph to the next."""
+    steps: int | None = None
+    """Most targets; if left out, all that the clip has, up to `MAX_TARGETS`."""
+
+    def __post_init__(self) -> None:
+        if self.k < 1:
+            raise InputError("A sequence of every 0th frame is impossible; give at least 1.")
+        if self.steps is not None and not 1 <= self.steps <= MAX_TARGETS:
+            raise InputError(
+                f"A sequence of {self.steps} steps is impossible; give 1 to {MAX_TARGETS}, which "
+                "is how many a .ply can tell apart."
+            )
+
+    @property
+    def name(self) -> str:
+        return f"sequence-{self.k}" + ("" if self.steps is None else f"-steps-{self.steps}")
+
+    def case(self, clip: Clip, resolution: tuple[int, int] | None = None) -> SequenceCase | None:
+        """The sequence of a clip; None where the clip is too short for one step."""
+        targets = tuple(range(2 * self.k, len(clip), self.k))[: self.steps or MAX_TARGETS]
+        return SequenceCase(clip, (0, self.k), targets, resolution) if targets else None
+
+
+@dataclass(frozen=True)
+class SequenceCase:
+    """A clip that is completed view after view."""
+
+    clip: Clip
+    context: tuple[int, ...]
+    """Frames that are known from the beginning."""
+    targets: tuple[int, ...]
+    """Frames that are completed, in this order."""
+    resolution: tuple[int, int] | None = None
+    """Height and width; those of the photographs if left out."""
+
+    @property
+    def name(self) -> str:
+        first, last = self.targets[0], self.targets[-1]
+        span = f"{first}" if first == last else f"{first}..{last}"
+        return f"{self.clip.name} {'+'.join(map(str, self.context))}>{span}"
+
+    def load(self, frames: Sequence[int]) -> list[View]:
+        """Photographs of `frames`."""
+        return self.clip.views(frames, self.resolution)
+
+
+@dataclass(frozen=True)
 class ClipCase:
     """One completion task in a clip."""
 
@@ -125,8 +178,9 @@ class ClipCase:
         return self.clip.views(frames, self.resolution)
 
 
-def parse_protocol(text: str) -> EvaluationProtocol:
-    """The protocol of that name: `n-10`, `n-10-stride-5`, `stress`, or the path of an index.
+def parse_protocol(text: str) -> EvaluationProtocol | ViewByView:
+    """The protocol of that name: `n-10`, `n-10-stride-5`, `stress`, `sequence-4`,
+    `sequence-4-steps-6`, or the path of an index.
 
     Raises:
         InputError: where it is none of these, or the index is damaged.
@@ -134,13 +188,16 @@ def parse_protocol(text: str) -> EvaluationProtocol:
     match = re.fullmatch(r"n-([0-9]{1,6})(?:-stride-([0-9]{1,6}))?", text)
     if match:
         return Extrapolation(int(match[1]), None if match[2] is None else int(match[2]))
+    match = re.fullmatch(r"sequence-([0-9]{1,6})(?:-steps-([0-9]{1,6}))?", text)
+    if match:
+        return ViewByView(int(match[1]), None if match[2] is None else int(match[2]))
     if text == "stress":
         return StressTest()
     if Path(text).is_file():
         return read_evaluation_index(text)
     raise InputError(
-        f"There is no protocol {text!r}; give n-K for a number of frames K (as n-10), stress, or "
-        "the path of an evaluation index."
+        f"There is no protocol {text!r}; give n-K for a number of frames K (as n-10), stress, "
+        "sequence-K (as sequence-4), or the path of an evaluation index."
     )
 
 
@@ -164,6 +221,22 @@ def cases_of(
             beside = neighbours(target, split.context, len(clip))
             cases.append(ClipCase(clip, split.context, target, beside, resolution))
     return cases
+
+
+def sequences_of(
+    protocol: ViewByView,
+    clips: Iterable[Clip],
+    skipped: list[Skipped],
+    resolution: tuple[int, int] | None = None,
+) -> Iterator[SequenceCase]:
+    """The sequence of each clip; clips that are too short for a step are appended to `skipped`."""
+    for clip in clips:
+        case = protocol.case(clip, resolution)
+        if case is None:
+            needed = f"{protocol.name} needs {2 * protocol.k + 1}"
+            skipped.append(Skipped(clip.name, f"it has {len(clip)} frames, and {needed}"))
+        else:
+            yield case
 
 
 def neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:

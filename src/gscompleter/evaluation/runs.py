@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
@@ -46,17 +47,23 @@ from gscompleter.render import load_renderer
 from gscompleter.types import View
 
 T = TypeVar("T")
+C = TypeVar("C", bound="Named")
 
 VERSION = 1
 """Of the files in a folder of results."""
 
 
 @runtime_checkable
-class EvaluationCase(Protocol):
-    """A completion task: of a `cases.json`, or chosen by a protocol in a clip."""
+class Named(Protocol):
+    """Anything that a method is run on and that has a place in the folder of results."""
 
     @property
     def name(self) -> str: ...
+
+
+@runtime_checkable
+class EvaluationCase(Named, Protocol):
+    """A completion task: of a `cases.json`, or chosen by a protocol in a clip."""
 
     @property
     def context(self) -> tuple[int, ...]: ...
@@ -85,11 +92,11 @@ class RunConfig:
     source: Mapping[str, Any] = field(default_factory=dict)
     """Where the cases come from, so that no folder mixes two sources."""
 
-    def parts(self, target: View) -> Parts:
-        """The models for a case. Only the generator `oracle` looks at the image of `target`."""
+    def parts(self, *targets: View) -> Parts:
+        """The models for a case. Only the generator `oracle` looks at the images of `targets`."""
         return Parts(
             load_reconstructor(self.reconstructor),
-            load_generator(self.generator, self.seed, [target]),
+            load_generator(self.generator, self.seed, targets),
             load_renderer(self.device),
             self.seed,
             0.0 if self.generator == "oracle" else None,
@@ -136,6 +143,28 @@ def evaluate(
     Raises:
         InputError: a wrong name or shard, a folder that holds something else, a full disk.
     """
+    begin(cases, methods, out, config, shard)
+    return make_rows(
+        cases[shard[0] :: shard[1]],
+        methods,
+        partial(row_path, out),
+        lambda case: Bench(case, out, config).row,
+        again,
+    )
+
+
+def begin(
+    cases: Sequence[Named],
+    methods: Sequence[str],
+    out: Path,
+    config: RunConfig,
+    shard: tuple[int, int],
+) -> None:
+    """See that a run is possible, and make `out` its folder.
+
+    Raises:
+        InputError: a wrong name or shard, a folder that holds something else, a full disk.
+    """
     check_methods(methods)
     check_shard(shard)
     check_cases(cases)
@@ -146,15 +175,32 @@ def evaluate(
     load_generator(config.generator)
     claim(out, config)
 
-    jobs = [(case, name) for case in cases[shard[0] :: shard[1]] for name in methods]
-    missing = [(case, name) for case, name in jobs if is_missing(row_path(out, case, name), again)]
-    failed, bench = 0, None
+
+def make_rows(
+    cases: Sequence[C],
+    methods: Sequence[str],
+    path_of: Callable[[C, str], Path],
+    rows_of: Callable[[C], Callable[[str], dict[str, Any]]],
+    again: Again,
+) -> Tally:
+    """Write the rows that are missing, case by case.
+
+    Args:
+        cases: What the methods are run on.
+        methods: Names of methods.
+        path_of: Where the row of a case and a method lies.
+        rows_of: Of a case, what makes the row of a method; it is asked for once per case.
+        again: What of an earlier call is done once more.
+    """
+    jobs = [(case, name) for case in cases for name in methods]
+    missing = [job for job in jobs if is_missing(path_of(*job), again)]
+    failed, current, row_of = 0, None, None
     for case, name in track(missing, "Evaluating"):
         with shown_on(None):  # one bar is enough
-            if bench is None or bench.case is not case:
-                bench = Bench(case, out, config)
-            row = bench.row(name)
-        write_json(row_path(out, case, name), row)
+            if row_of is None or current is not case:
+                current, row_of = case, rows_of(case)
+            row = row_of(name)
+        write_json(path_of(case, name), row)
         failed += row["error"] is not None
     return Tally(len(missing) - failed, failed, len(jobs) - len(missing))
 
@@ -202,11 +248,7 @@ class Bench:
         (target,) = (view.to(device) for view in case.load((case.target,)))
         neighbours = [view.to(device) for view in case.load(case.neighbours)]
         parts = self.config.parts(target)
-        path = self.folder / "start.npz"
-        start = load_start(path, views, target)
-        if start is None:
-            start = start_of(views, target.camera, parts)
-            save_start(path, start)
+        start = start_at(self.folder / "start.npz", views, target, parts)
         camera = start.target
         truth = ranged_truth(start.views, target, neighbours, camera.near, camera.far)
         return start, parts, truth
@@ -223,7 +265,7 @@ class Bench:
             ("before", seen.before.image),
             ("truth", truth.target.image),
         ):
-            _write_image(self.folder / f"{name}.png", image)
+            save_image(self.folder / f"{name}.png", image)
         return self._row_of(
             method,
             scores=content,
@@ -251,6 +293,15 @@ class Bench:
         }
 
 
+def start_at(path: Path, views: Sequence[View], target: View, parts: Parts) -> Start:
+    """The context that is saved at `path`, else computed and saved there."""
+    start = load_start(path, views, target)
+    if start is None:
+        start = start_of(views, target.camera, parts)
+        save_start(path, start)
+    return start
+
+
 def measured(method: str, start: Start, parts: Parts) -> Saved:
     """What a method makes of a case, and the most memory that this took."""
     with peak_memory(start.context.means.device) as peak:
@@ -263,7 +314,12 @@ def row_path(out: Path, case: EvaluationCase, method: str) -> Path:
     return case_folder(out, case.name) / f"{slug(method)}.json"
 
 
-def _write_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
+def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
+    """A picture among the results.
+
+    Raises:
+        OutputError: where it cannot be written.
+    """
     try:
         write_image(path, image)
     except InputError as error:
@@ -295,7 +351,7 @@ def check_shard(shard: tuple[int, int]) -> None:
         )
 
 
-def check_cases(cases: Sequence[EvaluationCase]) -> None:
+def check_cases(cases: Sequence[Named]) -> None:
     """Refuse no case at all, and two that would be written to one place."""
     if not cases:
         raise InputError(

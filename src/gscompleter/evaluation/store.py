@@ -6,6 +6,10 @@
     cases/CASE/METHOD.json           its row of scores, or why it has none
     cases/CASE/METHOD.png            what the target camera sees afterwards
     cases/CASE/before.png, truth.png the same before, and the photograph
+    sequences/NAME/start.npz              the context that all methods begin with
+    sequences/NAME/METHOD/step-001.npz    what a method added in its first step
+    sequences/NAME/METHOD/step-001.png    what the camera of that step sees afterwards
+    sequences/NAME/METHOD.json            its row: all steps, and why there are no more
 
 Everything appears under its name once it is complete.
 """
@@ -35,6 +39,9 @@ RUN = "run.json"
 CASES = "cases"
 """Where the folders of the cases are."""
 
+SEQUENCES = "sequences"
+"""Where the folders of the sequences are."""
+
 _FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 
 
@@ -53,6 +60,11 @@ def slug(name: str) -> str:
 def case_folder(out: Path, case: str) -> Path:
     """Where everything about the case of that name lies."""
     return out / CASES / slug(case)
+
+
+def sequence_folder(out: Path, sequence: str) -> Path:
+    """Where everything about the sequence of that name lies."""
+    return out / SEQUENCES / slug(sequence)
 
 
 @dataclass(frozen=True)
