@@ -1,0 +1,1 @@
+"""Feed-forward models: the authors' weights on our own networks."""
