@@ -1,0 +1,112 @@
+"""Ψ of the paper: MVSplat and DepthSplat as reconstructors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.reconstructors.feed_forward.depthsplat import DepthSplat
+from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
+from gscompleter.reconstructors.feed_forward.inputs import Crop, batch_of
+from gscompleter.reconstructors.feed_forward.mvsplat import MVSplat
+from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, observed
+
+MAX_COEFFICIENTS = 16
+"""Spherical harmonics of degree 3, the highest that rasterisers of 3DGS show.
+
+MVSplat predicts degree 4, too, which its own rasteriser ignores as well.
+"""
+
+
+@dataclass(frozen=True)
+class FeedForward:
+    """Gaussians of all pixels from one pass of a network.
+
+    The networks have learnt the sizes of rooms in metres and of scenes that structure from
+    motion brought to a similar size. Depths follow the depth range of the cameras, but the
+    Gaussians of DepthSplat have sizes in the unit it was trained in: a scene in another unit,
+    say millimetres, must be scaled to metres first.
+    """
+
+    network: MVSplat | DepthSplat
+    """With its weights, on the device where it is to run."""
+    dtype: torch.dtype = torch.float32
+    """bfloat16 or float16 let a GPU run the network in lower precision (autocast); geometry
+    stays in float32. A CPU takes float32 only. No test covers it on a GPU."""
+
+    def __post_init__(self) -> None:
+        if self.dtype != torch.float32 and self.device.type != "cuda":
+            raise InputError(
+                f"The network lies on the {self.device.type} and {self.dtype} was asked for, "
+                "which needs a GPU; use float32."
+            )
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.network.parameters()).device
+
+    def __call__(self, views: Sequence[View]) -> Reconstruction:
+        """A Gaussian for each pixel that the network sees, and z-depths per view.
+
+        Images are cropped about the centre to multiples of 16 or 64 pixels; outside of the crop
+        depths are not valid.
+
+        Raises:
+            InputError: fewer than two views, views of several sizes, images smaller than one
+                patch, an empty depth range.
+        """
+        config = self.network.config
+        images, cameras, crop = batch_of(views, config.patch, config.near, config.far)
+        lower = torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32)
+        # Not torch.inference_mode: the stages that follow optimise what comes from here.
+        with torch.no_grad(), lower:
+            predicted = self.network(images.to(self.device), cameras.to(self.device))
+        return reconstruction_of(predicted, views, crop)
+
+
+def reconstruction_of(
+    predicted: PixelGaussians, views: Sequence[View], crop: Crop
+) -> Reconstruction:
+    """The only scene of a batch, on the device of its views.
+
+    z-depths follow from the means, which serves networks of z-depth and of distance alike.
+    """
+    device = views[0].image.device
+    gaussians = gaussians_of(predicted).to(device)
+    per_view = crop.height * crop.width
+    depths = [
+        depth_map_of(means, view, crop)
+        for means, view in zip(gaussians.means.split(per_view), views, strict=True)
+    ]
+    pixels = [crop.pixel_index(view.camera.width) for view in views]
+    return Reconstruction(
+        gaussians,
+        tuple(depths),
+        torch.arange(len(views), device=device).repeat_interleave(per_view),
+        torch.cat(pixels).to(device),
+    )
+
+
+def gaussians_of(predicted: PixelGaussians) -> Gaussians:
+    """View by view, row by row, without the harmonics that nothing shows."""
+    return observed(
+        predicted.means.flatten(0, -2),
+        predicted.quats.flatten(0, -2),
+        predicted.scales.flatten(0, -2),
+        predicted.opacities.flatten(),
+        predicted.sh[..., :MAX_COEFFICIENTS, :].flatten(0, -3),
+    )
+
+
+def depth_map_of(means: Float[Tensor, "n 3"], view: View, crop: Crop) -> DepthMap:
+    """z-depth of the Gaussians of the crop, in the whole image."""
+    z = (means - view.camera.center) @ view.camera.forward
+    depth, within = crop.padded(
+        z.view(crop.height, crop.width), view.camera.height, view.camera.width
+    )
+    return DepthMap(depth, within)
