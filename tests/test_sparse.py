@@ -7,6 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from feed_forward_fixtures import error, rule_v1
 from gscompleter import InputError
 from gscompleter.reconstructors.feed_forward.sparse import (
     OFFSETS,
@@ -17,8 +18,9 @@ from gscompleter.reconstructors.feed_forward.sparse import (
     unique_rows,
 )
 from gscompleter.reconstructors.feed_forward.sparse_unet import SparseUNet
+from gscompleter.reconstructors.feed_forward.volsplat import GaussianHead
 from gscompleter.reconstructors.feed_forward.voxels import voxelize
-from parity import FIXTURES, relative_error, rule_state, rule_tensor
+from volsplat_fixtures import FIXTURES, with_sparse_rule
 
 LOW, SIDE = -6, 12
 """The dense grid the sparse ones lie in: coordinates LOW to LOW + SIDE, on even corners."""
@@ -200,7 +202,7 @@ def test_clouds_that_cannot_be_voxelized_are_refused(points, resolution, sentenc
 
 @pytest.fixture(scope="module")
 def small() -> dict[str, torch.Tensor]:
-    with np.load(FIXTURES / "volsplat" / "sparse_small.npz") as file:
+    with np.load(FIXTURES / "sparse_small.npz") as file:
         return {name: torch.from_numpy(file[name]) for name in file}
 
 
@@ -211,25 +213,32 @@ def test_single_convolutions_agree_with_minkowski_engine(small):
     place = {tuple(row): i for i, row in enumerate(small["conv_s2_coords"].tolist())}
     order = [place[tuple(row)] for row in coarse.coordinates.tolist()]
     assert sorted(order) == list(range(len(place)))
-    kernel = rule_tensor("conv.kernel", (27, 8, 6), plain=True)
+    kernel = rule_v1("conv.kernel", torch.Size((27, 8, 6)))
     down = convolve(small["feats"], kernel, table)
-    assert relative_error(down, small["conv_s2_out"][order]) < 1e-6
-    kernel = rule_tensor("up.kernel", (27, 6, 4), plain=True)
+    assert error(down, small["conv_s2_out"][order]) < 1e-6
+    kernel = rule_v1("up.kernel", torch.Size((27, 6, 4)))
     up = convolve(down, kernel, table.transposed())
     assert torch.equal(grid.coordinates, small["up_coords"].long())
-    assert relative_error(up, small["up_out"]) < 1e-6
+    assert error(up, small["up_out"]) < 1e-6
 
 
 def test_the_u_net_agrees_with_minkowski_engine(small):
-    network = SparseUNet(8).eval()
-    keys = json.loads((FIXTURES / "volsplat" / "sparse_small_keys.json").read_text())["unet"]
+    network = with_sparse_rule(SparseUNet(8))
+    keys = json.loads((FIXTURES / "sparse_small_keys.json").read_text())["unet"]
     assert {k: list(v.shape) for k, v in network.state_dict().items()} == {
         key: shape for key, (shape, _) in keys.items()
     }
-    network.load_state_dict(rule_state(network))
     with torch.inference_mode():
         found = network(small["feats"], Grid(small["coords"].long()))
-    assert relative_error(found, small["unet_out"]) < 5e-6
+    assert error(found, small["unet_out"]) < 5e-6
+
+
+def test_two_convolutions_over_one_table_agree_with_minkowski_engine(small):
+    """The head takes what the U-Net gives."""
+    head = with_sparse_rule(GaussianHead(8, 5))
+    with torch.inference_mode():
+        found = head(small["unet_out"], Grid(small["coords"].long()))
+    assert error(found, small["head_out"]) < 5e-6
 
 
 def test_the_u_net_gives_the_same_bits_twice(small):

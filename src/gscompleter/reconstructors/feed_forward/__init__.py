@@ -11,6 +11,7 @@ from gscompleter.reconstructors.feed_forward.depthsplat import (
 )
 from gscompleter.reconstructors.feed_forward.mvsplat import MVSplat, MVSplatConfig
 from gscompleter.reconstructors.feed_forward.reconstructor import FeedForward
+from gscompleter.reconstructors.feed_forward.volsplat import VolSplat, VolSplatConfig
 
 __all__ = [
     "VARIANTS",
@@ -19,4 +20,6 @@ __all__ = [
     "FeedForward",
     "MVSplat",
     "MVSplatConfig",
+    "VolSplat",
+    "VolSplatConfig",
 ]

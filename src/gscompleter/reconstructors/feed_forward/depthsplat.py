@@ -8,24 +8,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gscompleter.reconstructors.feed_forward.cameras import Cameras
-from gscompleter.reconstructors.feed_forward.depth_predictor import (
-    VITS,
-    DepthConfig,
-    DepthPredictor,
-)
+from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
 from gscompleter.reconstructors.feed_forward.dpt import padded_conv3x3
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import (
     DEPTHSPLAT_CHANNELS,
     PixelGaussians,
     depthsplat_gaussians,
 )
-from gscompleter.reconstructors.feed_forward.unet import conv3x3
+from gscompleter.reconstructors.feed_forward.pixel_features import PixelFeatures
 
 
 @dataclass(frozen=True)
@@ -65,20 +59,14 @@ VARIANTS: Mapping[str, DepthSplatConfig] = {
 """The published ones, by size, data and resolution."""
 
 
-class DepthSplat(nn.Module):
+class DepthSplat(PixelFeatures):
     """The whole network: 38 M (small), 121 M (base) or 354 M (large) parameters."""
 
     def __init__(self, config: DepthSplatConfig = DepthSplatConfig()) -> None:
-        super().__init__()
+        super().__init__(config.depth)
         self.config = config
-        features = VITS[config.depth.vit].gaussian_features
-        self.depth_predictor = DepthPredictor(config.depth)
-        self.feature_upsampler = config.depth.head(features, with_disparity=False)
-        self.gaussian_regressor = nn.Sequential(
-            conv3x3(features + 5, 64), nn.GELU(), conv3x3(64, 64)
-        )
         self.gaussian_head = nn.Sequential(
-            padded_conv3x3(features + 68, DEPTHSPLAT_CHANNELS),
+            padded_conv3x3(self.channels, DEPTHSPLAT_CHANNELS),
             nn.GELU(),
             padded_conv3x3(DEPTHSPLAT_CHANNELS, DEPTHSPLAT_CHANNELS),
         )
@@ -91,10 +79,7 @@ class DepthSplat(nn.Module):
                 `config.patch`.
             cameras: Of the views.
         """
-        known = self.depth_predictor(images, cameras)
-        features = self.feature_upsampler(known.vit_maps, known.maps)
-        certainty = F.interpolate(known.certainty, size=images.shape[-2:])
+        depth, features = self.describe(images, cameras)
+        raw = self.gaussian_head(features)
         flat = images.flatten(0, 1)
-        regressed = self.gaussian_regressor(torch.cat([flat, known.depth, certainty, features], 1))
-        raw = self.gaussian_head(torch.cat([regressed, flat, features, certainty], 1))
-        return depthsplat_gaussians(raw, known.depth, flat, cameras, self.config.gaussian_scale_max)
+        return depthsplat_gaussians(raw, depth, flat, cameras, self.config.gaussian_scale_max)

@@ -121,7 +121,7 @@ def z_rays(offsets: Float[Tensor, "b v h w 2"], cameras: Cameras) -> Float[Tenso
         return torch.einsum("bvij,bvhwj->bvhwi", inverse, F.pad(points, (0, 1), value=1.0))
 
 
-def damped(sh: Float[Tensor, "b v h w c"]) -> Float[Tensor, "b v h w k 3"]:
+def damped(sh: Float[Tensor, "*batch c"]) -> Float[Tensor, "*batch k 3"]:
     """Raw channels, colour by colour, as harmonics whose higher degrees start out small."""
     coefficients = sh.unflatten(-1, (3, -1)).transpose(-1, -2)
     degrees = range(1, round(coefficients.shape[-2] ** 0.5))

@@ -1,4 +1,4 @@
-"""Ψ of the paper: MVSplat and DepthSplat as reconstructors."""
+"""Ψ of the paper: MVSplat, DepthSplat and VolSplat as reconstructors."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from gscompleter.reconstructors.feed_forward.depthsplat import DepthSplat
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
 from gscompleter.reconstructors.feed_forward.inputs import Crop, batch_of
 from gscompleter.reconstructors.feed_forward.mvsplat import MVSplat
+from gscompleter.reconstructors.feed_forward.volsplat import VolSplat, VoxelGaussians
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, observed
 
 MAX_COEFFICIENTS = 16
@@ -25,15 +26,15 @@ MVSplat predicts degree 4, too, which its own rasteriser ignores as well.
 
 @dataclass(frozen=True)
 class FeedForward:
-    """Gaussians of all pixels from one pass of a network.
+    """Gaussians of all pixels, or of all voxels, from one pass of a network.
 
     The networks have learnt the sizes of rooms in metres and of scenes that structure from
     motion brought to a similar size. Depths follow the depth range of the cameras, but the
-    Gaussians of DepthSplat have sizes in the unit it was trained in: a scene in another unit,
-    say millimetres, must be scaled to metres first.
+    Gaussians of DepthSplat, and those and the voxels of VolSplat, have sizes in the unit these
+    were trained in: a scene in another unit, say millimetres, must be scaled to metres first.
     """
 
-    network: MVSplat | DepthSplat
+    network: MVSplat | DepthSplat | VolSplat
     """With its weights, on the device where it is to run."""
     dtype: torch.dtype = torch.float32
     """bfloat16 or float16 let a GPU run the network in lower precision (autocast); geometry
@@ -51,14 +52,16 @@ class FeedForward:
         return next(self.network.parameters()).device
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
-        """A Gaussian for each pixel that the network sees, and z-depths per view.
+        """A Gaussian for each pixel that the network sees (VolSplat: for each voxel that holds
+        such a pixel, without a note of which), and z-depths per view.
 
         Images are cropped about the centre to multiples of 16 or 64 pixels; outside of the crop
         depths are not valid.
 
         Raises:
             InputError: fewer than two views, views of several sizes, images smaller than one
-                patch, an empty depth range.
+                patch, an empty depth range; for VolSplat, poses or depths that spread its voxels
+                too widely to be counted.
         """
         config = self.network.config
         images, cameras, crop = batch_of(views, config.patch, config.near, config.far)
@@ -66,6 +69,8 @@ class FeedForward:
         # Not torch.inference_mode: the stages that follow optimise what comes from here.
         with torch.no_grad(), lower:
             predicted = self.network(images.to(self.device), cameras.to(self.device))
+        if isinstance(predicted, VoxelGaussians):
+            return reconstruction_of_voxels(predicted, views, crop)
         return reconstruction_of(predicted, views, crop)
 
 
@@ -90,6 +95,21 @@ def reconstruction_of(
         torch.arange(len(views), device=device).repeat_interleave(per_view),
         torch.cat(pixels).to(device),
     )
+
+
+def reconstruction_of_voxels(
+    predicted: VoxelGaussians, views: Sequence[View], crop: Crop
+) -> Reconstruction:
+    """The scene on the device of its views; its Gaussians belong to no particular pixel."""
+    device = views[0].image.device
+    gaussians = observed(
+        predicted.means, predicted.quats, predicted.scales, predicted.opacities, predicted.sh
+    )
+    depths = [
+        DepthMap(*crop.padded(depth, view.camera.height, view.camera.width))
+        for depth, view in zip(predicted.depth.to(device), views, strict=True)
+    ]
+    return Reconstruction(gaussians.to(device), tuple(depths))
 
 
 def gaussians_of(predicted: PixelGaussians) -> Gaussians:
