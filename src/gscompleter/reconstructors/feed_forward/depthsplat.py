@@ -18,6 +18,7 @@ from gscompleter.reconstructors.feed_forward.depth_predictor import (
     VITS,
     DepthConfig,
     DepthPredictor,
+    dpt_head,
 )
 from gscompleter.reconstructors.feed_forward.dpt import padded_conv3x3
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import (
@@ -73,7 +74,7 @@ class DepthSplat(nn.Module):
         self.config = config
         features = VITS[config.depth.vit].gaussian_features
         self.depth_predictor = DepthPredictor(config.depth)
-        self.feature_upsampler = config.depth.head(features, with_disparity=False)
+        self.feature_upsampler = dpt_head(config.depth, features, with_disparity=False)
         self.gaussian_regressor = nn.Sequential(
             conv3x3(features + 5, 64), nn.GELU(), conv3x3(64, 64)
         )

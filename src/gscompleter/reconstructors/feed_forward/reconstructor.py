@@ -53,24 +53,23 @@ class FeedForward:
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """A Gaussian for each pixel that the network sees, and z-depths per view.
 
-        Images are cropped about the centre to multiples of 16 or 64 pixels; outside of the crop
-        depths are not valid.
+        Images are cropped about their centres to one size, in multiples of 16 or 64 pixels;
+        outside of the crop depths are not valid.
 
         Raises:
-            InputError: fewer than two views, views of several sizes, images smaller than one
-                patch, an empty depth range.
+            InputError: fewer than two views, images smaller than one patch, an empty depth range.
         """
         config = self.network.config
-        images, cameras, crop = batch_of(views, config.patch, config.near, config.far)
+        images, cameras, crops = batch_of(views, config.patch, config.near, config.far)
         lower = torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32)
         # Not torch.inference_mode: the stages that follow optimise what comes from here.
         with torch.no_grad(), lower:
             predicted = self.network(images.to(self.device), cameras.to(self.device))
-        return reconstruction_of(predicted, views, crop)
+        return reconstruction_of(predicted, views, crops)
 
 
 def reconstruction_of(
-    predicted: PixelGaussians, views: Sequence[View], crop: Crop
+    predicted: PixelGaussians, views: Sequence[View], crops: Sequence[Crop]
 ) -> Reconstruction:
     """The only scene of a batch, on the device of its views.
 
@@ -78,12 +77,11 @@ def reconstruction_of(
     """
     device = views[0].image.device
     gaussians = gaussians_of(predicted).to(device)
-    per_view = crop.height * crop.width
-    depths = [
-        depth_map_of(means, view, crop)
-        for means, view in zip(gaussians.means.split(per_view), views, strict=True)
-    ]
-    pixels = [crop.pixel_index(view.camera.width) for view in views]
+    per_view = crops[0].height * crops[0].width
+    means = gaussians.means.split(per_view)
+    pairs = list(zip(views, crops, strict=True))
+    depths = [depth_map_of(own, view, crop) for own, (view, crop) in zip(means, pairs, strict=True)]
+    pixels = [crop.pixel_index(view.camera.width) for view, crop in pairs]
     return Reconstruction(
         gaussians,
         tuple(depths),
