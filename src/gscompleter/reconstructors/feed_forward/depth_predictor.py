@@ -89,18 +89,6 @@ class DepthConfig:
         """Sides of the images must be multiples of it, in pixels."""
         return 16 if self.lowest_feature_resolution == 4 else 64
 
-    def head(self, features: int, with_disparity: bool, out: nn.Module | None = None) -> DptHead:
-        """A DPT head of `features` channels for the maps of a `DepthPrediction`."""
-        vit = VITS[self.vit]
-        fine, middle, coarse = LAYOUTS[self.upsample_factor, self.num_scales]
-        if not with_disparity:
-            fine, middle, coarse = (
-                tuple(name for name in names if name != "disparity")
-                for names in (fine, middle, coarse)
-            )
-        layout = (fine, middle, coarse)
-        return DptHead(vit.channels, vit.widths, features, layout, CHANNELS, out)
-
 
 @dataclass(frozen=True)
 class DepthPrediction:
@@ -149,9 +137,8 @@ class DepthPredictor(nn.Module):
         self.depth_head = nn.ModuleList()
         for scale in range(config.num_scales):
             self.add_scale(scale)
-        self.upsampler = config.head(
-            self.vit.depth_features, with_disparity=True, out=to_residual(self.vit.depth_features)
-        )
+        features = self.vit.depth_features
+        self.upsampler = dpt_head(config, features, with_disparity=True, out=to_residual(features))
 
     def add_scale(self, scale: int) -> None:
         """What turns the cost volume of `scale` (0 is the coarsest) into probabilities."""
@@ -256,6 +243,16 @@ class DepthPredictor(nn.Module):
         logits = self.depth_head[scale](refined + self.regressor_residual[scale](joined))
         probability = logits.softmax(1)
         return (probability * candidates).sum(1, keepdim=True), probability
+
+
+def dpt_head(
+    config: DepthConfig, features: int, with_disparity: bool, out: nn.Module | None = None
+) -> DptHead:
+    """A DPT head of `features` channels that fuses the maps of a `DepthPrediction`."""
+    vit = VITS[config.vit]
+    levels = LAYOUTS[config.upsample_factor, config.num_scales]
+    layout = [[name for name in names if with_disparity or name != "disparity"] for names in levels]
+    return DptHead(vit.channels, vit.widths, features, layout, CHANNELS, out)
 
 
 def to_residual(features: int) -> nn.Sequential:

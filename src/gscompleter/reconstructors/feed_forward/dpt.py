@@ -13,7 +13,7 @@ from gscompleter.reconstructors.feed_forward.resampling import resized
 
 VIT = "vit"
 """Stands, among the names of maps that are joined, for the transformer's own."""
-Layout = tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]
+Layout = Sequence[Sequence[str]]
 """Names of the maps that are joined at 1/2, 1/4 and 1/8 of full resolution, in this order."""
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.reconstructors.feed_forward.cameras import Cameras
-from gscompleter.types import View
+from gscompleter.types import Camera, View
 
 
 @dataclass(frozen=True)
@@ -47,75 +47,76 @@ class Crop:
         return (rows * width + torch.arange(self.width) + self.left).flatten()
 
 
-def central_crop(height: int, width: int, patch: int) -> Crop:
-    """The largest window about the centre whose sides are multiples of `patch`.
+def central_crops(cameras: Sequence[Camera], patch: int) -> list[Crop]:
+    """The largest windows of one size about the centres of all images, in whole patches.
+
+    Images of several sizes are not resized: where one view is wider than the others, as is the
+    target with its margin, the network sees as much of it as of the others.
 
     Raises:
-        InputError: where the image is smaller than one patch.
+        InputError: where an image is smaller than one patch.
     """
+    height = min(camera.height for camera in cameras)
+    width = min(camera.width for camera in cameras)
     if height < patch or width < patch:
         raise InputError(
-            f"The images have {height} x {width} pixels, and this model needs at least "
-            f"{patch} x {patch}; use larger ones."
+            f"All images have {height} x {width} pixels in common, and this model needs at "
+            f"least {patch} x {patch}; use larger ones."
         )
-    h, w = height // patch * patch, width // patch * patch
-    return Crop((height - h) // 2, (width - w) // 2, h, w)
+    height, width = height // patch * patch, width // patch * patch
+    return [
+        Crop((camera.height - height) // 2, (camera.width - width) // 2, height, width)
+        for camera in cameras
+    ]
 
 
 def batch_of(
     views: Sequence[View], patch: int, near: float, far: float
-) -> tuple[Float[Tensor, "1 v 3 h w"], Cameras, Crop]:
-    """`views` as a batch of one scene, cropped about the centre to whole patches.
+) -> tuple[Float[Tensor, "1 v 3 h w"], Cameras, list[Crop]]:
+    """`views` as a batch of one scene, and the windows of them that it holds.
 
     Args:
-        views: At least two, of one size.
-        patch: Sides of the crop are multiples of it, in pixels.
+        views: At least two.
+        patch: Sides of the windows are multiples of it, in pixels.
         near: Smallest z-depth, for cameras that know none.
         far: Largest z-depth, for cameras that know none.
 
     Raises:
-        InputError: fewer than two views, views of several sizes, images smaller than one patch,
-            an empty depth range.
+        InputError: fewer than two views, images smaller than one patch, an empty depth range.
     """
     if len(views) < 2:
         raise InputError(
             f"{len(views)} view was given, and the model matches at least 2; name more frames."
         )
-    sizes = {(view.camera.height, view.camera.width) for view in views}
-    if len(sizes) > 1:
-        listed = " and ".join(f"{height} x {width}" for height, width in sorted(sizes))
-        raise InputError(
-            f"The views have {listed} pixels, and the model takes views of one size; "
-            "give a --resolution."
-        )
-    crop = central_crop(*sizes.pop(), patch)
-    ranges = [depth_range(view, near, far) for view in views]
-    images = torch.stack([view.image[crop.rows, crop.columns].movedim(-1, 0) for view in views])
+    crops = central_crops([view.camera for view in views], patch)
+    pairs = list(zip(views, crops, strict=True))
+    ranges = [depth_range(view.camera, near, far) for view in views]
+    images = torch.stack([v.image[c.rows, c.columns].movedim(-1, 0) for v, c in pairs])
     cameras = Cameras(
         c2w=torch.stack([view.camera.c2w for view in views])[None].float(),
-        K=torch.stack([cropped_intrinsics(view, crop) for view in views])[None],
+        K=torch.stack([cropped_intrinsics(v.camera, c) for v, c in pairs])[None],
         near=images.new_tensor([[low for low, _ in ranges]]),
         far=images.new_tensor([[high for _, high in ranges]]),
     )
-    return images[None], cameras, crop
+    return images[None], cameras, crops
 
 
-def cropped_intrinsics(view: View, crop: Crop) -> Float[Tensor, "3 3"]:
+def cropped_intrinsics(camera: Camera, crop: Crop) -> Float[Tensor, "3 3"]:
     """Intrinsics of the crop, in its widths and heights.
 
     The principal point keeps its place in the image. The authors' loaders leave (cx, cy) as
     they are, which is the same where it lies at the centre, as it does in their data.
     """
-    K = view.camera.K.float().clone()
+    K = camera.K.float().clone()
     K[0, 2] -= crop.left
     K[1, 2] -= crop.top
     return K / K.new_tensor([crop.width, crop.height, 1])[:, None]
 
 
-def depth_range(view: View, near: float, far: float) -> tuple[float, float]:
-    """Near and far z-depth of a view: as its camera knows them, else `near` and `far`."""
-    low = near if view.camera.near is None else view.camera.near
-    high = far if view.camera.far is None else view.camera.far
+def depth_range(camera: Camera, near: float, far: float) -> tuple[float, float]:
+    """Near and far z-depth of a view: as `camera` knows them, else `near` and `far`."""
+    low = near if camera.near is None else camera.near
+    high = far if camera.far is None else camera.far
     if not 0 < low < high:
         raise InputError(
             f"The depth range {low:g} to {high:g} is empty; near must be positive and less than "

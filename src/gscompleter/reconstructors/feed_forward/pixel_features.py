@@ -12,6 +12,7 @@ from gscompleter.reconstructors.feed_forward.depth_predictor import (
     VITS,
     DepthConfig,
     DepthPredictor,
+    dpt_head,
 )
 from gscompleter.reconstructors.feed_forward.unet import conv3x3
 
@@ -32,7 +33,7 @@ class PixelFeatures(nn.Module):
         features = VITS[config.vit].gaussian_features
         self.channels = REGRESSED + 3 + features + 1
         self.depth_predictor = DepthPredictor(config)
-        self.feature_upsampler = config.head(features, with_disparity=False)
+        self.feature_upsampler = dpt_head(config, features, with_disparity=False)
         self.gaussian_regressor = nn.Sequential(
             conv3x3(features + 5, REGRESSED), nn.GELU(), conv3x3(REGRESSED, REGRESSED)
         )

@@ -55,27 +55,26 @@ class FeedForward:
         """A Gaussian for each pixel that the network sees (VolSplat: for each voxel that holds
         such a pixel, without a note of which), and z-depths per view.
 
-        Images are cropped about the centre to multiples of 16 or 64 pixels; outside of the crop
-        depths are not valid.
+        Images are cropped about their centres to one size, in multiples of 16 or 64 pixels;
+        outside of the crop depths are not valid.
 
         Raises:
-            InputError: fewer than two views, views of several sizes, images smaller than one
-                patch, an empty depth range; for VolSplat, poses or depths that spread its voxels
-                too widely to be counted.
+            InputError: fewer than two views, images smaller than one patch, an empty depth range;
+                for VolSplat, poses or depths that spread its voxels too widely to be counted.
         """
         config = self.network.config
-        images, cameras, crop = batch_of(views, config.patch, config.near, config.far)
+        images, cameras, crops = batch_of(views, config.patch, config.near, config.far)
         lower = torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32)
         # Not torch.inference_mode: the stages that follow optimise what comes from here.
         with torch.no_grad(), lower:
             predicted = self.network(images.to(self.device), cameras.to(self.device))
         if isinstance(predicted, VoxelGaussians):
-            return reconstruction_of_voxels(predicted, views, crop)
-        return reconstruction_of(predicted, views, crop)
+            return reconstruction_of_voxels(predicted, views, crops)
+        return reconstruction_of(predicted, views, crops)
 
 
 def reconstruction_of(
-    predicted: PixelGaussians, views: Sequence[View], crop: Crop
+    predicted: PixelGaussians, views: Sequence[View], crops: Sequence[Crop]
 ) -> Reconstruction:
     """The only scene of a batch, on the device of its views.
 
@@ -83,12 +82,11 @@ def reconstruction_of(
     """
     device = views[0].image.device
     gaussians = gaussians_of(predicted).to(device)
-    per_view = crop.height * crop.width
-    depths = [
-        depth_map_of(means, view, crop)
-        for means, view in zip(gaussians.means.split(per_view), views, strict=True)
-    ]
-    pixels = [crop.pixel_index(view.camera.width) for view in views]
+    per_view = crops[0].height * crops[0].width
+    means = gaussians.means.split(per_view)
+    pairs = list(zip(views, crops, strict=True))
+    depths = [depth_map_of(own, view, crop) for own, (view, crop) in zip(means, pairs, strict=True)]
+    pixels = [crop.pixel_index(view.camera.width) for view, crop in pairs]
     return Reconstruction(
         gaussians,
         tuple(depths),
@@ -98,7 +96,7 @@ def reconstruction_of(
 
 
 def reconstruction_of_voxels(
-    predicted: VoxelGaussians, views: Sequence[View], crop: Crop
+    predicted: VoxelGaussians, views: Sequence[View], crops: Sequence[Crop]
 ) -> Reconstruction:
     """The scene on the device of its views; its Gaussians belong to no particular pixel."""
     device = views[0].image.device
@@ -107,7 +105,7 @@ def reconstruction_of_voxels(
     )
     depths = [
         DepthMap(*crop.padded(depth, view.camera.height, view.camera.width))
-        for depth, view in zip(predicted.depth.to(device), views, strict=True)
+        for depth, view, crop in zip(predicted.depth.to(device), views, crops, strict=True)
     ]
     return Reconstruction(gaussians.to(device), tuple(depths))
 
