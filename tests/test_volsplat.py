@@ -13,7 +13,7 @@ from gscompleter.geometry import inside, project
 from gscompleter.reconstructors.feed_forward import FeedForward, VolSplat, VolSplatConfig
 from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
 from gscompleter.reconstructors.feed_forward.inputs import batch_of
-from gscompleter.reconstructors.feed_forward.volsplat import REACH
+from gscompleter.reconstructors.feed_forward.volsplat import REACH, VoxelGaussians
 from gscompleter.stages.anchor import lift
 from gscompleter.types import SH_C0, View
 from scenes import Room, camera_at, view_of
@@ -71,10 +71,27 @@ def test_voxels_of_the_published_size_agree_with_the_authors_code(shared):
     check(Case.load(shared / "fixtures" / "volsplat" / "v2_64x64_vox0.001.npz"))
 
 
-def test_a_gaussian_lies_within_reach_of_its_voxel():
+def predict(network: VolSplat) -> VoxelGaussians:
     images, cameras, _ = batch_of(photographs(), SMALL.patch, SMALL.near, SMALL.far)
     with torch.no_grad():
-        predicted = random_network()(images, cameras)
+        return network(images, cameras)
+
+
+def test_weights_can_be_assigned_to_a_network_that_was_built_without_any():
+    given = random_network()
+    with torch.device("meta"):
+        empty = VolSplat(SMALL)
+    empty.load_state_dict(given.state_dict(), strict=True, assign=True)
+    assert torch.equal(predict(empty.eval()).means, predict(given).means)
+
+
+@pytest.mark.parametrize("lower_precision", [False, True])
+def test_a_gaussian_lies_within_reach_of_its_voxel(lower_precision):
+    with torch.autocast("cpu", torch.bfloat16, enabled=lower_precision):
+        predicted = predict(random_network())
+    for field in ("depth", "means", "quats", "scales", "opacities", "sh"):
+        assert getattr(predicted, field).dtype == torch.float32
+        assert getattr(predicted, field).isfinite().all()
     centers = predicted.grid.coordinates[:, 1:] * SMALL.voxel_resolution
     away = (predicted.means - centers).abs().max().item() / SMALL.voxel_resolution
     assert 0.5 < away < 0.5 + REACH + 1e-3
@@ -116,9 +133,7 @@ def test_a_reconstruction_of_voxels_names_no_pixels_and_has_depths_within_the_cr
 def test_the_depth_maps_are_those_of_the_voxels():
     """Unprojected, each pixel lies in a voxel that has a Gaussian."""
     views = photographs()
-    images, cameras, _ = batch_of(views, SMALL.patch, SMALL.near, SMALL.far)
-    with torch.no_grad():
-        predicted = random_network()(images, cameras)
+    predicted = predict(random_network())
     occupied = {tuple(row) for row in predicted.grid.coordinates[:, 1:].tolist()}
     found = 0
     for view, depth in zip(views, predicted.depth, strict=True):
