@@ -8,7 +8,10 @@ from gscompleter.geometry import (
     distance_from_depth,
     inside,
     project,
+    quats_from,
+    quats_product,
     rotation_between,
+    rotations_from,
     same_camera,
     sample,
     unproject,
@@ -77,3 +80,21 @@ def test_the_synthetic_room_shows_the_same_colour_from_everywhere():
     difference = (sample(image_b, pixels) - image_a).abs().mean(-1)[agrees]
     assert agrees.float().mean() > 0.5
     assert difference.median() < 0.02
+
+
+def test_a_rotation_is_its_quaternion():
+    """Half turns, whose quaternions have a first component of 0, and any others."""
+    half_turns = torch.eye(4)[1:]
+    others = torch.randn(20, 4, generator=torch.Generator().manual_seed(0))
+    rotations = rotations_from(torch.cat([half_turns, others]))
+    quats = quats_from(rotations)
+    assert torch.allclose(quats.norm(dim=-1), torch.ones(23))
+    assert torch.allclose(rotations_from(quats), rotations, atol=1e-6)
+
+
+def test_a_product_of_quaternions_turns_by_the_second_and_then_by_the_first():
+    first, second = torch.randn(2, 5, 4, generator=torch.Generator().manual_seed(0))
+    turned = rotations_from(quats_product(first, second))
+    assert torch.allclose(turned, rotations_from(first) @ rotations_from(second), atol=1e-6)
+    one_after_all = quats_product(first[0], second)
+    assert torch.allclose(one_after_all, quats_product(first[:1].expand(5, 4), second))

@@ -112,3 +112,38 @@ def rotations_from(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
         torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=-1),
     ]
     return torch.stack(rows, dim=-2)
+
+
+def quats_from(rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
+    """Unit wxyz quaternions of rotation matrices, by the largest of the four components."""
+    r = rotations.flatten(-2).unbind(-1)
+    w, x = 1 + r[0] + r[4] + r[8], 1 + r[0] - r[4] - r[8]
+    y, z = 1 - r[0] + r[4] - r[8], 1 - r[0] - r[4] + r[8]
+    a, b, c = r[7] - r[5], r[2] - r[6], r[3] - r[1]
+    d, e, f = r[3] + r[1], r[2] + r[6], r[7] + r[5]
+    candidates = torch.stack(
+        [
+            torch.stack([w, a, b, c], dim=-1),
+            torch.stack([a, x, d, e], dim=-1),
+            torch.stack([b, d, y, f], dim=-1),
+            torch.stack([c, e, f, z], dim=-1),
+        ],
+        dim=-2,
+    )
+    largest = torch.stack([w, x, y, z], dim=-1).argmax(-1)
+    best = candidates.take_along_dim(largest[..., None, None], dim=-2)[..., 0, :]
+    return torch.nn.functional.normalize(best, dim=-1)
+
+
+def quats_product(
+    after: Float[Tensor, "*#n 4"], before: Float[Tensor, "*#n 4"]
+) -> Float[Tensor, "*n 4"]:
+    """wxyz quaternions of the rotations `before` followed by the rotations `after`."""
+    w, x, y, z = after.unbind(-1)
+    rows = [
+        torch.stack([w, -x, -y, -z], dim=-1),
+        torch.stack([x, w, -z, y], dim=-1),
+        torch.stack([y, z, w, -x], dim=-1),
+        torch.stack([z, -y, x, w], dim=-1),
+    ]
+    return (torch.stack(rows, dim=-2) @ before[..., None])[..., 0]

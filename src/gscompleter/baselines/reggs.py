@@ -22,7 +22,7 @@ from gscompleter.baselines.mixture_wasserstein import (
     mixture_wasserstein,
     reduced,
 )
-from gscompleter.geometry import rotations_from
+from gscompleter.geometry import quats_product, rotations_from
 from gscompleter.progress import track
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, View
@@ -151,7 +151,7 @@ def carried(scene: Gaussians, fit: Similarity) -> Gaussians:
     """The scene, turned and moved towards the lifted Gaussians; differentiable in `fit`."""
     unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
     means = scene.means @ fit.rotation.T + fit.translation
-    return replace(scene, means=means, quats=multiplied(unit, scene.quats), encoded=None)
+    return replace(scene, means=means, quats=quats_product(unit, scene.quats), encoded=None)
 
 
 def into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
@@ -162,7 +162,7 @@ def into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
     return replace(
         lifted,
         means=(means - fit.translation) @ fit.rotation,
-        quats=multiplied(back, lifted.quats),
+        quats=quats_product(back, lifted.quats),
         scales=lifted.scales * fit.scale,
         encoded=None,
     )
@@ -199,19 +199,3 @@ def turned(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
         rotation @ mixture.covariances @ rotation.T,
         mixture.weights,
     )
-
-
-def multiplied(
-    first: Float[Tensor, "4"], quaternions: Float[Tensor, "n 4"]
-) -> Float[Tensor, "n 4"]:
-    """wxyz products first * q: the rotation q, then `first`."""
-    w, x, y, z = first.unbind()
-    matrix = torch.stack(
-        [
-            torch.stack([w, -x, -y, -z]),
-            torch.stack([x, w, -z, y]),
-            torch.stack([y, z, w, -x]),
-            torch.stack([z, -y, x, w]),
-        ]
-    )
-    return quaternions @ matrix.T

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.geometry import quats_from
 from gscompleter.types import Gaussians, View, observed, sh_from_rgb
 
 
@@ -60,39 +61,11 @@ def discs(
     )
     return observed(
         means=means,
-        quats=quaternions(axes),
+        quats=quats_from(axes),
         scales=sizes * (config.sigma * pixel)[:, None],
         opacities=opacity.reshape(-1),
         sh=sh_from_rgb(view.image.reshape(-1, 3)),
     )
-
-
-def quaternions(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
-    """wxyz quaternions of rotation matrices, by the largest of the four components."""
-    r = rotations
-    squares = torch.stack(
-        [
-            1 + r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2],
-            1 + r[:, 0, 0] - r[:, 1, 1] - r[:, 2, 2],
-            1 - r[:, 0, 0] + r[:, 1, 1] - r[:, 2, 2],
-            1 - r[:, 0, 0] - r[:, 1, 1] + r[:, 2, 2],
-        ],
-        dim=-1,
-    )
-    a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
-    d, e, f = r[:, 1, 0] + r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 2, 1] + r[:, 1, 2]
-    w, x, y, z = squares.unbind(-1)
-    candidates = torch.stack(
-        [
-            torch.stack([w, a, b, c], -1),
-            torch.stack([a, x, d, e], -1),
-            torch.stack([b, d, y, f], -1),
-            torch.stack([c, e, f, z], -1),
-        ],
-        dim=1,
-    )
-    best = candidates[torch.arange(len(r)), squares.argmax(-1)]
-    return torch.nn.functional.normalize(best, dim=-1)
 
 
 def normals_of(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w 3"]:

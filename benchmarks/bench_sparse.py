@@ -1,0 +1,116 @@
+"""The sparse U-Net of VolSplat against the same network on a dense grid, as a ratio.
+
+    python benchmarks/bench_sparse.py [--size 256] [--dense-cells 64]
+
+Two photographs of `size` x `size` pixels make a voxel of most pixels. At the resolution of the
+published model the box around them has billions of cells, which no dense convolution can hold. The
+dense network, torch's `conv3d` and `conv_transpose3d`, gets a box of `dense_cells` cells a side
+around coarser voxels of the same points, and the sparse network the same coarser voxels.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+import tyro
+from torch import Tensor
+
+from gscompleter.reconstructors.feed_forward.sparse import Grid, SparseConv, hierarchy_over
+from gscompleter.reconstructors.feed_forward.sparse_unet import SparseUNet
+from gscompleter.reconstructors.feed_forward.voxels import voxelize
+
+CHANNELS = 164
+RESOLUTION = 0.001
+"""Of the published model, in scene units."""
+
+
+def best_seconds(function: Callable[[], object], runs: int = 3) -> float:
+    """The fastest of `runs`."""
+    seconds = []
+    for _ in range(runs):
+        start = time.perf_counter()
+        function()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
+def points_of_two_views(size: int) -> Tensor:
+    """A point per pixel of two cameras beside each other, on wavy surfaces 2 to 6 units away."""
+    place = (torch.arange(size) + 0.5) / size - 0.5
+    y, x = torch.meshgrid(place, place, indexing="ij")
+    rays = torch.stack([x, y, torch.full_like(x, 0.9)], dim=-1) / 0.9
+    depth = 4 + 2 * torch.sin(6 * x) * torch.cos(5 * y)
+    left, right = depth[..., None] * rays, 1.01 * depth[..., None] * rays
+    return torch.cat([left.reshape(-1, 3), right.reshape(-1, 3) + torch.tensor([0.2, 0.0, 0.0])])
+
+
+def dense_kernel(conv: SparseConv) -> Tensor:
+    """[27, in, out] with x fastest as [out, in, x, y, z]."""
+    kernel = conv.kernel
+    return kernel.unflatten(0, (3, 3, 3)).permute(4, 3, 2, 1, 0).contiguous()
+
+
+def dense_unet(network: SparseUNet, features: Tensor) -> Tensor:
+    """The convolutions of `network` on every cell of a box [1, c, x, y, z]."""
+    x, encoded = features, []
+    for encoder in network.encoders:
+        x = F.conv3d(x, dense_kernel(encoder.conv), stride=2, padding=1).relu_()
+        encoded.append(x)
+    x = F.conv3d(x, dense_kernel(network.bottleneck[0].conv), stride=2, padding=1).relu_()
+    x = F.conv3d(x, dense_kernel(network.bottleneck[1].conv), padding=1).relu_()
+    for up, join in network.decoder_blocks:
+        x = torch.cat([doubled(x, up.upconv), encoded.pop()], dim=1)
+        x = F.conv3d(x, join.kernel.T[..., None, None, None])
+    return doubled(x, network.final_upsample.upconv)
+
+
+def doubled(features: Tensor, conv: SparseConv) -> Tensor:
+    """A transposed convolution of stride 2 on a box."""
+    kernel = dense_kernel(conv).transpose(0, 1)
+    return F.conv_transpose3d(features, kernel, stride=2, padding=1, output_padding=1).relu_()
+
+
+def in_box(features: Tensor, grid: Grid, cells: int) -> Tensor:
+    """The features in a box [1, c, cells, cells, cells] of zeros."""
+    box = features.new_zeros((cells, cells, cells, features.shape[1]))
+    x, y, z = (grid.coordinates - grid.coordinates.amin(dim=0))[:, 1:].unbind(1)
+    box[x, y, z] = features
+    return box.permute(3, 0, 1, 2)[None]
+
+
+@torch.inference_mode()
+def main(size: int = 256, dense_cells: int = 64) -> None:
+    """Print the table.
+
+    Args:
+        size: Side of the two photographs, in pixels.
+        dense_cells: Side of the box of the dense network, a multiple of 16.
+    """
+    torch.manual_seed(0)
+    points = points_of_two_views(size)
+    features = torch.rand(len(points), CHANNELS)
+    network = SparseUNet(CHANNELS).eval()
+
+    fine = voxelize(points, features, RESOLUTION)
+    tables = best_seconds(lambda: hierarchy_over(fine.grid, 4))
+    whole = best_seconds(lambda: network(fine.features, fine.grid), runs=2)
+    print(f"voxels of {RESOLUTION:g}: {len(fine.grid):,}")
+    print(f"  tables of neighbours {tables:8.2f} s, {100 * tables / whole:.0f} % of the network")
+    print(f"  sparse network       {whole:8.2f} s")
+
+    extent = (points.amax(dim=0) - points.amin(dim=0)).max().item()
+    coarse = voxelize(points, features, extent / (dense_cells - 2))
+    sparse = best_seconds(lambda: network(coarse.features, coarse.grid))
+    box = in_box(coarse.features, coarse.grid, dense_cells)
+    dense = best_seconds(lambda: dense_unet(network, box), runs=2)
+    share = 100 * len(coarse.grid) / dense_cells**3
+    print(f"a box of {dense_cells}³ cells, of which {len(coarse.grid):,} ({share:.1f} %) occupied")
+    print(f"  sparse network       {sparse:8.2f} s")
+    print(f"  dense network        {dense:8.2f} s, {dense / sparse:.1f} x the sparse one")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

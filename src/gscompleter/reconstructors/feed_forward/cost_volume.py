@@ -1,0 +1,100 @@
+"""How well the features of each view match those of its sources at candidate depths."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gscompleter.reconstructors.feed_forward.cameras import Cameras, full_precision
+
+MIN_DEPTH = 1e-3
+"""Points less far in front of a source, or behind it, are projected as if they were there."""
+
+
+def evenly_spaced(
+    first: Float[Tensor, "n 1 h w"], last: Float[Tensor, "n 1 h w"], number: int
+) -> Float[Tensor, "n {number} h w"]:
+    """`number` candidates for each pixel, from the `first` to the `last`."""
+    steps = torch.linspace(0, 1, number, device=first.device)[:, None, None]
+    return first + steps * (last - first)
+
+
+def cost_volume(
+    features: Float[Tensor, "n c h w"],
+    cameras: Cameras,
+    sources: Int[Tensor, "b v s"],
+    inverse_depths: Float[Tensor, "n d _ _"],
+    depth_chunk: int,
+) -> Float[Tensor, "n d h w"]:
+    """Scaled dot products of the features of n = b v views with those they would have if each
+    pixel lay at each candidate depth, averaged over the sources of a view.
+
+    Args:
+        features: Of all views, the views of a scene one after the other.
+        cameras: Of all views.
+        sources: The views that each is compared with.
+        inverse_depths: Candidates for each view, or for each of its pixels.
+        depth_chunk: Candidates that are compared at a time, which bounds the memory.
+    """
+    n, _, h, w = features.shape
+    K = cameras.intrinsics(h, w).flatten(0, 1)
+    transforms = cameras.transforms_to(sources).flatten(0, 1)
+    depths = (1 / inverse_depths).expand(n, -1, h, w)
+    first = torch.arange(len(sources), device=sources.device)[:, None, None] * sources.shape[1]
+    numbers = (first + sources).flatten(0, 1).tolist()
+    volumes = []
+    for view in range(n):
+        chunks = []
+        for chunk in depths[view].split(depth_chunk):
+            matches = [
+                correlation(features[view], features[source], K[view], transform, chunk)
+                for source, transform in zip(numbers[view], transforms[view], strict=True)
+            ]
+            chunks.append(torch.stack(matches).mean(0))
+        volumes.append(torch.cat(chunks))
+    return torch.stack(volumes)
+
+
+def correlation(
+    reference: Float[Tensor, "c h w"],
+    source: Float[Tensor, "c h w"],
+    K: Float[Tensor, "3 3"],
+    source_from_reference: Float[Tensor, "4 4"],
+    depths: Float[Tensor, "d h w"],
+) -> Float[Tensor, "d h w"]:
+    """Dot products of the reference with the source as sampled at `depths` of the reference,
+    over the square root of the number of channels; 0 outside of the source."""
+    grid = sampling_grid(K, source_from_reference, depths)
+    sampled = F.grid_sample(
+        source[None], grid.flatten(0, 1)[None], mode="bilinear", align_corners=True
+    )
+    return (reference[:, None] * sampled[0].unflatten(1, depths.shape[:2])).sum(0) / (
+        len(reference) ** 0.5
+    )
+
+
+def sampling_grid(
+    K: Float[Tensor, "3 3"],
+    source_from_reference: Float[Tensor, "4 4"],
+    depths: Float[Tensor, "d h w"],
+) -> Float[Tensor, "d h w 2"]:
+    """Where the pixels of the reference at `depths` lie in the source: -1 is the centre of its
+    first, 1 of its last column or row.
+
+    As the models were trained, centres of pixels have integer coordinates here, and `K` of the
+    reference serves for both views.
+    """
+    _, h, w = depths.shape
+    with full_precision(K):
+        x, y = torch.arange(w, device=K.device), torch.arange(h, device=K.device)
+        columns, rows = torch.meshgrid(x, y, indexing="xy")
+        pixels = torch.stack([columns, rows, torch.ones_like(rows)]).flatten(1).to(K)
+        rays = source_from_reference[:3, :3] @ torch.linalg.inv(K) @ pixels
+        shift = source_from_reference[:3, 3, None, None]
+        points = rays[:, None] * depths.flatten(1) + shift
+        image = (K @ points.flatten(1)).unflatten(1, depths.shape)
+        at = image[:2] / image[2:].clamp(min=MIN_DEPTH)
+        last = at.new_tensor([w - 1, h - 1]).view(2, 1, 1, 1)
+        return (2 * at / last - 1).permute(1, 2, 3, 0)

@@ -1,0 +1,282 @@
+"""The depth predictor of DepthSplat, which VolSplat shares: matching and monocular features.
+
+Modules carry the names of the published weights, so that these load as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from gscompleter.reconstructors.feed_forward.cameras import Cameras, nearest_views, other_views
+from gscompleter.reconstructors.feed_forward.cnn import ImageEncoder, normalised
+from gscompleter.reconstructors.feed_forward.cost_volume import cost_volume, evenly_spaced
+from gscompleter.reconstructors.feed_forward.dino import PATCH, DinoV2
+from gscompleter.reconstructors.feed_forward.dpt import DptHead, Layout, padded_conv3x3
+from gscompleter.reconstructors.feed_forward.resampling import enlarged, resized
+from gscompleter.reconstructors.feed_forward.transformer import MultiViewTransformer
+from gscompleter.reconstructors.feed_forward.unet import Steps, UNet, conv3x3
+
+MAX_SOURCES = 2
+"""Of more than three views each is matched with the two nearest, else with all others."""
+
+
+@dataclass(frozen=True)
+class Vit:
+    """Sizes that come with a vision transformer."""
+
+    channels: int
+    num_blocks: int
+    heads: int
+    tapped: tuple[int, int, int, int]
+    """Blocks whose features are used."""
+    widths: tuple[int, int, int, int]
+    """Channels of the four levels of the DPT heads, finest first."""
+    depth_features: int
+    """Channels of the DPT head that refines depth."""
+    gaussian_features: int
+    """Channels of the DPT head whose features become Gaussians."""
+
+
+VITS = {
+    "vits": Vit(384, 12, 6, (2, 5, 8, 11), (48, 96, 192, 384), 32, 64),
+    "vitb": Vit(768, 12, 12, (2, 5, 8, 11), (96, 192, 384, 768), 48, 96),
+    "vitl": Vit(1024, 24, 16, (4, 11, 17, 23), (128, 256, 512, 1024), 64, 128),
+}
+
+CHANNELS = {"cnn0": 64, "cnn1": 96, "cnn2": 128, "matching0": 128, "matching1": 64, "disparity": 1}
+"""Of the maps that DPT heads join: of the encoder (finest first), of the transformer (coarsest
+first), and the inverse depth."""
+LAYOUTS: Mapping[tuple[int, int], Layout] = {
+    (4, 1): (("cnn0", "cnn1", "vit"), ("cnn2", "vit", "matching0", "disparity"), ("vit",)),
+    (2, 2): (
+        ("cnn0", "cnn1", "matching1", "disparity", "vit"),
+        ("cnn2", "vit", "matching0"),
+        ("vit",),
+    ),
+    (4, 2): (
+        ("cnn0", "vit"),
+        ("cnn1", "vit", "matching1", "disparity"),
+        ("cnn2", "vit", "matching0"),
+    ),
+    (8, 1): (("cnn0", "vit"), ("cnn1", "vit"), ("cnn2", "vit", "matching0", "disparity")),
+}
+"""By upsampling factor and number of scales, what is joined at 1/2, 1/4 and 1/8 of full size."""
+
+
+@dataclass(frozen=True)
+class DepthConfig:
+    vit: Literal["vits", "vitb", "vitl"] = "vits"
+    """Size of the vision transformer."""
+    num_scales: Literal[1, 2] = 1
+    """Resolutions at which views are matched, each twice the one before."""
+    upsample_factor: Literal[2, 4, 8] = 4
+    """From the finest matched resolution to the full one."""
+    lowest_feature_resolution: Literal[4, 8] = 4
+    """Full resolution over that of the coarsest features."""
+    num_candidates: int = 128
+    """Inverse depths that are compared at the coarsest resolution; the next has a quarter."""
+    depth_chunk: int = 16
+    """Depths that are compared at a time; fewer need less memory and give the same."""
+
+    @property
+    def patch(self) -> int:
+        """Sides of the images must be multiples of it, in pixels."""
+        return 16 if self.lowest_feature_resolution == 4 else 64
+
+
+@dataclass(frozen=True)
+class DepthPrediction:
+    """What is known of n = b v views, the views of a scene one after the other."""
+
+    depth: Float[Tensor, "n 1 h w"]
+    """z-depth in scene units."""
+    certainty: Float[Tensor, "n 1 p q"]
+    """Probability of the best candidate, at the finest matched resolution."""
+    maps: Mapping[str, Float[Tensor, "n _ _ _"]]
+    """Features that DPT heads join, by name."""
+    vit_maps: list[Float[Tensor, "n _ _ _"]]
+    """Features of the vision transformer, at 1/8 of full resolution."""
+
+
+class Pyramid(nn.Module):
+    """A map, and another of twice the resolution with half the channels."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        half = channels // 2
+        finer = nn.Sequential(
+            nn.ConvTranspose2d(channels, half, 2, 2), nn.GELU(), conv3x3(half, half)
+        )
+        self.stages = nn.ModuleList([nn.Identity(), finer])
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> list[Float[Tensor, "n _ _ _"]]:
+        return [stage(x) for stage in self.stages]
+
+
+class DepthPredictor(nn.Module):
+    """Depth from cost volumes and monocular features, coarse to fine."""
+
+    def __init__(self, config: DepthConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.vit = VITS[config.vit]
+        self.backbone = ImageEncoder(1 if config.lowest_feature_resolution == 4 else 2, 2)
+        self.transformer = MultiViewTransformer()
+        self.pretrained = DinoV2(self.vit.channels, self.vit.num_blocks, self.vit.heads)
+        if config.num_scales == 2:
+            self.mv_pyramid = Pyramid(128)
+            self.mono_pyramid = Pyramid(self.vit.channels)
+        self.regressor = nn.ModuleList()
+        self.regressor_residual = nn.ModuleList()
+        self.depth_head = nn.ModuleList()
+        for scale in range(config.num_scales):
+            self.add_scale(scale)
+        features = self.vit.depth_features
+        self.upsampler = dpt_head(config, features, with_disparity=True, out=to_residual(features))
+
+    def add_scale(self, scale: int) -> None:
+        """What turns the cost volume of `scale` (0 is the coarsest) into probabilities."""
+        width, candidates = 128 // 2**scale, self.config.num_candidates // 4**scale
+        of_image, of_vit = CHANNELS[f"cnn{2 - scale}"], self.vit.channels // 2**scale
+        channels = candidates + of_image + width + of_vit
+        unet = UNet(width, levels=3 + scale, attention_level=2 + scale, pre_norm=True)
+        self.regressor.append(
+            Steps(
+                [
+                    conv3x3(channels, width),
+                    nn.GroupNorm(8, width),
+                    nn.GELU(),
+                    unet,
+                    conv3x3(width, width),
+                ]
+            )
+        )
+        self.regressor_residual.append(nn.Conv2d(channels, width, 1))
+        self.depth_head.append(
+            nn.Sequential(
+                padded_conv3x3(width, 2 * width),
+                nn.GELU(),
+                padded_conv3x3(2 * width, candidates),
+            )
+        )
+
+    def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> DepthPrediction:
+        """Depth and features of at least two views in [0, 1], their sides multiples of `patch`."""
+        b, v = images.shape[:2]
+        sources = (
+            nearest_views(cameras, MAX_SOURCES)
+            if v > MAX_SOURCES + 1
+            else other_views(b, v, images.device)
+        )
+        flat = normalised(images.flatten(0, 1))
+        encoded = self.backbone(flat)
+        matching = self.matching_features(encoded[-1], sources)
+        vit_maps = self.vit_features(flat)
+        monocular = self.monocular_features(vit_maps[-1])
+
+        contexts = [
+            [encoded[2 - scale], matching[scale], monocular[scale]]
+            for scale in range(self.config.num_scales)
+        ]
+
+        low, high = cameras.inverse_range()
+        candidates = evenly_spaced(low, high, self.config.num_candidates)
+        disparity, probability = self.match(0, contexts[0], cameras, sources, candidates)
+        for scale in range(1, self.config.num_scales):
+            number = self.config.num_candidates // 4**scale
+            interval = (high - low) / (self.config.num_candidates - 1) / 2**scale
+            candidates = candidates_around(enlarged(disparity, 2), interval, number, low, high)
+            disparity, probability = self.match(
+                scale, contexts[scale], cameras, sources, candidates
+            )
+
+        maps = {f"cnn{i}": x for i, x in enumerate(encoded)}
+        maps |= {f"matching{i}": x for i, x in enumerate(matching)}
+        residual = self.upsampler(vit_maps, {**maps, "disparity": disparity})
+        full = enlarged(disparity, self.config.upsample_factor) + residual
+        certainty = probability.amax(1, keepdim=True)
+        return DepthPrediction(1 / full.clamp(low, high), certainty, maps, vit_maps)
+
+    def matching_features(
+        self, encoded: Float[Tensor, "n 128 h w"], sources: Int[Tensor, "b v s"]
+    ) -> list[Float[Tensor, "n _ _ _"]]:
+        """Features to match views by, at each scale."""
+        informed = self.transformer(encoded, sources)
+        return self.mv_pyramid(informed) if self.config.num_scales == 2 else [informed]
+
+    def vit_features(self, images: Float[Tensor, "n 3 h w"]) -> list[Float[Tensor, "n c p q"]]:
+        """Features of four depths of the vision transformer, at 1/8 of full resolution."""
+        h, w = images.shape[2:]
+        patches = resized(images, (h // PATCH * PATCH, w // PATCH * PATCH))
+        return [resized(x, (h // 8, w // 8)) for x in self.pretrained(patches, self.vit.tapped)]
+
+    def monocular_features(
+        self, vit_map: Float[Tensor, "n c p q"]
+    ) -> list[Float[Tensor, "n _ _ _"]]:
+        """The deepest features of the vision transformer, at each scale."""
+        if self.config.lowest_feature_resolution == 4:
+            vit_map = enlarged(vit_map, 2)
+        return self.mono_pyramid(vit_map) if self.config.num_scales == 2 else [vit_map]
+
+    def match(
+        self,
+        scale: int,
+        context: list[Float[Tensor, "n _ h w"]],
+        cameras: Cameras,
+        sources: Int[Tensor, "b v s"],
+        candidates: Float[Tensor, "n d _ _"],
+    ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n d h w"]]:
+        """Expected inverse depth, and the probability of each candidate.
+
+        `context` are the features of the image, for matching, and of the vision transformer.
+        """
+        _, to_match, _ = context
+        costs = cost_volume(to_match, cameras, sources, candidates, self.config.depth_chunk)
+        joined = torch.cat([costs, *context], 1)
+        refined = self.regressor[scale](joined, sources.shape[1])
+        logits = self.depth_head[scale](refined + self.regressor_residual[scale](joined))
+        probability = logits.softmax(1)
+        return (probability * candidates).sum(1, keepdim=True), probability
+
+
+def dpt_head(
+    config: DepthConfig, features: int, with_disparity: bool, out: nn.Module | None = None
+) -> DptHead:
+    """A DPT head of `features` channels that fuses the maps of a `DepthPrediction`."""
+    vit = VITS[config.vit]
+    levels = LAYOUTS[config.upsample_factor, config.num_scales]
+    layout = [[name for name in names if with_disparity or name != "disparity"] for names in levels]
+    return DptHead(vit.channels, vit.widths, features, layout, CHANNELS, out)
+
+
+def to_residual(features: int) -> nn.Sequential:
+    """From the fused features of the DPT head to a correction of inverse depth."""
+    return nn.Sequential(
+        padded_conv3x3(features, features // 2),
+        nn.GELU(),
+        padded_conv3x3(features // 2, 16),
+        nn.GELU(),
+        nn.Conv2d(16, 1, 1),
+    )
+
+
+def candidates_around(
+    disparity: Float[Tensor, "n 1 h w"],
+    interval: Float[Tensor, "n 1 1 1"],
+    number: int,
+    low: Float[Tensor, "n 1 1 1"],
+    high: Float[Tensor, "n 1 1 1"],
+) -> Float[Tensor, "n {number} h w"]:
+    """Inverse depths about each pixel's own, `interval` apart, within `low` and `high`.
+
+    The ends are clamped, not the candidates: near the limits these lie closer together.
+    """
+    start = (disparity - number // 2 * interval).clamp(low, high)
+    stop = (disparity + (number // 2 - 1) * interval).clamp(low, high)
+    return evenly_spaced(start, stop, number)

@@ -1,0 +1,85 @@
+"""DepthSplat (Xu et al., CVPR 2025): Gaussians from cost volumes and monocular depth features.
+
+Modules carry the names of the published weights, so that these load as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.reconstructors.feed_forward.cameras import Cameras
+from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
+from gscompleter.reconstructors.feed_forward.dpt import padded_conv3x3
+from gscompleter.reconstructors.feed_forward.gaussian_adapter import (
+    DEPTHSPLAT_CHANNELS,
+    PixelGaussians,
+    depthsplat_gaussians,
+)
+from gscompleter.reconstructors.feed_forward.pixel_features import PixelFeatures
+
+
+@dataclass(frozen=True)
+class DepthSplatConfig:
+    depth: DepthConfig = DepthConfig()
+    """The depth predictor."""
+    image_size: tuple[int, int] = (256, 256)
+    """Height and width it was trained at, in pixels; others work too."""
+    near: float = 0.5
+    """Smallest z-depth, in scene units, where the camera knows none."""
+    far: float = 100.0
+    """Largest z-depth, in scene units, where the camera knows none."""
+    gaussian_scale_max: float = 3.0
+    """Largest standard deviation of a Gaussian, in scene units."""
+
+    @property
+    def patch(self) -> int:
+        """Sides of the images must be multiples of it, in pixels."""
+        return self.depth.patch
+
+
+SMALL = DepthConfig("vits", 1, 4, 4)
+BASE = DepthConfig("vitb", 2, 2, 4)
+LARGE = DepthConfig("vitl", 2, 2, 4)
+BASE_WIDE = DepthConfig("vitb", 2, 4, 8)
+SMALL_WIDE = DepthConfig("vits", 1, 8, 8)
+
+VARIANTS: Mapping[str, DepthSplatConfig] = {
+    "small-re10k-256x256": DepthSplatConfig(SMALL),
+    "base-re10k-256x256": DepthSplatConfig(BASE),
+    "large-re10k-256x256": DepthSplatConfig(LARGE),
+    "base-re10k-256x448": DepthSplatConfig(BASE_WIDE, (256, 448)),
+    "base-dl3dv-256x448": DepthSplatConfig(BASE_WIDE, (256, 448), far=200.0),
+    "small-re10kdl3dv-448x768": DepthSplatConfig(SMALL_WIDE, (448, 768), 0.5, 200.0, 0.1),
+    "base-re10kdl3dv-448x768": DepthSplatConfig(BASE_WIDE, (448, 768), 0.5, 200.0, 0.1),
+}
+"""The published ones, by size, data and resolution."""
+
+
+class DepthSplat(PixelFeatures):
+    """The whole network: 38 M (small), 121 M (base) or 354 M (large) parameters."""
+
+    def __init__(self, config: DepthSplatConfig = DepthSplatConfig()) -> None:
+        super().__init__(config.depth)
+        self.config = config
+        self.gaussian_head = nn.Sequential(
+            padded_conv3x3(self.channels, DEPTHSPLAT_CHANNELS),
+            nn.GELU(),
+            padded_conv3x3(DEPTHSPLAT_CHANNELS, DEPTHSPLAT_CHANNELS),
+        )
+
+    def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
+        """The Gaussians of all pixels.
+
+        Args:
+            images: In [0, 1], at least two views, with sides that are multiples of
+                `config.patch`.
+            cameras: Of the views.
+        """
+        depth, features = self.describe(images, cameras)
+        raw = self.gaussian_head(features)
+        flat = images.flatten(0, 1)
+        return depthsplat_gaussians(raw, depth, flat, cameras, self.config.gaussian_scale_max)

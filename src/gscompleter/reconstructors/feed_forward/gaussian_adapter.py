@@ -1,0 +1,151 @@
+"""From the raw channels of each pixel to its Gaussian in the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.geometry import quats_from, quats_product
+from gscompleter.reconstructors.feed_forward.cameras import Cameras, full_precision
+from gscompleter.reconstructors.feed_forward.spherical_harmonics import rotate_sh
+from gscompleter.types import SH_C0
+
+MVSPLAT_SH = 25
+"""Harmonics of MVSplat (degree 4), of which rasterisers of 3DGS show the first 16."""
+MVSPLAT_CHANNELS = 2 + 3 + 4 + 3 * MVSPLAT_SH
+"""Offset, scale, rotation, harmonics."""
+MVSPLAT_SCALES = (0.5, 15.0)
+"""Smallest and largest standard deviation, in tenths of (roughly twice) a pixel."""
+DEPTHSPLAT_SH = 9
+"""Harmonics of DepthSplat (degree 2)."""
+DEPTHSPLAT_CHANNELS = 1 + 2 + 3 + 4 + 3 * DEPTHSPLAT_SH
+"""Opacity, offset, scale, rotation, harmonics."""
+MIN_SCALE = 1e-10
+"""Smallest standard deviation of DepthSplat, in scene units."""
+
+
+@dataclass(frozen=True)
+class PixelGaussians:
+    """What a network makes of a batch: one Gaussian for each pixel of each view, in the world."""
+
+    depth: Float[Tensor, "b v h w"]
+    """As the network calls it: z-depth (DepthSplat) or distance along the ray (MVSplat)."""
+    means: Float[Tensor, "b v h w 3"]
+    quats: Float[Tensor, "b v h w 4"]
+    """Rotations as wxyz quaternions."""
+    scales: Float[Tensor, "b v h w 3"]
+    """Standard deviations along the rotated axes, in scene units."""
+    opacities: Float[Tensor, "b v h w"]
+    sh: Float[Tensor, "b v h w k 3"]
+    """Spherical harmonics in the basis of 3DGS."""
+
+
+def mvsplat_gaussians(
+    raw: Float[Tensor, "n 84 h w"],
+    distance: Float[Tensor, "n 1 h w"],
+    opacity: Float[Tensor, "n 1 h w"],
+    cameras: Cameras,
+) -> PixelGaussians:
+    """The Gaussians of MVSplat, which takes its depth for the distance along the unit ray.
+
+    Their size is a multiple of what a pixel covers at that distance.
+    """
+    offset, scale, rotation, sh = per_pixel(raw, cameras).split([2, 3, 4, 3 * MVSPLAT_SH], -1)
+    depth = per_pixel(distance, cameras)[..., 0]
+    h, w = depth.shape[2:]
+    with full_precision(raw):
+        focal_inverse = torch.linalg.inv(cameras.K[..., :2, :2])
+        pixel = 0.1 * (focal_inverse @ raw.new_tensor([1 / w, 1 / h]).float()).sum(-1)
+    low, high = MVSPLAT_SCALES
+    footprint = pixel[..., None, None] * depth
+    return in_world(
+        F.normalize(z_rays(offset, cameras), dim=-1),
+        depth,
+        rotation,
+        (low + (high - low) * scale.sigmoid()) * footprint[..., None],
+        per_pixel(opacity, cameras)[..., 0],
+        damped(sh),
+        cameras,
+    )
+
+
+def depthsplat_gaussians(
+    raw: Float[Tensor, "n 37 h w"],
+    z_depth: Float[Tensor, "n 1 h w"],
+    images: Float[Tensor, "n 3 h w"],
+    cameras: Cameras,
+    max_scale: float,
+) -> PixelGaussians:
+    """The Gaussians of DepthSplat, at z-depth.
+
+    Their size is in scene units, up to `max_scale`. Their colour starts from that of the pixel.
+    """
+    opacity, offset, scale, rotation, sh = per_pixel(raw, cameras).split(
+        [1, 2, 3, 4, 3 * DEPTHSPLAT_SH], -1
+    )
+    coefficients = damped(sh)
+    colour = (per_pixel(images, cameras) - 0.5) / SH_C0
+    constant = coefficients[..., :1, :] + colour[..., None, :]
+    return in_world(
+        z_rays(offset, cameras),
+        per_pixel(z_depth, cameras)[..., 0],
+        rotation,
+        F.softplus(scale - 4).clamp(MIN_SCALE, max_scale),
+        opacity[..., 0].sigmoid(),
+        torch.cat([constant, coefficients[..., 1:, :]], dim=-2),
+        cameras,
+    )
+
+
+def per_pixel(maps: Float[Tensor, "n c h w"], cameras: Cameras) -> Float[Tensor, "b v h w c"]:
+    """Channels last, views apart, in float32."""
+    return maps.float().permute(0, 2, 3, 1).unflatten(0, cameras.near.shape)
+
+
+def z_rays(offsets: Float[Tensor, "b v h w 2"], cameras: Cameras) -> Float[Tensor, "b v h w 3"]:
+    """Directions of unit z, in camera axes, through a point of each pixel.
+
+    Raw offsets move it by less than half a pixel from the centre.
+    """
+    h, w = offsets.shape[2:4]
+    x = torch.arange(w, device=offsets.device) + 0.5
+    y = torch.arange(h, device=offsets.device) + 0.5
+    centers = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    points = (centers + offsets.sigmoid() - 0.5) / offsets.new_tensor([w, h])
+    with full_precision(offsets):
+        inverse = torch.linalg.inv(cameras.K)
+        return torch.einsum("bvij,bvhwj->bvhwi", inverse, F.pad(points, (0, 1), value=1.0))
+
+
+def damped(sh: Float[Tensor, "*batch c"]) -> Float[Tensor, "*batch k 3"]:
+    """Raw channels, colour by colour, as harmonics whose higher degrees start out small."""
+    coefficients = sh.unflatten(-1, (3, -1)).transpose(-1, -2)
+    degrees = range(1, round(coefficients.shape[-2] ** 0.5))
+    factors = [1.0] + [0.1 * 0.25**degree for degree in degrees for _ in range(2 * degree + 1)]
+    return coefficients * sh.new_tensor(factors)[:, None]
+
+
+def in_world(
+    rays: Float[Tensor, "b v h w 3"],
+    depth: Float[Tensor, "b v h w"],
+    rotations: Float[Tensor, "b v h w 4"],
+    scales: Float[Tensor, "b v h w 3"],
+    opacities: Float[Tensor, "b v h w"],
+    sh: Float[Tensor, "b v h w k 3"],
+    cameras: Cameras,
+) -> PixelGaussians:
+    """Gaussians at `depth` times their rays, carried from camera to world axes.
+
+    Rotations come as the networks put them: xyzw quaternions of any length.
+    """
+    c2w = cameras.c2w[..., :3, :3]
+    centers = cameras.c2w[:, :, None, None, :3, 3]
+    with full_precision(rays):
+        means = centers + torch.einsum("bvij,bvhwj->bvhwi", c2w, rays * depth[..., None])
+        own = F.normalize(rotations.roll(1, -1), dim=-1)
+        quats = quats_product(quats_from(c2w)[:, :, None, None], own)
+    return PixelGaussians(depth, means, quats, scales, opacities, rotate_sh(sh, c2w))

@@ -1,0 +1,152 @@
+"""MVSplat (Chen et al., ECCV 2024): Gaussians from cost volumes, in a single pass.
+
+Modules carry the names of the published weights, so that these load as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from gscompleter.reconstructors.feed_forward.cameras import Cameras, other_views
+from gscompleter.reconstructors.feed_forward.cnn import ImageEncoder, normalised
+from gscompleter.reconstructors.feed_forward.cost_volume import cost_volume, evenly_spaced
+from gscompleter.reconstructors.feed_forward.gaussian_adapter import (
+    MVSPLAT_CHANNELS,
+    PixelGaussians,
+    mvsplat_gaussians,
+)
+from gscompleter.reconstructors.feed_forward.resampling import enlarged
+from gscompleter.reconstructors.feed_forward.transformer import MultiViewTransformer
+from gscompleter.reconstructors.feed_forward.unet import Steps, UNet, conv3x3
+
+NUM_CANDIDATES = 128
+"""Inverse depths that are compared."""
+DOWNSCALE = 4
+"""Cost volumes have this fraction of the resolution of the images."""
+
+
+@dataclass(frozen=True)
+class MVSplatConfig:
+    """The weights for RealEstate10K and for ACID share these defaults."""
+
+    image_size: tuple[int, int] = (256, 256)
+    """Height and width it was trained at, in pixels; others work too."""
+    near: float = 1.0
+    """Smallest z-depth, in scene units, where the camera knows none."""
+    far: float = 100.0
+    """Largest z-depth, in scene units, where the camera knows none."""
+    depth_chunk: int = 16
+    """Depths that are compared at a time; fewer need less memory and give the same."""
+
+    @property
+    def patch(self) -> int:
+        """Sides of the images must be multiples of it, in pixels."""
+        return 16
+
+
+class Backbone(nn.Module):
+    """Features of each view, alone and informed by those of the others."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.backbone = ImageEncoder(stride2=2, stride3=1)
+        self.transformer = MultiViewTransformer()
+
+    def forward(
+        self, images: Float[Tensor, "n 3 h w"], sources: Int[Tensor, "b v s"]
+    ) -> tuple[Float[Tensor, "n 128 p q"], Float[Tensor, "n 128 p q"]]:
+        """Features informed by the others, and alone, of images in [0, 1]."""
+        alone = self.backbone(normalised(images))[-1]
+        return self.transformer(alone, sources), alone
+
+
+class DepthPredictor(nn.Module):
+    """Depth from a cost volume, refined at full resolution, and the raw channels with it."""
+
+    def __init__(self, depth_chunk: int) -> None:
+        super().__init__()
+        self.depth_chunk = depth_chunk
+        coarse = UNet(128, levels=3, attention_level=2, pre_norm=False)
+        self.corr_refine_net = Steps(
+            [conv3x3(256, 128), nn.GroupNorm(8, 128), nn.GELU(), coarse, conv3x3(128, 128)]
+        )
+        self.regressor_residual = nn.Conv2d(256, 128, 1)
+        self.depth_head_lowres = two_convolutions(128, 256, NUM_CANDIDATES)
+        self.upsampler = nn.Sequential(
+            conv3x3(256, 128),
+            nn.Upsample(scale_factor=DOWNSCALE, mode="bilinear", align_corners=True),
+            nn.GELU(),
+        )
+        self.proj_feature = conv3x3(128, 32)
+        fine = UNet(32, levels=5, attention_level=4, pre_norm=False)
+        self.refine_unet = Steps([conv3x3(37, 32), nn.GroupNorm(4, 32), nn.GELU(), fine])
+        self.to_gaussians = two_convolutions(163, 168, MVSPLAT_CHANNELS)
+        self.to_disparity = two_convolutions(32, 64, 2)
+
+    def forward(
+        self,
+        images: Float[Tensor, "n 3 h w"],
+        informed: Float[Tensor, "n 128 p q"],
+        alone: Float[Tensor, "n 128 p q"],
+        cameras: Cameras,
+        sources: Int[Tensor, "b v s"],
+    ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n 1 h w"], Float[Tensor, "n channels h w"]]:
+        """Depth in scene units, opacity, and the raw channels of the Gaussians."""
+        views = sources.shape[1]
+        coarse, certainty = self.coarse_disparity(informed, cameras, sources)
+        features = self.upsampler(torch.cat([informed, alone], 1))
+        joined = torch.cat([images, self.proj_feature(features), coarse, certainty], 1)
+        refined = self.refine_unet(joined, views)
+        raw = self.to_gaussians(torch.cat([refined, images, features], 1))
+        correction, density = self.to_disparity(refined).split(1, 1)
+        disparity = (coarse + correction).clamp(*cameras.inverse_range())
+        return 1 / disparity, density.sigmoid(), raw
+
+    def coarse_disparity(
+        self,
+        features: Float[Tensor, "n 128 p q"],
+        cameras: Cameras,
+        sources: Int[Tensor, "b v s"],
+    ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n 1 h w"]]:
+        """Expected inverse depth, and the probability of the best, at full resolution."""
+        candidates = evenly_spaced(*cameras.inverse_range(), NUM_CANDIDATES)
+        costs = cost_volume(features, cameras, sources, candidates, self.depth_chunk)
+        joined = torch.cat([costs, features], 1)
+        refined = self.corr_refine_net(joined, sources.shape[1]) + self.regressor_residual(joined)
+        probability = self.depth_head_lowres(refined).softmax(1)
+        expected = (probability * candidates).sum(1, keepdim=True)
+        certainty = probability.amax(1, keepdim=True)
+        return enlarged(expected, DOWNSCALE), F.interpolate(certainty, scale_factor=DOWNSCALE)
+
+
+class MVSplat(nn.Module):
+    """The whole network: 12 M parameters, trained on pairs of views."""
+
+    def __init__(self, config: MVSplatConfig = MVSplatConfig()) -> None:
+        super().__init__()
+        self.config = config
+        self.backbone = Backbone()
+        self.depth_predictor = DepthPredictor(config.depth_chunk)
+
+    def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
+        """The Gaussians of all pixels.
+
+        Args:
+            images: In [0, 1], at least two views, with sides that are multiples of 16.
+            cameras: Of the views.
+        """
+        b, v = images.shape[:2]
+        sources = other_views(b, v, images.device)
+        flat = images.flatten(0, 1)
+        informed, alone = self.backbone(flat, sources)
+        distance, opacity, raw = self.depth_predictor(flat, informed, alone, cameras, sources)
+        return mvsplat_gaussians(raw, distance, opacity, cameras)
+
+
+def two_convolutions(channels: int, width: int, out: int) -> nn.Sequential:
+    return nn.Sequential(conv3x3(channels, width), nn.GELU(), conv3x3(width, out))

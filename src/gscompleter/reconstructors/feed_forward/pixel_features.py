@@ -1,0 +1,50 @@
+"""What DepthSplat and VolSplat know of each pixel before it becomes a Gaussian."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.reconstructors.feed_forward.cameras import Cameras
+from gscompleter.reconstructors.feed_forward.depth_predictor import (
+    VITS,
+    DepthConfig,
+    DepthPredictor,
+    dpt_head,
+)
+from gscompleter.reconstructors.feed_forward.unet import conv3x3
+
+REGRESSED = 64
+"""Channels that are made of all others; they come first."""
+COLOUR = slice(REGRESSED, REGRESSED + 3)
+"""Where the colour of the pixel stands among the channels."""
+
+
+class PixelFeatures(nn.Module):
+    """The part that both networks share: depth, and features at full resolution.
+
+    Modules carry the names of the published weights, so that these load as they are.
+    """
+
+    def __init__(self, config: DepthConfig) -> None:
+        super().__init__()
+        features = VITS[config.vit].gaussian_features
+        self.channels = REGRESSED + 3 + features + 1
+        self.depth_predictor = DepthPredictor(config)
+        self.feature_upsampler = dpt_head(config, features, with_disparity=False)
+        self.gaussian_regressor = nn.Sequential(
+            conv3x3(features + 5, REGRESSED), nn.GELU(), conv3x3(REGRESSED, REGRESSED)
+        )
+
+    def describe(
+        self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras
+    ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n c h w"]]:
+        """z-depth in scene units, and `channels` features, of the n = b v views."""
+        known = self.depth_predictor(images, cameras)
+        features = self.feature_upsampler(known.vit_maps, known.maps)
+        certainty = F.interpolate(known.certainty, size=images.shape[-2:])
+        flat = images.flatten(0, 1)
+        regressed = self.gaussian_regressor(torch.cat([flat, known.depth, certainty, features], 1))
+        return known.depth, torch.cat([regressed, flat, features, certainty], 1)

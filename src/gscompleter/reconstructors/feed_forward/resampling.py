@@ -1,0 +1,17 @@
+"""Maps of another size."""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+
+def resized(x: Float[Tensor, "n c h w"], size: tuple[int, int]) -> Float[Tensor, "n c p q"]:
+    """Bilinear, with the corners' centres kept in place."""
+    return F.interpolate(x, size=size, mode="bilinear", align_corners=True)
+
+
+def enlarged(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c p q"]:
+    """`factor` times as high and as wide."""
+    return resized(x, (factor * x.shape[2], factor * x.shape[3]))

@@ -1,0 +1,88 @@
+"""How the networks turn view-dependent colour into the world: a rotation in the basis of e3nn.
+
+MVSplat and DepthSplat predict spherical harmonics in camera axes and rotate them with matrices
+for the basis of e3nn, whose polar axis is y: degree 1 is (x, y, z). Then they render them in the
+basis of 3DGS, where degree 1 is (-y, z, -x), without conversion. That is no rotation of the
+colours, but the published weights were trained with it, so that this is what they need. This
+file is the only place that knows; all else takes the result for harmonics of 3DGS.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from math import factorial, pi, sqrt
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from gscompleter.reconstructors.feed_forward.cameras import full_precision
+
+NUM_DIRECTIONS = 64
+"""Directions at which harmonics are compared; 2 * degree + 1 would be the least."""
+
+
+def rotate_sh(
+    sh: Float[Tensor, "b v h w k 3"], rotations: Float[Tensor, "b v 3 3"]
+) -> Float[Tensor, "b v h w k 3"]:
+    """Harmonics of k = (degree + 1)² coefficients, rotated in the basis of e3nn."""
+    degrees = [sh[..., :1, :]]
+    with full_precision(sh):
+        while (k := sum(part.shape[-2] for part in degrees)) < sh.shape[-2]:
+            degree = len(degrees)
+            matrices = rotation_of_degree(degree, rotations)
+            part = sh[..., k : k + 2 * degree + 1, :]
+            degrees.append(torch.einsum("bvij,bvhwjc->bvhwic", matrices, part))
+    return torch.cat(degrees, dim=-2)
+
+
+def rotation_of_degree(degree: int, rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n m m"]:
+    """The Wigner matrices D with `Y(R d) = D Y(d)` for all directions d, by least squares."""
+    directions, inverse = sampled_harmonics(degree)
+    turned = directions.to(rotations.device) @ rotations.double().transpose(-1, -2)
+    matrices = inverse.to(rotations.device) @ harmonics(degree, turned)
+    return matrices.transpose(-1, -2).to(rotations.dtype)
+
+
+@cache
+def sampled_harmonics(
+    degree: int,
+) -> tuple[Float64[Tensor, "d 3"], Float64[Tensor, "m d"]]:
+    """Directions all over the sphere, and the pseudo-inverse of the harmonics at them."""
+    number = torch.arange(NUM_DIRECTIONS, dtype=torch.float64)
+    y = 1 - (2 * number + 1) / NUM_DIRECTIONS
+    azimuth = number * pi * (3 - sqrt(5))
+    radius = (1 - y * y).sqrt()
+    directions = torch.stack([radius * azimuth.sin(), y, radius * azimuth.cos()], dim=-1)
+    return directions, torch.linalg.pinv(harmonics(degree, directions))
+
+
+def harmonics(degree: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n m"]:
+    """Real spherical harmonics of orders -degree to degree at unit directions, with pole y."""
+    x, y, z = directions.unbind(-1)
+    values = {}
+    cosine, sine = torch.ones_like(x), torch.zeros_like(x)  # of order * azimuth, from z to x
+    for order in range(degree + 1):
+        ratio = factorial(degree - order) / factorial(degree + order)
+        norm = sqrt((2 * degree + 1) / (4 * pi) * ratio * (2 if order else 1))
+        polar = norm * associated_legendre(degree, order, y)
+        values[-order], values[order] = polar * sine, polar * cosine
+        cosine, sine = z * cosine - x * sine, z * sine + x * cosine
+    return torch.stack([values[order] for order in range(-degree, degree + 1)], dim=-1)
+
+
+def associated_legendre(degree: int, order: int, t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """`P(t) / (1 - t²)^(order / 2)`, without the Condon-Shortley sign."""
+    before, value = torch.zeros_like(t), torch.full_like(t, odd_factorial(order))
+    for n in range(order + 1, degree + 1):
+        following = ((2 * n - 1) * t * value - (n + order - 1) * before) / (n - order)
+        before, value = value, following
+    return value
+
+
+def odd_factorial(order: int) -> float:
+    """1 · 3 · … · (2 order - 1)."""
+    product = 1.0
+    for i in range(1, order + 1):
+        product *= 2 * i - 1
+    return product

@@ -1,0 +1,167 @@
+"""The multi-view transformer of MVSplat and DepthSplat: window attention in and across views."""
+
+from __future__ import annotations
+
+from math import pi
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from gscompleter.reconstructors.feed_forward.cameras import select
+
+SPLITS = 2
+"""Windows along each side of a feature map."""
+
+
+class WindowAttention(nn.Module):
+    """Attention of each pixel to the same window of the source views, with a single head."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.q_proj = nn.Linear(channels, channels, bias=False)
+        self.k_proj = nn.Linear(channels, channels, bias=False)
+        self.v_proj = nn.Linear(channels, channels, bias=False)
+        self.merge = nn.Linear(channels, channels, bias=False)
+        self.norm1 = nn.LayerNorm(channels)
+
+    def forward(
+        self,
+        x: Float[Tensor, "n h w c"],
+        sources: Float[Tensor, "n s h w c"],
+        mask: Float[Tensor, "windows p p"] | None,
+    ) -> Float[Tensor, "n h w c"]:
+        """`x` and what it learns from `sources`; with a `mask`, in windows shifted by half."""
+        return x + self.message(x, sources, mask)
+
+    def message(
+        self,
+        x: Float[Tensor, "n h w c"],
+        sources: Float[Tensor, "n s h w c"],
+        mask: Float[Tensor, "windows p p"] | None,
+    ) -> Float[Tensor, "n h w c"]:
+        """What each pixel of `x` learns from `sources`."""
+        _, h, w, _ = x.shape
+        shift = (0, 0) if mask is None else (h // SPLITS // 2, w // SPLITS // 2)
+        back = (-shift[0], -shift[1])
+        query = to_windows(self.q_proj(x[:, None].roll(back, (2, 3))))
+        sources = sources.roll(back, (2, 3))
+        key, value = to_windows(self.k_proj(sources)), to_windows(self.v_proj(sources))
+        if mask is not None:
+            # Keys of several views lie pixel by pixel, while the published models were trained
+            # with the mask repeated view by view. We do as they did: it matters from two
+            # source views on.
+            mask = mask.repeat(1, 1, sources.shape[1])
+        attended = F.scaled_dot_product_attention(query, key, value, mask)
+        return self.norm1(self.merge(from_windows(attended, h, w).roll(shift, (1, 2))))
+
+
+class WindowAttentionAndMlp(WindowAttention):
+    """Window attention whose message passes a multi-layer perceptron together with `x`."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels)
+        self.mlp = nn.Sequential(
+            nn.Linear(2 * channels, 8 * channels, bias=False),
+            nn.GELU(),
+            nn.Linear(8 * channels, channels, bias=False),
+        )
+        self.norm2 = nn.LayerNorm(channels)
+
+    def message(
+        self,
+        x: Float[Tensor, "n h w c"],
+        sources: Float[Tensor, "n s h w c"],
+        mask: Float[Tensor, "windows p p"] | None,
+    ) -> Float[Tensor, "n h w c"]:
+        message = super().message(x, sources, mask)
+        return self.norm2(self.mlp(torch.cat([x, message], -1)))
+
+
+class TransformerLayer(nn.Module):
+    """Attention within each view, then to its source views."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.self_attn = WindowAttention(channels)
+        self.cross_attn_ffn = WindowAttentionAndMlp(channels)
+
+    def forward(
+        self,
+        x: Float[Tensor, "b v h w c"],
+        sources: Int[Tensor, "b v s"],
+        mask: Float[Tensor, "windows p p"] | None,
+    ) -> Float[Tensor, "b v h w c"]:
+        seen = select(x, sources).flatten(0, 1)
+        own = x.flatten(0, 1)
+        own = self.self_attn(own, own[:, None], mask)
+        return self.cross_attn_ffn(own, seen, mask).view_as(x)
+
+
+class MultiViewTransformer(nn.Module):
+    """Six layers; every other one has its windows shifted by half their size."""
+
+    def __init__(self, channels: int = 128, num_layers: int = 6) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(TransformerLayer(channels) for _ in range(num_layers))
+
+    def forward(
+        self, features: Float[Tensor, "n c h w"], sources: Int[Tensor, "b v s"]
+    ) -> Float[Tensor, "n c h w"]:
+        """Features of all n = b v views, informed by those of their `sources`."""
+        x = (features + position_in_window(features)).unflatten(0, sources.shape[:2])
+        x = x.permute(0, 1, 3, 4, 2)
+        height, width = x.shape[2:4]
+        mask = shifted_window_mask(height, width, features.device)
+        for i, layer in enumerate(self.layers):
+            x = layer(x, sources, mask if i % 2 else None)
+        return x.permute(0, 1, 4, 2, 3).flatten(0, 1)
+
+
+def to_windows(x: Float[Tensor, "n s h w c"]) -> Float[Tensor, "n windows p c"]:
+    """Windows of p pixels of s views: the view changes fastest, then column and row."""
+    x = x.unflatten(3, (SPLITS, -1)).unflatten(2, (SPLITS, -1))
+    return x.permute(0, 2, 4, 3, 5, 1, 6).flatten(3, 5).flatten(1, 2)
+
+
+def from_windows(
+    windows: Float[Tensor, "n windows p c"], height: int, width: int
+) -> Float[Tensor, "n {height} {width} c"]:
+    """The inverse of `to_windows` for a single view."""
+    x = windows.unflatten(1, (SPLITS, SPLITS)).unflatten(3, (height // SPLITS, width // SPLITS))
+    return x.permute(0, 1, 3, 2, 4, 5).flatten(3, 4).flatten(1, 2)
+
+
+def shifted_window_mask(
+    height: int, width: int, device: torch.device
+) -> Float[Tensor, "windows p p"]:
+    """What is added to scores in shifted windows: -100 where the roll joined opposite borders."""
+
+    def bands(size: int) -> Tensor:
+        window = size // SPLITS
+        band = torch.zeros(size, device=device)
+        band[-window:] = 1
+        band[-(window // 2) :] = 2
+        return band
+
+    regions = 3 * bands(height)[:, None] + bands(width)
+    ids = to_windows(regions[None, None, :, :, None])[0, ..., 0]
+    return (ids[:, None, :] != ids[:, :, None]).float() * -100.0
+
+
+def position_in_window(features: Float[Tensor, "n c h w"]) -> Float[Tensor, "c h w"]:
+    """Sines and cosines of the row, then of the column, within each window (as in DETR)."""
+    _, channels, height, width = features.shape
+    order = torch.arange(channels // 2, device=features.device)
+    period = 10000 ** (2 * (order // 2) / len(order))
+
+    def along(size: int) -> Float[Tensor, "size c"]:
+        number = torch.arange(1, size + 1, device=features.device, dtype=torch.float32)
+        angle = (number / (size + 1e-6) * 2 * pi)[:, None] / period
+        return torch.stack([angle[:, 0::2].sin(), angle[:, 1::2].cos()], -1).flatten(1)
+
+    rows, columns = along(height // SPLITS).T, along(width // SPLITS).T
+    shape = (-1, rows.shape[1], columns.shape[1])
+    window = torch.cat([rows[:, :, None].expand(shape), columns[:, None].expand(shape)])
+    return window.repeat(1, SPLITS, SPLITS)

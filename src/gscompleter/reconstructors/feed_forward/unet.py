@@ -1,0 +1,141 @@
+"""The U-Net that both networks refine their cost volumes with: that of latent diffusion without
+time steps, with attention across the pixels of all views of a scene.
+
+MVSplat normalises after each convolution, DepthSplat before it; `pre_norm` tells them apart.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+HEAD = 32
+"""Channels of an attention head."""
+
+
+def conv3x3(channels: int, out: int, stride: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(channels, out, 3, stride, 1)
+
+
+def group_norm(channels: int) -> nn.GroupNorm:
+    return nn.GroupNorm(8, channels)
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions, each with its norm and activation."""
+
+    def __init__(self, channels: int, out: int, pre_norm: bool) -> None:
+        super().__init__()
+        if pre_norm:
+            self.in_layers = nn.Sequential(group_norm(channels), nn.SiLU(), conv3x3(channels, out))
+            # The dropout does nothing; it stands here because keys count the layers.
+            self.out_layers = nn.Sequential(
+                group_norm(out), nn.SiLU(), nn.Dropout(0.0), conv3x3(out, out)
+            )
+        else:
+            self.in_layers = nn.Sequential(conv3x3(channels, out), group_norm(out), nn.SiLU())
+            self.out_layers = nn.Sequential(conv3x3(out, out), group_norm(out), nn.SiLU())
+        self.skip_connection = nn.Identity() if channels == out else nn.Conv2d(channels, out, 1)
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
+        return self.skip_connection(x) + self.out_layers(self.in_layers(x))
+
+
+class ViewAttention(nn.Module):
+    """Attention of every pixel to all pixels of all views of its scene."""
+
+    def __init__(self, channels: int, pre_norm: bool) -> None:
+        super().__init__()
+        self.pre_norm = pre_norm
+        self.norm = group_norm(channels)
+        self.qkv = nn.Conv1d(channels, 3 * channels, 1)
+        self.proj_out = nn.Conv1d(channels, channels, 1)
+
+    def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n c h w"]:
+        """Only the attention joins the views of a scene; the norm sees each view alone."""
+        y = self.norm(x) if self.pre_norm else x
+        y = y.flatten(2).unflatten(0, (-1, views)).transpose(1, 2).flatten(2)
+        y = self.proj_out(self.attended(self.qkv(y)))
+        y = y.unflatten(2, (views, -1)).transpose(1, 2).reshape(x.shape)
+        return x + (y if self.pre_norm else self.norm(y))
+
+    def attended(self, qkv: Float[Tensor, "b three_c t"]) -> Float[Tensor, "b c t"]:
+        """Values as each of t tokens attends to them; channels lie head by head as q, k, v."""
+        q, k, v = qkv.unflatten(1, (-1, 3, HEAD)).transpose(-1, -2).unbind(2)
+        return F.scaled_dot_product_attention(q, k, v).transpose(-1, -2).flatten(1, 2)
+
+
+class Downsample(nn.Module):
+    """To half the size."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.op = conv3x3(channels, channels, stride=2)
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c p q"]:
+        return self.op(x)
+
+
+class Upsample(nn.Module):
+    """To twice the size."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv = conv3x3(channels, channels)
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c 2*h 2*w"]:
+        return self.conv(F.interpolate(x, scale_factor=2, mode="nearest"))
+
+
+class Steps(nn.ModuleList):
+    """Modules one after the other, of which some look across the views of a scene."""
+
+    def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n o p q"]:
+        for step in self:
+            x = step(x, views) if isinstance(step, ViewAttention | UNet) else step(x)
+        return x
+
+
+class UNet(nn.Module):
+    """A U-Net of constant width, with attention at the level `attention_level` (0 is finest)."""
+
+    def __init__(self, channels: int, levels: int, attention_level: int, pre_norm: bool) -> None:
+        super().__init__()
+
+        def block(width: int, level: int) -> list[nn.Module]:
+            residual = ResidualBlock(width, channels, pre_norm)
+            if level != attention_level:
+                return [residual]
+            return [residual, ViewAttention(channels, pre_norm)]
+
+        self.input_blocks = nn.ModuleList([Steps([conv3x3(channels, channels)])])
+        for level in range(levels):
+            self.input_blocks.append(Steps(block(channels, level)))
+            if level < levels - 1:
+                self.input_blocks.append(Steps([Downsample(channels)]))
+        self.middle_block = nn.Sequential(
+            ResidualBlock(channels, channels, pre_norm),
+            nn.Identity(),
+            ResidualBlock(channels, channels, pre_norm),
+        )
+        self.output_blocks = nn.ModuleList()
+        for level in reversed(range(levels)):
+            self.output_blocks.append(Steps(block(2 * channels, level)))
+            upsample = [Upsample(channels)] if level > 0 else []
+            self.output_blocks.append(Steps([*block(2 * channels, level), *upsample]))
+        norm, conv = group_norm(channels), conv3x3(channels, channels)
+        out = [norm, nn.SiLU(), conv] if pre_norm else [conv, norm, nn.SiLU()]
+        self.out = nn.Sequential(*out)
+
+    def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n c h w"]:
+        """Maps of n = b v images, the `views` of a scene one after the other."""
+        skipped = []
+        for block in self.input_blocks:
+            x = block(x, views)
+            skipped.append(x)
+        x = self.middle_block(x)
+        for block in self.output_blocks:
+            x = block(torch.cat([x, skipped.pop()], 1), views)
+        return self.out(x)

@@ -1,0 +1,157 @@
+"""VolSplat (Wang et al., 2025): Gaussians from voxels that gather the pixels of all views.
+
+Modules carry the names of the published weights (`spare_unet` among them), so that these load as
+they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.reconstructors.feed_forward.cameras import Cameras, full_precision
+from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
+from gscompleter.reconstructors.feed_forward.gaussian_adapter import (
+    MIN_SCALE,
+    damped,
+    per_pixel,
+    z_rays,
+)
+from gscompleter.reconstructors.feed_forward.pixel_features import COLOUR, PixelFeatures
+from gscompleter.reconstructors.feed_forward.sparse import Grid, SparseConv, neighbours_within
+from gscompleter.reconstructors.feed_forward.sparse_unet import SparseUNet
+from gscompleter.reconstructors.feed_forward.voxels import Voxels, voxelize
+from gscompleter.types import sh_from_rgb
+
+NUM_SH = 9
+"""Harmonics (degree 2)."""
+PARTS = (1, 3, 3, 4, 3 * NUM_SH)
+"""Channels of opacity, offset, scale, rotation and harmonics."""
+REACH = 1.5
+"""How far a Gaussian may lie from the mean of its voxel along each axis, in voxels."""
+
+
+@dataclass(frozen=True)
+class VolSplatConfig:
+    depth: DepthConfig = DepthConfig("vitb", 2, 2, 4)
+    """The depth predictor, that of DepthSplat base."""
+    image_size: tuple[int, int] = (256, 256)
+    """Height and width it was trained at, in pixels; others work too."""
+    near: float = 0.5
+    """Smallest z-depth, in scene units, where the camera knows none."""
+    far: float = 100.0
+    """Largest z-depth, in scene units, where the camera knows none."""
+    voxel_resolution: float = 0.001
+    """Side of a voxel, in scene units."""
+    gaussian_scale_max: float = 3.0
+    """Largest standard deviation of a Gaussian, in scene units."""
+
+    @property
+    def patch(self) -> int:
+        """Sides of the images must be multiples of it, in pixels."""
+        return self.depth.patch
+
+
+@dataclass(frozen=True)
+class VoxelGaussians:
+    """What the network makes of a scene: one Gaussian for each voxel, and depths per view."""
+
+    depth: Float[Tensor, "v h w"]
+    """z-depth of the pixels."""
+    grid: Grid
+    """The voxels, in the order of the Gaussians."""
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    """Rotations as wxyz quaternions."""
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the rotated axes, in scene units."""
+    opacities: Float[Tensor, "n"]
+    sh: Float[Tensor, "n 9 3"]
+    """Spherical harmonics in the basis of 3DGS."""
+
+
+class GaussianHead(nn.Module):
+    """From the features of voxels to the raw channels of their Gaussians."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__()
+        self.conv1 = SparseConv(channels_in, channels_out)
+        self.conv2 = SparseConv(channels_out, channels_out)
+
+    def forward(
+        self, features: Float[Tensor, "n channels_in"], grid: Grid
+    ) -> Float[Tensor, "n channels_out"]:
+        neighbours = neighbours_within(grid)
+        raw: Tensor = self.conv2(F.gelu(self.conv1(features, neighbours)), neighbours)
+        return raw
+
+
+class VolSplat(PixelFeatures):
+    """The whole network: 138 M parameters."""
+
+    def __init__(self, config: VolSplatConfig = VolSplatConfig()) -> None:
+        super().__init__(config.depth)
+        self.config = config
+        self.spare_unet = SparseUNet(self.channels)
+        self.gaussian_head = GaussianHead(self.channels, sum(PARTS))
+
+    def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> VoxelGaussians:
+        """The Gaussians of all voxels of one scene.
+
+        Args:
+            images: In [0, 1], at least two views, with sides that are multiples of
+                `config.patch`.
+            cameras: Of the views.
+
+        Raises:
+            InputError: depths that are not finite, or voxels spread too widely to be counted.
+            ValueError: several scenes, whose numbers of voxels would differ.
+        """
+        if len(images) != 1:
+            raise ValueError(f"VolSplat takes one scene at a time, got {len(images)}")
+        depth, features = self.describe(images, cameras)
+        with full_precision(images):
+            points = world_points(depth, cameras)
+            rows = per_pixel(features, cameras).flatten(0, 3)
+            voxels = voxelize(points, rows, self.config.voxel_resolution)
+            refined = voxels.features + self.spare_unet(voxels.features, voxels.grid)
+            raw = self.gaussian_head(refined, voxels.grid)
+        return voxel_gaussians(raw, voxels, depth[:, 0].float(), self.config)
+
+
+def world_points(depth: Float[Tensor, "n 1 h w"], cameras: Cameras) -> Float[Tensor, "p 3"]:
+    """The centres of all pixels at their z-depth, in the world, view by view and row by row."""
+    along = per_pixel(depth, cameras)
+    centered = along.new_zeros((*along.shape[:4], 2))
+    in_camera = z_rays(centered, cameras) * along
+    rotations, centers = cameras.c2w[..., :3, :3], cameras.c2w[:, :, None, None, :3, 3]
+    points = centers + torch.einsum("bvij,bvhwj->bvhwi", rotations, in_camera)
+    return points.flatten(0, 3)
+
+
+def voxel_gaussians(
+    raw: Float[Tensor, "n 38"],
+    voxels: Voxels,
+    depth: Float[Tensor, "v h w"],
+    config: VolSplatConfig,
+) -> VoxelGaussians:
+    """The Gaussians of the voxels.
+
+    Offsets, axes and harmonics are those of the world. The constant harmonic is the mean colour
+    of the pixels of the voxel; what the network says of it counts for nothing.
+    """
+    opacity, offset, scale, rotation, sh = raw.split(PARTS, dim=1)
+    reach = REACH * config.voxel_resolution
+    return VoxelGaussians(
+        depth,
+        voxels.grid,
+        means=voxels.points + (2 * offset.sigmoid() - 1) * reach,
+        quats=F.normalize(rotation.roll(1, 1), dim=1),
+        scales=F.softplus(scale - 4).clamp(MIN_SCALE, config.gaussian_scale_max),
+        opacities=opacity[:, 0].sigmoid(),
+        sh=torch.cat([sh_from_rgb(voxels.features[:, COLOUR]), damped(sh)[:, 1:]], dim=1),
+    )

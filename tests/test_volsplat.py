@@ -1,0 +1,194 @@
+"""VolSplat: equal to the authors' code on stored cases, and at work in a completion."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+
+from feed_forward_fixtures import Case, published_shapes
+from gscompleter import GSCompleter, InputError
+from gscompleter.geometry import inside, project
+from gscompleter.reconstructors.feed_forward import FeedForward, VolSplat, VolSplatConfig
+from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
+from gscompleter.reconstructors.feed_forward.inputs import batch_of
+from gscompleter.reconstructors.feed_forward.volsplat import REACH, VoxelGaussians
+from gscompleter.stages.anchor import lift
+from gscompleter.types import SH_C0, View
+from scenes import Room, camera_at, view_of
+from volsplat_fixtures import FIXTURES, VoxelPass, with_sparse_rule
+
+TOLERANCE = 5e-5
+SMALL = VolSplatConfig(DepthConfig("vits", 1, 4, 4), voxel_resolution=0.02)
+"""A smaller network than the published one, for tests of what does not depend on its size."""
+
+
+@cache
+def published() -> VolSplat:
+    """The published architecture with the weights of the fixtures."""
+    return with_sparse_rule(VolSplat())
+
+
+@cache
+def random_network() -> VolSplat:
+    torch.manual_seed(0)
+    return VolSplat(SMALL).eval()
+
+
+def photographs(size: int = 64) -> list[View]:
+    return [view_of(Room(), camera_at(x, size=size), i) for i, x in enumerate((-0.3, 0.1))]
+
+
+def test_names_and_shapes_of_the_weights_are_those_of_the_published_file():
+    keys = json.loads((FIXTURES / "keys-re10k-vitb.json").read_text())["keys"]
+    assert len(keys) == 806
+    ours = {key: tuple(value.shape) for key, value in published().state_dict().items()}
+    assert ours == published_shapes("volsplat", "keys-re10k-vitb")
+
+
+def check(case: Case) -> None:
+    """Every stored array, for the voxels that lie in the same place.
+
+    A point that lies on the border of two voxels falls to one side or the other by the last bit
+    of its depth.
+    """
+    network = published()
+    network.config = VolSplatConfig(voxel_resolution=float(case.values["voxel_resolution"]))
+    run = VoxelPass.through(network, case)
+    assert len(run.predicted.means) == int(case.values["num_voxels"])
+    assert (run.rows_of(case) < 0).float().mean() < 5e-4
+    errors = run.errors(case)
+    assert len(errors) == 10
+    assert {name: e for name, e in errors.items() if not e < TOLERANCE} == {}
+
+
+def test_voxels_with_neighbours_agree_with_the_authors_code():
+    check(Case.load(FIXTURES / "v2_64x64_vox0.02.npz"))
+
+
+def test_voxels_of_the_published_size_agree_with_the_authors_code(shared):
+    check(Case.load(shared / "fixtures" / "volsplat" / "v2_64x64_vox0.001.npz"))
+
+
+def predict(network: VolSplat) -> VoxelGaussians:
+    images, cameras, _ = batch_of(photographs(), SMALL.patch, SMALL.near, SMALL.far)
+    with torch.no_grad():
+        return network(images, cameras)
+
+
+def test_weights_can_be_assigned_to_a_network_that_was_built_without_any():
+    given = random_network()
+    with torch.device("meta"):
+        empty = VolSplat(SMALL)
+    empty.load_state_dict(given.state_dict(), strict=True, assign=True)
+    assert torch.equal(predict(empty.eval()).means, predict(given).means)
+
+
+@pytest.mark.parametrize("lower_precision", [False, True])
+def test_a_gaussian_lies_within_reach_of_its_voxel(lower_precision):
+    with torch.autocast("cpu", torch.bfloat16, enabled=lower_precision):
+        predicted = predict(random_network())
+    for field in ("depth", "means", "quats", "scales", "opacities", "sh"):
+        assert getattr(predicted, field).dtype == torch.float32
+        assert getattr(predicted, field).isfinite().all()
+    centers = predicted.grid.coordinates[:, 1:] * SMALL.voxel_resolution
+    away = (predicted.means - centers).abs().max().item() / SMALL.voxel_resolution
+    assert 0.5 < away < 0.5 + REACH + 1e-3
+    assert len(predicted.means) < 2 * 64 * 64
+
+
+def test_a_single_voxel_has_the_mean_colour_of_all_pixels():
+    views = photographs()
+    network = random_network()
+    try:
+        network.config = replace(SMALL, voxel_resolution=1e4)
+        (colour,) = FeedForward(network)(views).gaussians.sh[:, 0]
+    finally:
+        network.config = SMALL
+    mean = torch.stack([view.image for view in views]).mean(dim=(0, 1, 2))
+    assert torch.allclose(0.5 + SH_C0 * colour, mean, atol=1e-5)
+
+
+def test_a_reconstruction_of_voxels_names_no_pixels_and_has_depths_within_the_crop():
+    views = [
+        View(view.image[:70, :75].contiguous(), replace(view.camera, width=75, height=70), i)
+        for i, view in enumerate(photographs(80))
+    ]
+    reconstruction = FeedForward(random_network())(views)
+    assert reconstruction.view_index is None
+    assert reconstruction.pixel_index is None
+    assert reconstruction.gaussians.sh.shape[1:] == (9, 3)
+    assert (reconstruction.gaussians.generated == 0).all()
+    expected = torch.zeros(70, 75, dtype=torch.bool)
+    expected[3:67, 5:69] = True
+    for depth, view in zip(reconstruction.depths, views, strict=True):
+        assert torch.equal(depth.valid, expected)
+        assert (depth.depth[~expected] == 0).all()
+        within = depth.depth[expected]
+        assert within.min() >= view.camera.near * 0.999
+        assert within.max() <= view.camera.far * 1.001
+
+
+def test_the_depth_maps_are_those_of_the_voxels():
+    """Unprojected, each pixel lies in a voxel that has a Gaussian."""
+    views = photographs()
+    predicted = predict(random_network())
+    occupied = {tuple(row) for row in predicted.grid.coordinates[:, 1:].tolist()}
+    found = 0
+    for view, depth in zip(views, predicted.depth, strict=True):
+        points = view.camera.center + depth[..., None] * view.camera.z_rays()
+        cells = torch.round(points / SMALL.voxel_resolution).long().reshape(-1, 3)
+        found += sum(tuple(cell) in occupied for cell in cells.tolist())
+    assert found > 0.999 * predicted.depth.numel()
+
+
+def test_several_scenes_at_once_are_refused():
+    images, cameras, _ = batch_of(photographs(), SMALL.patch, SMALL.near, SMALL.far)
+    with pytest.raises(ValueError, match="one scene"):
+        random_network()(images.repeat(2, 1, 1, 1, 1), cameras)
+
+
+def test_a_single_view_is_refused():
+    with pytest.raises(InputError, match="at least 2"):
+        FeedForward(random_network())(photographs()[:1])
+
+
+def test_poses_that_are_no_numbers_are_refused():
+    first, second = photographs()
+    c2w = second.camera.c2w.clone()
+    c2w[0, 3] = torch.nan
+    lost = replace(second, camera=replace(second.camera, c2w=c2w))
+    with pytest.raises(InputError, match="not finite"):
+        FeedForward(random_network())([first, lost])
+
+
+def test_all_that_the_target_sees_is_lifted():
+    reference, anchor = photographs()
+    reconstructor = FeedForward(random_network())
+    lifted = lift(reconstructor, reference, anchor)
+    whole = reconstructor([reference, anchor]).gaussians
+    seen = inside(*project(whole.means, reference.camera), reference.camera)
+    assert lifted.pixel_index is None
+    assert torch.equal(lifted.gaussians.means, whole.means[seen])
+    assert 0 < len(lifted.gaussians) <= len(whole)
+
+
+class Truth:
+    """Φ that knows the room."""
+
+    def __call__(self, nearest, target, context):
+        return view_of(Room(), target).image
+
+
+def test_smoke_a_completion_runs_with_random_weights():
+    """That the stages take Gaussians of voxels; with random weights the picture means nothing."""
+    views, target = photographs(), camera_at(0.7, yaw=12, size=64)
+    completion = GSCompleter(FeedForward(random_network()), Truth())(views, target)
+    (result,) = completion.targets
+    assert result.hole_fraction > 0.05
+    assert len(result.losses["register"]) > 0
+    assert len(completion.added) > 0
+    assert (completion.added.generated == 1).all()
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.isfinite(getattr(completion.scene, name)).all(), name
