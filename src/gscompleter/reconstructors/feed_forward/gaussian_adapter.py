@@ -19,7 +19,7 @@ MVSPLAT_SH = 25
 MVSPLAT_CHANNELS = 2 + 3 + 4 + 3 * MVSPLAT_SH
 """Offset, scale, rotation, harmonics."""
 MVSPLAT_SCALES = (0.5, 15.0)
-"""Smallest and largest standard deviation, in tenths of (roughly twice) a pixel."""
+"""Smallest and largest standard deviation, in fifths of what a pixel covers."""
 DEPTHSPLAT_SH = 9
 """Harmonics of DepthSplat (degree 2)."""
 DEPTHSPLAT_CHANNELS = 1 + 2 + 3 + 4 + 3 * DEPTHSPLAT_SH
