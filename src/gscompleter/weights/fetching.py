@@ -1,7 +1,6 @@
 """Where a file of weights comes from: a path, our cache, the hub's cache, or a download.
 
-Nothing here imports torch. The download itself could not be run where this was written; what the
-hub's library does with files that are in its cache was.
+Nothing here imports torch.
 """
 
 from __future__ import annotations

@@ -61,5 +61,5 @@ def differences(needed: Shapes, given: Shapes) -> str:
     if other:
         name = other[0]
         shapes = f"{list(given[name])} instead of {list(needed[name])}"
-        parts.append(f"{len(other)} have another shape (such as {name}, {shapes})")
+        parts.append(f"it has {len(other)} of another shape (such as {name}, {shapes})")
     return ", ".join(parts)

@@ -1,8 +1,8 @@
 """Every file of weights that the feed-forward reconstructors can be filled with.
 
 Nothing here imports torch, so that `gscompleter models` answers at once. The hub was out of reach
-when this was written: names, digits and licences are those that the authors' pages state, and no
-file was downloaded to confirm them.
+when this was written: names, digits and licences are those that the authors' pages state, and none
+of the files was downloaded to confirm them.
 """
 
 from __future__ import annotations

@@ -49,8 +49,13 @@ def check_kind(path: Path, name: str) -> None:
     """
     if not path.is_file():
         raise InputError(f"There is no file {path}; {name} is needed there.")
-    with path.open("rb") as file:
-        head = file.read(64)
+    try:
+        with path.open("rb") as file:
+            head = file.read(64)
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be opened ({error.strerror}); make it readable."
+        ) from error
     wrong = ""
     if not head:
         wrong = "is empty"
@@ -131,7 +136,7 @@ def read_tensors(path: Path, name: str) -> Any:
             f"{path} holds no plain weights but Python objects too ({found[1]}), and to load those "
             f"may run any code; {_replace_it(path, name)}."
         ) from error
-    except (RuntimeError, EOFError, ValueError, KeyError) as error:
+    except Exception as error:  # a damaged pickle can fail in any way
         raise InputError(f"{path} cannot be read by torch; {_replace_it(path, name)}.") from error
 
 
@@ -163,25 +168,25 @@ def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> d
     inner = content.get(weights.entry, content) if isinstance(content, Mapping) else None
     if not isinstance(inner, Mapping) or not all(isinstance(key, str) for key in inner):
         raise InputError(f"{path} holds no named tensors; give {weights.file}.")
-    found = {k.removeprefix(weights.prefix): v for k, v in inner.items() if is_of(k, weights)}
+    prefix = weights.prefix
+    found = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
     if not found:
         raise InputError(
-            f"{path} holds no tensors named {weights.prefix}…, but {_some(list(inner))}; give "
+            f"{path} holds no tensors named {prefix}…, but {_some(list(inner))}; give "
             f"{weights.file}."
         )
-    unknown = [k for k in inner if not is_of(k, weights) and not k.startswith(NOT_THE_ENCODERS)]
-    unknown += [k for k, v in found.items() if not isinstance(v, Tensor)]
+    unknown = [
+        key
+        for key, value in inner.items()
+        if not (key.startswith(prefix) and isinstance(value, Tensor))
+        and not key.startswith(NOT_THE_ENCODERS)
+    ]
     if unknown:
         raise InputError(
             f"{path} holds more than the network {weights.name}: {_some(unknown)}; give "
             f"{weights.file}."
         )
     return found
-
-
-def is_of(key: str, weights: PublishedWeights) -> bool:
-    """Whether a name in the file is that of a tensor of the network."""
-    return key.startswith(weights.prefix)
 
 
 def _replace_it(path: Path, name: str) -> str:
