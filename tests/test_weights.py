@@ -217,11 +217,16 @@ def test_without_the_hubs_package_the_sentence_says_what_to_install(
     assert str(place_of(DEPTHSPLAT)) in sentence
 
 
-def hub_cache(folder: Path, weights: PublishedWeights, content: bytes) -> Path:
-    """The hub's cache as its library leaves it: a file by its hash, and a link by its name."""
+def hub_cache(
+    folder: Path, weights: PublishedWeights, content: bytes, original: bytes | None = None
+) -> Path:
+    """The hub's cache as its library leaves it: a file by its hash, and a link by its name.
+
+    Where the content was damaged later, the hash is that of the original.
+    """
     assert weights.repository is not None
     repository = folder / f"models--{weights.repository.replace('/', '--')}"
-    blob = repository / "blobs" / hashlib.sha256(content).hexdigest()
+    blob = repository / "blobs" / hashlib.sha256(original or content).hexdigest()
     link = repository / "snapshots" / COMMIT / weights.file
     reference = repository / "refs" / "main"
     for path in (blob, link, reference):
@@ -333,13 +338,14 @@ def test_a_damaged_download_is_fetched_anew_once_it_is_deleted_as_told(
     tmp_path: Path, serve: Callable
 ):
     weights = save(tmp_path / "original.pth", published_tensors(), DEPTHSPLAT)
-    hub_cache(tmp_path / "hub", weights, b"damaged")
+    original = (tmp_path / "original.pth").read_bytes()
+    hub_cache(tmp_path / "hub", weights, b"damaged", original)
     with pytest.raises(InputError, match="delete") as caught:
         read_state_dict(fetch(weights), weights)
     told = re.search(r"delete (\S+) and", sentence_of(caught))
     assert told is not None
     Path(told[1]).unlink()
-    serve(weights, (tmp_path / "original.pth").read_bytes())
+    serve(weights, original)
     assert read_state_dict(fetch(weights), weights).keys() == network().state_dict().keys()
 
 
