@@ -16,6 +16,7 @@ from gscompleter.options import (
     DemoOptions,
     EvaluateOptions,
     IndexOptions,
+    ModelsOptions,
     TablesOptions,
 )
 
@@ -25,6 +26,7 @@ Command = (
     | Annotated[EvaluateOptions, tyro.conf.subcommand("evaluate")]
     | Annotated[TablesOptions, tyro.conf.subcommand("tables")]
     | Annotated[IndexOptions, tyro.conf.subcommand("index")]
+    | Annotated[ModelsOptions, tyro.conf.subcommand("models")]
 )
 
 # Where each command lives. Its module is imported once the arguments are known to be right, so
@@ -35,6 +37,7 @@ COMMANDS = {
     EvaluateOptions: ("gscompleter.evaluation.commands", "run_evaluation"),
     TablesOptions: ("gscompleter.evaluation.commands", "run_tables"),
     IndexOptions: ("gscompleter.evaluation.commands", "run_index"),
+    ModelsOptions: ("gscompleter.weights.commands", "run_models"),
 }
 
 

@@ -145,3 +145,11 @@ class IndexOptions:
     """Replace the file where there is one."""
     quiet: bool = False
     """Say nothing but errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelsOptions:
+    """List the published weights: what they are, under which licence, and which are cached."""
+
+    json: bool = False
+    """Print everything that is known of them as JSON."""

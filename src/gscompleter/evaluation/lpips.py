@@ -14,8 +14,6 @@ only read where its SHA-256 is that of the published one, and without weights th
 
 from __future__ import annotations
 
-import hashlib
-import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,12 +25,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gscompleter.errors import InputError
+from gscompleter.weights.fetching import WeightsNotAvailable
+from gscompleter.weights.reading import check_kind, check_sha256, read_tensors
 
 NetworkName = Literal["vgg", "alex"]
-
-
-class WeightsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in a sentence)
-    """The published weights are not on this machine."""
 
 
 @dataclass(frozen=True)
@@ -242,7 +238,7 @@ def load_lpips(
         for file in (wanted.backbone, wanted.linear)
     ]
     of_backbone, of_linear = (
-        read_weights(path, file.sha256)
+        read_weights(path, file)
         for path, file in zip(paths, (wanted.backbone, wanted.linear), strict=True)
     )
     metric = Lpips(wanted)
@@ -287,25 +283,15 @@ def locate(file: WeightsFile, network: Network, folder: Path | None, download: b
     raise WeightsNotAvailable(f"LPIPS lacks {path.name}{failure}; put {needed}.")
 
 
-def read_weights(path: Path, sha256: str) -> Mapping[str, Tensor]:
+def read_weights(path: Path, file: WeightsFile) -> Mapping[str, Tensor]:
     """The tensors of a file, once its hash is the expected one; never any other object.
 
     Raises:
         InputError: where the file is another one, is damaged, or holds more than tensors.
     """
-    with path.open("rb") as stream:
-        digest = hashlib.sha256()
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    if digest.hexdigest() != sha256:
-        raise InputError(
-            f"{path} is not the published file: its SHA-256 begins with "
-            f"{digest.hexdigest()[:8]} instead of {sha256[:8]}; delete it and fetch it again."
-        )
-    try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
-        raise InputError(f"{path} holds no plain weights; fetch it again.") from error
+    check_kind(path, file.name)
+    check_sha256(path, file.sha256, file.name)
+    weights = read_tensors(path, file.name)
     if not isinstance(weights, Mapping):
         raise InputError(f"{path} holds no named weights; fetch it again.")
     return weights

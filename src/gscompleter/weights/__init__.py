@@ -1,0 +1,45 @@
+"""Weights that authors publish: which there are, where they lie, how they are read and fitted."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gscompleter.weights.fetching import WeightsNotAvailable, cached, fetch, place_of
+    from gscompleter.weights.fitting import load_strictly
+    from gscompleter.weights.published import PUBLISHED, PublishedWeights
+    from gscompleter.weights.reading import read_state_dict
+
+# Imported on first use, so that `gscompleter models` does not wait for torch.
+_HOMES = {
+    "PUBLISHED": "published",
+    "PublishedWeights": "published",
+    "WeightsNotAvailable": "fetching",
+    "cached": "fetching",
+    "fetch": "fetching",
+    "load_strictly": "fitting",
+    "place_of": "fetching",
+    "read_state_dict": "reading",
+}
+
+__all__ = [
+    "PUBLISHED",
+    "PublishedWeights",
+    "WeightsNotAvailable",
+    "cached",
+    "fetch",
+    "load_strictly",
+    "place_of",
+    "read_state_dict",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'gscompleter.weights' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"gscompleter.weights.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,78 @@
+"""The command `models`: the published weights as a table, or as JSON for machines."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from gscompleter.options import ModelsOptions
+from gscompleter.weights.fetching import INSTALL, cached, hub_is_installed, place_of
+from gscompleter.weights.published import PUBLISHED, PublishedWeights
+
+WIDEST = 1000
+"""Characters in a line where no terminal limits them."""
+
+
+def run_models(options: ModelsOptions) -> None:
+    """Print what weights are published and which are on this machine."""
+    found = {name: cached(weights) for name, weights in PUBLISHED.items()}
+    if options.json:
+        print(
+            json.dumps([as_json(PUBLISHED[name], path) for name, path in found.items()], indent=2)
+        )
+    else:
+        tell(found)
+
+
+def as_json(weights: PublishedWeights, path: Path | None) -> dict[str, object]:
+    """Everything that is known of a file, and where it is and belongs on this machine."""
+    return {
+        **asdict(weights),
+        "url": weights.url,
+        "pinned_by": weights.pinned_by,
+        "cached": None if path is None else str(path),
+        "place": str(place_of(weights)),
+    }
+
+
+def tell(found: dict[str, Path | None]) -> None:
+    """Print the table and what its marks mean."""
+    table = Table(box=None)
+    for title in ("name", "model", "parameters", "views", "size", "code / weights", "cached"):
+        table.add_column(title, no_wrap=title == "name")
+    table.add_column("source", overflow="fold")
+    for name, path in found.items():
+        table.add_row(*cells(PUBLISHED[name], path))
+    # Into a file or a pipe, every row is one line.
+    console = Console(width=None if sys.stdout.isatty() else WIDEST, markup=False, highlight=False)
+    console.print(table)
+    doubts: dict[str, list[str]] = {}
+    for weights in PUBLISHED.values():
+        if weights.caution:
+            doubts.setdefault(weights.caution, []).append(weights.name)
+    print("\n(!) Whether commercial use is allowed is unclear:")
+    for caution, names in doubts.items():
+        print(f"    {', '.join(names)}: {caution}.")
+    if not hub_is_installed():
+        print(f"\nThe hub's cache was not looked at, for huggingface_hub is missing: {INSTALL}")
+
+
+def cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:
+    """A row of the table."""
+    fewest, most = weights.views
+    count = weights.parameters
+    return (
+        weights.name,
+        weights.model if weights.gives == "Gaussians" else f"{weights.model}, {weights.gives} only",
+        "?" if count is None else f"{count / 1e6:.1f} M",
+        f"{fewest}" if fewest == most else f"{fewest}-{most}",
+        weights.size,
+        f"{weights.code_licence} / {weights.weights_licence}{' (!)' if weights.caution else ''}",
+        "no" if path is None else str(path),
+        weights.source,
+    )

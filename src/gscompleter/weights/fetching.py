@@ -1,0 +1,122 @@
+"""Where a file of weights comes from: a path, our cache, the hub's cache, or a download.
+
+Nothing here imports torch.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+
+from gscompleter.errors import InputError
+from gscompleter.weights.published import PublishedWeights
+
+INSTALL = "pip install 'gscompleter[models]'"
+
+
+class WeightsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in a sentence)
+    """The published weights are not on this machine."""
+
+
+def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = False) -> Path:
+    """The path of a file of weights, downloaded where it is not on this machine yet.
+
+    What the file holds is checked when it is read. A download shows the hub's progress bar and
+    lands in the hub's cache.
+
+    Args:
+        weights: Which file.
+        local: The file, or a folder that holds it under its published name. None looks into our
+            cache (`place_of`), then into that of the hub.
+        offline: Download nothing. The environment variable HF_HUB_OFFLINE=1 says the same.
+
+    Raises:
+        InputError: where `local` does not exist.
+        WeightsNotAvailable: where the file is not here and cannot be downloaded.
+    """
+    if local is not None:
+        return _given(weights, local)
+    found = cached(weights)
+    if found is not None:
+        return found
+    if weights.repository is None:
+        raise WeightsNotAvailable(
+            f"The weights {weights.name} are not on this machine, and no program can fetch them: "
+            f"{_by_hand(weights)}."
+        )
+    return _download(weights, offline)
+
+
+def place_of(weights: PublishedWeights) -> Path:
+    """Where a file that was fetched by hand is looked for: `weights/MODEL/FILE` in our cache.
+
+    Our cache is the folder $GSCOMPLETER_HOME, or else ~/.cache/gscompleter.
+    """
+    home = os.environ.get("GSCOMPLETER_HOME")
+    root = Path(home).expanduser() if home else Path.home() / ".cache" / "gscompleter"
+    return root / "weights" / weights.model.lower() / weights.file
+
+
+def cached(weights: PublishedWeights) -> Path | None:
+    """The file in our cache or in that of the hub, or None; nothing is downloaded."""
+    place = place_of(weights)
+    if place.is_file():
+        return place
+    if weights.repository is None or not hub_is_installed():
+        return None
+    from huggingface_hub import try_to_load_from_cache
+
+    found = try_to_load_from_cache(weights.repository, weights.file, revision=weights.revision)
+    return Path(found) if isinstance(found, str) else None
+
+
+def hub_is_installed() -> bool:
+    """Whether the package huggingface_hub is there, without which no hub cache is seen."""
+    return find_spec("huggingface_hub") is not None
+
+
+def _given(weights: PublishedWeights, local: Path) -> Path:
+    path = local / weights.file if local.is_dir() else local
+    if not path.is_file():
+        raise InputError(
+            f"There are no weights at {path}; name the file {weights.file} or a folder that holds "
+            f"it, which {weights.source} gives out."
+        )
+    return path
+
+
+def _by_hand(weights: PublishedWeights) -> str:
+    return f"fetch {weights.file} from {weights.url} and put it at {place_of(weights)}"
+
+
+def _download(weights: PublishedWeights, offline: bool) -> Path:
+    assert weights.repository is not None
+    try:
+        from huggingface_hub import constants, hf_hub_download
+        from huggingface_hub.errors import LocalEntryNotFoundError
+    except ImportError as error:
+        raise WeightsNotAvailable(
+            f"To download the weights {weights.name}, huggingface_hub is needed: {INSTALL}; or "
+            f"{_by_hand(weights)}."
+        ) from error
+    offline = offline or constants.HF_HUB_OFFLINE
+    try:
+        path = hf_hub_download(
+            weights.repository, weights.file, revision=weights.revision, local_files_only=offline
+        )
+    except LocalEntryNotFoundError as error:
+        reason = "downloads are off" if offline else "the hub cannot be reached"
+        raise WeightsNotAvailable(
+            f"The weights {weights.name} are not on this machine and {reason}; where there is a "
+            f"connection, {_by_hand(weights)}."
+        ) from error
+    except Exception as error:
+        # Which library's errors come through depends on the version of huggingface_hub; whatever
+        # it was, the way out is the same.
+        reason = " ".join(str(error).split())
+        raise WeightsNotAvailable(
+            f"The weights {weights.name} could not be downloaded ({type(error).__name__}: "
+            f"{reason}); try again, or {_by_hand(weights)}."
+        ) from error
+    return Path(path)

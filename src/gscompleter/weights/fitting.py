@@ -1,0 +1,65 @@
+"""Tensors into a network: all of them, each of its shape, or a sentence that says what differs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from torch import Tensor, nn
+
+from gscompleter.errors import InputError
+
+Shapes = Mapping[str, tuple[int, ...]]
+"""The shape of each tensor of a network, by its name."""
+
+
+def load_strictly(
+    model: nn.Module,
+    state_dict: Mapping[str, Tensor],
+    where: Path | str,
+    variants: Callable[[], Mapping[str, Shapes]] | None = None,
+) -> None:
+    """Fill a network with tensors that fit it exactly; it stays as it is where they do not.
+
+    Args:
+        model: The network.
+        state_dict: Its tensors, parameters and buffers, by their names in the network.
+        where: Where they come from, for the sentence.
+        variants: Gives the shapes of every network that there is, by name; it is called where the
+            tensors do not fit, to say which network they belong to.
+
+    Raises:
+        InputError: where a tensor is missing, is one too many, or has another shape.
+    """
+    needed, given = shapes_of(model.state_dict()), shapes_of(state_dict)
+    if needed != given:
+        known = {} if variants is None else variants()
+        right = [name for name, shapes in known.items() if dict(shapes) == given]
+        advice = f"its tensors are those of {' or '.join(right)}" if right else "give another file"
+        raise InputError(
+            f"{where} does not fit the network {type(model).__name__}: "
+            f"{differences(needed, given)}; {advice}."
+        )
+    model.load_state_dict(state_dict, strict=True)
+
+
+def shapes_of(state_dict: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    """The shape of each tensor."""
+    return {name: tuple(tensor.shape) for name, tensor in state_dict.items()}
+
+
+def differences(needed: Shapes, given: Shapes) -> str:
+    """How two lists of tensors differ, in words, with an example of each kind."""
+    missing = [name for name in needed if name not in given]
+    extra = [name for name in given if name not in needed]
+    other = [name for name in needed if name in given and needed[name] != given[name]]
+    parts = []
+    if missing:
+        parts.append(f"it lacks {len(missing)} of {len(needed)} tensors (such as {missing[0]})")
+    if extra:
+        parts.append(f"it has {len(extra)} that the network does not know (such as {extra[0]})")
+    if other:
+        name = other[0]
+        shapes = f"{list(given[name])} instead of {list(needed[name])}"
+        parts.append(f"it has {len(other)} of another shape (such as {name}, {shapes})")
+    return ", ".join(parts)

@@ -1,0 +1,277 @@
+"""Every file of weights that the feed-forward reconstructors can be filled with.
+
+Nothing here imports torch, so that `gscompleter models` answers at once. The hub was out of reach
+when this was written: names, digits and licences are those that the authors' pages state, and none
+of the files was downloaded to confirm them.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedWeights:
+    """A file of weights as its authors publish it, and what is known of it."""
+
+    name: str
+    """What it is called here: model, size, data it was trained on, and the size of the images
+    unless that is 256x256."""
+    model: str
+    """The method, as its authors write it."""
+    network: str | None
+    """The configuration that its tensors fit; None where the authors do not say."""
+    repository: str | None
+    """Repository on the Hugging Face hub; None where the file lies elsewhere."""
+    revision: str | None
+    """Commit of the repository, or `main` where none is known, which pins nothing."""
+    file: str
+    """The published name of the file."""
+    sha256: str | None
+    """Its SHA-256, or as many leading hex digits as are published; None where none are."""
+    megabytes: int | None
+    """Size of the file in MB, where it is known."""
+    parameters: int | None
+    """Learned numbers; rounded to millions where only the authors' figure is known."""
+    views: tuple[int, int]
+    """Fewest and most views it was trained with."""
+    image_size: tuple[int, int]
+    """Height and width of the images it was trained on, in pixels."""
+    near_far: tuple[float, float] | None
+    """Smallest and largest depth of its authors' evaluation, in scene units, where known."""
+    code: str
+    """Page of the authors' code."""
+    code_licence: str
+    """Licence of that code. Ours is written anew and does not depend on it."""
+    weights_licence: str
+    """Licence that is stated for the file, or `not stated`."""
+    caution: str
+    """Why commercial use is unclear; empty where a licence allows it plainly."""
+    source: str
+    """Page from which the authors give out the file."""
+    entry: str = "state_dict"
+    """Entry of the file that holds the tensors, where they do not lie at the top."""
+    prefix: str = "encoder."
+    """How the names of the network's tensors begin in the file."""
+    gives: Literal["Gaussians", "depth"] = "Gaussians"
+    """What the network predicts. Those of depth alone are no reconstructors."""
+
+    @property
+    def url(self) -> str:
+        """Where a browser finds the file: itself, or the folder that holds it."""
+        if self.repository is None:
+            return self.source
+        return f"https://huggingface.co/{self.repository}/resolve/{self.revision}/{self.file}"
+
+    @property
+    def pinned_by(self) -> str:
+        """What makes sure that the file is the published one."""
+        if self.sha256 is None:
+            return "nothing"
+        digits = len(self.sha256)
+        return "SHA-256" if digits == 64 else f"first {digits} digits of SHA-256"
+
+    @property
+    def size(self) -> str:
+        """Its size in words; 4 bytes a parameter are the least where the size is not known."""
+        if self.megabytes is not None:
+            return f"{self.megabytes} MB"
+        return "?" if self.parameters is None else f">= {self.parameters * 4 // 10**6} MB"
+
+
+UNSTATED = "not stated"
+UNLICENSED = "no licence is stated for the file"
+FROM_DEPTH_ANYTHING = "training started from Depth Anything V2 {}, which is CC BY-NC 4.0"
+ON_DL3DV = "trained on DL3DV-10K, whose terms allow non-commercial research only"
+
+MVSPLAT = PublishedWeights(
+    name="mvsplat-re10k",
+    model="MVSplat",
+    network="mvsplat",
+    repository=None,
+    revision=None,
+    file="re10k.ckpt",
+    sha256=None,
+    megabytes=48,
+    parameters=11_955_734,
+    views=(2, 2),
+    image_size=(256, 256),
+    near_far=(1.0, 100.0),
+    code="https://github.com/donydchen/mvsplat",
+    code_licence="MIT",
+    weights_licence=UNSTATED,
+    caution=UNLICENSED,
+    source="https://drive.google.com/drive/folders/14_E_5R6ojOWnLSrSVLVEMHnTiKsfddjU",
+)
+
+VOLSPLAT = PublishedWeights(
+    name="volsplat-re10k",
+    model="VolSplat",
+    network="volsplat",
+    repository="lhmd/VolSplat",
+    revision="main",
+    file="volsplat-re10k-256x256.ckpt",
+    sha256=None,
+    megabytes=None,
+    parameters=137_998_741,
+    views=(6, 6),
+    image_size=(256, 256),
+    near_far=(0.5, 100.0),
+    code="https://github.com/ziplab/VolSplat",
+    code_licence="MIT",
+    weights_licence=UNSTATED,
+    caution=f"{UNLICENSED}; {FROM_DEPTH_ANYTHING.format('Base')}",
+    source="https://huggingface.co/lhmd/VolSplat",
+)
+
+DEPTHSPLAT = PublishedWeights(
+    name="depthsplat-small-re10k",
+    model="DepthSplat",
+    network="depthsplat-small-s1-u4-l4",
+    repository="haofeixu/depthsplat",
+    revision="main",
+    file="depthsplat-gs-small-re10k-256x256-view2-cfeab6b1.pth",
+    sha256="cfeab6b1",
+    megabytes=None,
+    parameters=38_346_416,
+    views=(2, 2),
+    image_size=(256, 256),
+    near_far=(0.5, 100.0),
+    code="https://github.com/cvg/depthsplat",
+    code_licence="MIT",
+    weights_licence="MIT",
+    caution="",
+    source="https://huggingface.co/haofeixu/depthsplat",
+)
+
+# Learned numbers of each configuration: the size of its ViT, scales of its cost volume, factor of
+# its upsampler, and the fraction (one in ...) of the image's size at which matching begins.
+PARAMETERS = {
+    "depthsplat-small-s1-u8-l8": 38_404_880,
+    "depthsplat-base-s2-u2-l4": 120_747_896,
+    "depthsplat-base-s2-u4-l8": 120_877_016,
+    "depthsplat-large-s2-u2-l4": 354_337_760,
+    "depthsplat-depth-base-s2-u4-l8": 111_229_753,
+}
+
+
+def _depthsplat(name: str, file: str, network: str | None, **others: Any) -> PublishedWeights:
+    """Another file of DepthSplat: its name carries image size and leading digits of its SHA-256."""
+    parts = re.search(r"-(\d+)x(\d+)-.*-([0-9a-f]{8})\.pth$", file)
+    assert parts is not None, file
+    known: dict[str, Any] = {
+        "name": name,
+        "file": file,
+        "network": network,
+        "parameters": PARAMETERS.get(network or ""),
+        "image_size": (int(parts[1]), int(parts[2])),
+        "sha256": parts[3],
+    }
+    return replace(DEPTHSPLAT, **(known | others))
+
+
+FROM_BASE, FROM_LARGE = FROM_DEPTH_ANYTHING.format("Base"), FROM_DEPTH_ANYTHING.format("Large")
+ON_DEPTH_DATA = f"{ON_DL3DV}, and on ScanNet, TartanAir and VKITTI2, which have their own terms"
+BASELINE: dict[str, Any] = {
+    "repository": VOLSPLAT.repository,
+    "revision": VOLSPLAT.revision,
+    "megabytes": None,
+    "views": VOLSPLAT.views,
+    "near_far": None,
+    "source": VOLSPLAT.source,
+}
+DEPTH_ALONE: dict[str, Any] = {
+    "views": (2, 8),
+    "near_far": None,
+    "entry": "model",
+    "prefix": "",
+    "gives": "depth",
+}
+
+_FILES = (
+    MVSPLAT,
+    replace(MVSPLAT, name="mvsplat-acid", file="acid.ckpt"),
+    # Retrained by VolSplat's authors. Whether their tensors are named as those above is not known.
+    replace(
+        MVSPLAT,
+        name="mvsplat-re10k-6view",
+        file="mvsplat-re10k-baseline-256x256.ckpt",
+        **BASELINE,
+    ),
+    DEPTHSPLAT,
+    _depthsplat(
+        "depthsplat-base-re10k",
+        "depthsplat-gs-base-re10k-256x256-view2-ca7b6795.pth",
+        "depthsplat-base-s2-u2-l4",
+        caution=FROM_BASE,
+    ),
+    _depthsplat(
+        "depthsplat-large-re10k",
+        "depthsplat-gs-large-re10k-256x256-view2-e0f0f27a.pth",
+        "depthsplat-large-s2-u2-l4",
+        caution=FROM_LARGE,
+    ),
+    _depthsplat(
+        "depthsplat-base-re10k-256x448",
+        "depthsplat-gs-base-re10k-256x448-view2-fea94f65.pth",
+        "depthsplat-base-s2-u4-l8",
+        caution=FROM_BASE,
+    ),
+    _depthsplat(
+        "depthsplat-base-dl3dv-256x448",
+        "depthsplat-gs-base-dl3dv-256x448-randview2-6-02c7b19d.pth",
+        "depthsplat-base-s2-u4-l8",
+        views=(2, 6),
+        near_far=(0.5, 200.0),
+        caution=f"{ON_DL3DV}; {FROM_BASE}",
+    ),
+    _depthsplat(
+        "depthsplat-small-re10kdl3dv-448x768",
+        "depthsplat-gs-small-re10kdl3dv-448x768-randview4-10-c08188db.pth",
+        "depthsplat-small-s1-u8-l8",
+        views=(4, 10),
+        near_far=(0.5, 200.0),
+        caution=ON_DL3DV,
+    ),
+    _depthsplat(
+        "depthsplat-base-re10kdl3dv-448x768",
+        "depthsplat-gs-base-re10kdl3dv-448x768-randview2-6-f8ddd845.pth",
+        "depthsplat-base-s2-u4-l8",
+        views=(2, 6),
+        near_far=(0.5, 200.0),
+        caution=f"{ON_DL3DV}; {FROM_BASE}",
+    ),
+    # Also retrained by VolSplat's authors, who do not say how large it is.
+    replace(
+        DEPTHSPLAT,
+        name="depthsplat-re10k-6view",
+        network=None,
+        file="depthsplat-re10k-baseline-256x256.ckpt",
+        sha256=None,
+        parameters=None,
+        weights_licence=UNSTATED,
+        caution=UNLICENSED,
+        **BASELINE,
+    ),
+    # The authors do not say which upsampling it has.
+    _depthsplat(
+        "depthsplat-depth-small-352x640",
+        "depthsplat-depth-small-352x640-randview2-8-e807bd82.pth",
+        network=None,
+        parameters=36_000_000,
+        caution=ON_DEPTH_DATA,
+        **DEPTH_ALONE,
+    ),
+    _depthsplat(
+        "depthsplat-depth-base-352x640",
+        "depthsplat-depth-base-352x640-randview2-8-65a892c5.pth",
+        "depthsplat-depth-base-s2-u4-l8",
+        caution=f"{ON_DEPTH_DATA}; {FROM_BASE}",
+        **DEPTH_ALONE,
+    ),
+    VOLSPLAT,
+)
+
+PUBLISHED: dict[str, PublishedWeights] = {weights.name: weights for weights in _FILES}

@@ -1,0 +1,199 @@
+"""From a file of weights to named tensors, and to nothing else: code in a file is never run."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.weights.published import PUBLISHED, PublishedWeights
+
+NOT_THE_ENCODERS = ("decoder.", "losses.")
+"""How the names of other parts begin that the authors' training saves beside the network."""
+
+
+def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
+    """The tensors of the network in a file, on the CPU, by the names they have in the network.
+
+    The file is compared with the published SHA-256, as far as that is known; without one, a
+    damaged archive is still found by its checksums. A `.safetensors` file in place of a published
+    pickle is somebody's conversion or own training and has no published hash: its tensors only
+    have to fit. Tensors are mapped from the file, not copied, where its format allows that.
+
+    Raises:
+        InputError: where the file is missing, damaged, another one, or holds more than tensors.
+    """
+    check_kind(path, weights.file)
+    converted = path.suffix == ".safetensors" and not weights.file.endswith(".safetensors")
+    if weights.sha256 is not None and not converted:
+        check_sha256(path, weights.sha256, weights.file)
+    else:
+        check_archive(path, weights.file)
+    read = read_safetensors if path.suffix == ".safetensors" else read_tensors
+    return tensors_of_network(read(path, weights.file), path, weights)
+
+
+def check_kind(path: Path, name: str) -> None:
+    """Find by its first and last bytes that a file is no file of weights at all.
+
+    Raises:
+        InputError: where it is missing, empty, a pointer, a web page, or cut off.
+    """
+    if not path.is_file():
+        raise InputError(f"There is no file {path}; {name} is needed there.")
+    try:
+        with path.open("rb") as file:
+            head = file.read(64)
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be opened ({error.strerror}); make it readable."
+        ) from error
+    wrong = ""
+    if not head:
+        wrong = "is empty"
+    elif head.startswith(b"version https://git-lfs"):
+        wrong = "is a pointer of git-lfs and not the file itself"
+    elif head.lstrip().lower().startswith((b"<!doctype", b"<html")):
+        wrong = "is a web page that was saved under this name"
+    elif head.startswith(b"PK\x03\x04") and not zipfile.is_zipfile(path):
+        wrong = "ends too early, as after an interrupted download"
+    if wrong:
+        raise InputError(f"{path} {wrong}; {_replace_it(path, name)}.")
+
+
+def check_sha256(path: Path, expected: str, name: str) -> None:
+    """Compare a file with a published SHA-256, or with the leading digits that are known of it.
+
+    Raises:
+        InputError: where it is another file; where it is another published one, the name of that.
+    """
+    digest = sha256_of(path)
+    if digest.startswith(expected):
+        return
+    for other in PUBLISHED.values():
+        if other.sha256 is not None and digest.startswith(other.sha256):
+            raise InputError(
+                f"{path} is not the published file {name} but that of {other.name}; choose that "
+                f"model, or fetch {name}."
+            )
+    raise InputError(
+        f"{path} is not the published file {name}: its SHA-256 begins with {digest[:8]} instead "
+        f"of {expected[:8]}; {_replace_it(path, name)}."
+    )
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file in hex digits; a megabyte of it is in memory at a time."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def check_archive(path: Path, name: str) -> None:
+    """Compare the parts of a zip archive, as which torch saves, with their checksums.
+
+    Raises:
+        InputError: where one differs.
+    """
+    if not zipfile.is_zipfile(path):
+        return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, EOFError) as error:
+        damaged = str(error)
+    if damaged is not None:
+        raise InputError(f"{path} is damaged ({damaged}); {_replace_it(path, name)}.")
+
+
+def read_tensors(path: Path, name: str) -> Any:
+    """What torch saved in a file: tensors in plain containers. Anything else is refused.
+
+    Raises:
+        InputError: where the file holds pickled Python objects, or is no file of torch.
+    """
+    try:
+        # Older files of torch are no zip archives and cannot be mapped.
+        mapped = zipfile.is_zipfile(path)
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+    except pickle.UnpicklingError as error:
+        found = re.search(r"GLOBAL (\S+)", str(error))
+        if found is None:
+            raise InputError(
+                f"{path} holds no plain weights; {_replace_it(path, name)}."
+            ) from error
+        raise InputError(
+            f"{path} holds no plain weights but Python objects too ({found[1]}), and to load those "
+            f"may run any code; {_replace_it(path, name)}."
+        ) from error
+    except Exception as error:  # a damaged pickle can fail in any way
+        raise InputError(f"{path} cannot be read by torch; {_replace_it(path, name)}.") from error
+
+
+def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
+    """The tensors of a `.safetensors` file.
+
+    Raises:
+        InputError: where it is damaged, or the package safetensors is not there.
+    """
+    try:
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+    except ImportError as error:
+        raise InputError(
+            f"To read {path}, safetensors is needed: pip install safetensors; or give {name}."
+        ) from error
+    try:
+        return load_file(path)
+    except SafetensorError as error:
+        raise InputError(f"{path} is no safetensors file ({error}); give {name}.") from error
+
+
+def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
+    """The network's tensors among what a file holds, without what goes before their names.
+
+    Raises:
+        InputError: where there are none, or others than are known to lie beside them.
+    """
+    inner = content.get(weights.entry, content) if isinstance(content, Mapping) else None
+    if not isinstance(inner, Mapping) or not all(isinstance(key, str) for key in inner):
+        raise InputError(f"{path} holds no named tensors; give {weights.file}.")
+    prefix = weights.prefix
+    found = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
+    if not found:
+        raise InputError(
+            f"{path} holds no tensors named {prefix}…, but {_some(list(inner))}; give "
+            f"{weights.file}."
+        )
+    unknown = [
+        key
+        for key, value in inner.items()
+        if not (key.startswith(prefix) and isinstance(value, Tensor))
+        and not key.startswith(NOT_THE_ENCODERS)
+    ]
+    if unknown:
+        raise InputError(
+            f"{path} holds more than the network {weights.name}: {_some(unknown)}; give "
+            f"{weights.file}."
+        )
+    return found
+
+
+def _replace_it(path: Path, name: str) -> str:
+    # In the hub's cache the path is a link; without the file behind it, it is fetched anew.
+    return f"delete {path.resolve()} and fetch {name} again"
+
+
+def _some(keys: list[str]) -> str:
+    shown = ", ".join(keys[:3]) or "nothing"
+    return f"{shown} and {len(keys) - 3} more" if len(keys) > 3 else shown
