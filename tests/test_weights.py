@@ -602,14 +602,14 @@ def test_variants_are_only_built_where_they_are_needed():
 def test_a_reconstructor_gets_the_path_of_its_weights(monkeypatch: pytest.MonkeyPatch):
     got = []
 
-    def make(weights: Path | None) -> Reconstructor:
-        got.append(weights)
+    def make(weights: Path | None, device: str) -> Reconstructor:
+        got.append((weights, device))
         return PlaneSweep()
 
     monkeypatch.setitem(reconstructors.RECONSTRUCTORS, "mine", make)
-    load_reconstructor("mine", Path("w.pth"))
+    load_reconstructor("mine", Path("w.pth"), "cuda")
     load_reconstructor("mine")
-    assert got == [Path("w.pth"), None]
+    assert got == [(Path("w.pth"), "cuda"), (None, "cpu")]
 
 
 def test_the_embedded_reconstructor_takes_no_weights():

@@ -31,7 +31,10 @@ class CompleteOptions:
     """A .ply of Gaussians to complete, in the frame of the photographs. It is kept as it is.
     Without it the context is reconstructed from the photographs."""
     reconstructor: str = "plane-sweep"
-    """The model that turns views into Gaussians."""
+    """The model that turns views into Gaussians: plane-sweep, which needs no weights, or one of
+    those that `gscompleter models` lists."""
+    weights: Path | None = None
+    """The file of its weights, where they are not to be downloaded."""
     generator: str = "warp-inpaint"
     """The model that synthesizes the image at the target."""
     resolution: tuple[int, int] | None = None
@@ -108,7 +111,10 @@ class EvaluateOptions:
     limit: int | None = None
     """Most cases to do, in all shards together."""
     reconstructor: str = "plane-sweep"
-    """The model that turns views into Gaussians."""
+    """The model that turns views into Gaussians: plane-sweep, which needs no weights, or one of
+    those that `gscompleter models` lists."""
+    weights: Path | None = None
+    """The file of its weights, where they are not to be downloaded."""
     generator: str = "warp-inpaint"
     """The model that synthesizes the image at the target."""
     device: Device = "auto"

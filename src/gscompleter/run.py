@@ -65,7 +65,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         if target.photograph is not None
     ]
     completer = GSCompleter(
-        load_reconstructor(options.reconstructor),
+        load_reconstructor(options.reconstructor, options.weights, device),
         load_generator(options.generator, options.seed, photographs),
         renderer,
         config,
@@ -142,6 +142,7 @@ def settings_of(options: CompleteOptions, config: CompleterConfig) -> dict[str, 
         "target": list(options.target),
         "scene": None if options.scene is None else str(options.scene),
         "reconstructor": options.reconstructor,
+        "weights": None if options.weights is None else str(options.weights),
         "generator": options.generator,
         "uses_target_photographs": options.generator == "oracle",
         "resolution": None if options.resolution is None else list(options.resolution),

@@ -64,10 +64,11 @@ def run_evaluation(options: EvaluateOptions) -> None:
     for clip in skipped:
         console.print(f"Left out {clip.name}: {clip.reason}.", highlight=False)
     config = RunConfig(
-        options.reconstructor,
-        options.generator,
-        choose_device(options.device),
-        options.seed,
+        reconstructor=options.reconstructor,
+        weights=None if options.weights is None else str(options.weights),
+        generator=options.generator,
+        device=choose_device(options.device),
+        seed=options.seed,
         source=source_of(options),
     )
     sequences = [case for case in cases if isinstance(case, SequenceCase)]

@@ -42,7 +42,7 @@ from gscompleter.evaluation.store import (
 from gscompleter.generators import load_generator
 from gscompleter.io.image import write_image
 from gscompleter.progress import shown_on, track
-from gscompleter.reconstructors import load_reconstructor
+from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.types import View
 
@@ -83,6 +83,8 @@ class RunConfig:
     """What decides the numbers, beside the cases."""
 
     reconstructor: str = "plane-sweep"
+    weights: str | None = None
+    """The file of the reconstructor's weights; None takes the published ones."""
     generator: str = "warp-inpaint"
     device: Literal["cpu", "cuda"] = "cpu"
     seed: int = 0
@@ -92,10 +94,15 @@ class RunConfig:
     source: Mapping[str, Any] = field(default_factory=dict)
     """Where the cases come from, so that no folder mixes two sources."""
 
+    def load_reconstructor(self) -> Reconstructor:
+        """Ψ. One with weights is kept from one case to the next."""
+        weights = None if self.weights is None else Path(self.weights)
+        return load_reconstructor(self.reconstructor, weights, self.device)
+
     def parts(self, *targets: View) -> Parts:
         """The models for a case. Only the generator `oracle` looks at the images of `targets`."""
         return Parts(
-            load_reconstructor(self.reconstructor),
+            self.load_reconstructor(),
             load_generator(self.generator, self.seed, targets),
             load_renderer(self.device),
             self.seed,
@@ -171,7 +178,7 @@ def begin(
     slow = [name for name in methods if name in BASELINES]
     if slow and config.device != "cpu":
         raise InputError(f"{', '.join(slow)} can only run on a CPU; use --device cpu.")
-    load_reconstructor(config.reconstructor)
+    config.load_reconstructor()
     load_generator(config.generator)
     claim(out, config)
 

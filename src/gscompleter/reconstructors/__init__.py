@@ -6,11 +6,13 @@ A reconstructor is anything callable with views. The table of names serves the c
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from gscompleter.errors import InputError
 from gscompleter.types import Reconstruction, View
+from gscompleter.weights.published import PUBLISHED
 
 
 @runtime_checkable
@@ -24,7 +26,7 @@ class Reconstructor(Protocol):
     def __call__(self, views: Sequence[View]) -> Reconstruction: ...
 
 
-def _plane_sweep(weights: Path | None) -> Reconstructor:
+def _plane_sweep(weights: Path | None, device: str) -> Reconstructor:
     from gscompleter.reconstructors.plane_sweep import PlaneSweep
 
     if weights is not None:
@@ -32,20 +34,30 @@ def _plane_sweep(weights: Path | None) -> Reconstructor:
     return PlaneSweep()
 
 
-RECONSTRUCTORS: dict[str, Callable[[Path | None], Reconstructor]] = {
+def _feed_forward(name: str, weights: Path | None, device: str) -> Reconstructor:
+    from gscompleter.reconstructors.feed_forward.build import build
+
+    return build(name, weights, device)
+
+
+RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
     "plane-sweep": _plane_sweep,
+    **{name: partial(_feed_forward, name) for name, w in PUBLISHED.items() if w.is_reconstructor},
 }
-"""How each reconstructor is made, from the path of its weights or, without one, the published
-ones."""
+"""How each reconstructor is made, from the path of its weights (None takes the published ones) and
+the device that it runs on."""
 
 
-def load_reconstructor(name: str, weights: Path | None = None) -> Reconstructor:
+def load_reconstructor(
+    name: str, weights: Path | None = None, device: str = "cpu"
+) -> Reconstructor:
     """The reconstructor called `name`.
 
     Args:
         name: One of RECONSTRUCTORS.
         weights: The file of its weights; None takes the published ones, which are downloaded
             where they are not on this machine.
+        device: Where a network runs. `plane-sweep` computes on the CPU, wherever its views lie.
 
     Raises:
         InputError: where there is none of that name, it takes no weights and some are given, or
@@ -55,4 +67,4 @@ def load_reconstructor(name: str, weights: Path | None = None) -> Reconstructor:
         raise InputError(
             f"There is no reconstructor {name!r}; choose one of {', '.join(RECONSTRUCTORS)}."
         )
-    return RECONSTRUCTORS[name](weights)
+    return RECONSTRUCTORS[name](weights, device)

@@ -66,6 +66,11 @@ class PublishedWeights:
         return f"https://huggingface.co/{self.repository}/resolve/{self.revision}/{self.file}"
 
     @property
+    def is_reconstructor(self) -> bool:
+        """Whether it gives Gaussians, and to which network it belongs is known."""
+        return self.gives == "Gaussians" and self.network is not None
+
+    @property
     def pinned_by(self) -> str:
         """What makes sure that the file is the published one."""
         if self.sha256 is None:

@@ -1,0 +1,73 @@
+"""From the name of published weights to a reconstructor that holds them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from gscompleter.reconstructors.feed_forward.depthsplat import VARIANTS, DepthSplat
+from gscompleter.reconstructors.feed_forward.mvsplat import MVSplat, MVSplatConfig
+from gscompleter.reconstructors.feed_forward.reconstructor import FeedForward
+from gscompleter.reconstructors.feed_forward.volsplat import VolSplat, VolSplatConfig
+from gscompleter.weights import (
+    PUBLISHED,
+    PublishedWeights,
+    fetch,
+    load_strictly,
+    read_state_dict,
+)
+from gscompleter.weights.fitting import shapes_of
+
+Network = MVSplat | DepthSplat | VolSplat
+
+
+@lru_cache(maxsize=1)
+def build(name: str, weights: Path | None = None, device: str = "cpu") -> FeedForward:
+    """The reconstructor with the published weights of that name; the last one is kept.
+
+    Args:
+        name: A key of `PUBLISHED` whose file gives Gaussians.
+        weights: The file, or a folder that holds it; None takes the published one.
+        device: Where the network runs.
+
+    Raises:
+        InputError: where the weights cannot be had, are damaged, or belong to another network.
+    """
+    published = PUBLISHED[name]
+    path = fetch(published, weights)
+    state = read_state_dict(path, published)
+    network = network_of(published)
+    load_strictly(network, state, path, shapes_of_all)
+    return FeedForward(network.eval().requires_grad_(False).to(device))
+
+
+def network_of(published: PublishedWeights) -> Network:
+    """The network that a file fits, with random weights, set up for what it was trained on."""
+    near, far = published.near_far or (None, None)
+    if published.model == "DepthSplat":
+        depthsplat = VARIANTS[variant_of(published)]
+        return DepthSplat(replace(depthsplat, near=near, far=far) if near and far else depthsplat)
+    if published.model == "MVSplat":
+        mvsplat = MVSplatConfig()
+        return MVSplat(replace(mvsplat, near=near, far=far) if near and far else mvsplat)
+    volsplat = VolSplatConfig()
+    return VolSplat(replace(volsplat, near=near, far=far) if near and far else volsplat)
+
+
+def variant_of(published: PublishedWeights) -> str:
+    """The key of `VARIANTS`: the published name leaves out a size of 256x256."""
+    key = published.name.removeprefix("depthsplat-")
+    return key if key in VARIANTS else f"{key}-256x256"
+
+
+def shapes_of_all() -> dict[str, dict[str, tuple[int, ...]]]:
+    """The tensors of every network there is, by the names of the weights that fit it."""
+    found: dict[str, dict[str, tuple[int, ...]]] = {}
+    with torch.device("meta"):
+        for published in PUBLISHED.values():
+            if published.is_reconstructor:
+                found[published.name] = shapes_of(network_of(published).state_dict())
+    return found
