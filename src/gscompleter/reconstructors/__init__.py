@@ -49,7 +49,7 @@ the device that it runs on."""
 
 
 def load_reconstructor(
-    name: str, weights: Path | None = None, device: str = "cpu"
+    name: str, weights: Path | str | None = None, device: str = "cpu"
 ) -> Reconstructor:
     """The reconstructor called `name`.
 
@@ -67,4 +67,4 @@ def load_reconstructor(
         raise InputError(
             f"There is no reconstructor {name!r}; choose one of {', '.join(RECONSTRUCTORS)}."
         )
-    return RECONSTRUCTORS[name](weights, device)
+    return RECONSTRUCTORS[name](None if weights is None else Path(weights), device)
