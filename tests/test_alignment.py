@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from gscompleter.stages.alignment import AffineConfig, fit_affine
-from gscompleter.types import DepthMap
+from gscompleter.config import CompleterConfig
+from gscompleter.stages.alignment import AffineConfig, fit_affine, unless_contradicted
+from gscompleter.types import DepthAffine, DepthMap
 
 
 def depths(low: float = 2.0, high: float = 6.0, size: int = 64) -> torch.Tensor:
@@ -77,3 +78,34 @@ def test_with_nothing_to_compare_the_identity_is_left():
 def test_the_same_seed_gives_the_same_fit():
     predicted, context = everywhere(depths(size=128)), everywhere(depths(1, 9, size=128))
     assert fit(predicted, context) == fit(predicted, context)
+
+
+def checked(scale: float, context: torch.Tensor, config: AffineConfig = AffineConfig()):
+    """What becomes of an affine that fits the anchor, where the target sees `context`."""
+    random = torch.Generator().manual_seed(0)
+    through_anchor = DepthAffine(scale, 0.0, 0.9, "ransac")
+    return unless_contradicted(
+        through_anchor, everywhere(depths()), everywhere(context), random, config
+    )
+
+
+def test_an_affine_that_the_target_contradicts_is_fitted_there():
+    affine = checked(1.2, depths() / 5)
+    assert affine.contradicted
+    assert affine.scale == pytest.approx(0.2, rel=0.01)
+    assert affine.inliers > 0.9
+
+
+def test_an_affine_that_the_target_confirms_or_cannot_judge_stays():
+    assert checked(1.0, depths() * 1.02) == DepthAffine(1.0, 0.0, 0.9, "ransac")
+    unlike = torch.rand(64, 64, generator=torch.Generator().manual_seed(5)) * 50
+    assert not checked(1.0, unlike).contradicted
+    none = DepthMap(depths(), torch.zeros(64, 64, dtype=torch.bool))
+    affine = DepthAffine(3.0, 0.0, 0.9, "ransac")
+    random = torch.Generator()
+    assert unless_contradicted(affine, everywhere(depths()), none, random, AffineConfig()) == affine
+
+
+def test_the_paper_trusts_the_anchor_always():
+    config = CompleterConfig.paper().registration.affine
+    assert checked(1.2, depths() / 5, config) == DepthAffine(1.2, 0.0, 0.9, "ransac")

@@ -252,6 +252,11 @@ def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
     notes = []
     if anchor_fallback:
         notes.append("Every view is turned too far; the least-turned one is the anchor.")
+    if affine.contradicted:
+        notes.append(
+            "At the target the scene contradicted the depths that fit the anchor; they were fitted "
+            "there instead."
+        )
     if affine.method == "median":
         notes.append("RANSAC found no trustworthy affine; the median depth ratio took its place.")
     if affine.method == "identity":

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import yaml
 
 from gscompleter.errors import InputError
+from gscompleter.stages.alignment import AffineConfig
 from gscompleter.stages.anchor import AnchorConfig
 from gscompleter.stages.free_space import FreeSpaceConfig
 from gscompleter.stages.integration import HarmConfig, HoleConfig, RefineConfig
@@ -56,6 +57,7 @@ class CompleterConfig:
                 footprint="fixed",
                 mask_occluded=False,
                 carry_into_holes=False,
+                affine=AffineConfig(min_agreement=None),
             ),
             free_space=FreeSpaceConfig(num_steps=0),
             holes=HoleConfig(neighbourhood=None),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,10 @@ def summarize(
                 "anchor": views[result.anchor].frame,
                 "anchor_fallback": result.anchor_fallback,
                 "hole_fraction": result.hole_fraction,
-                "affine": asdict(result.affine),
+                "affine": {
+                    key: getattr(result.affine, key)
+                    for key in ("scale", "shift", "inliers", "method")
+                },
                 **images.scores(),
                 "generated": provenance(result),
                 "added": len(result.added),

@@ -278,6 +278,8 @@ class DepthAffine:
     """Share of the compared pixels that agree with the fit."""
     method: Literal["ransac", "median", "identity"] = "identity"
     """How the fit was found; the later ones are the fallbacks of the earlier."""
+    contradicted: bool = False
+    """True where what the target sees of the scene took the place of what the anchor sees."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -26,6 +26,10 @@ class AffineConfig:
     """Smallest share of inliers that makes a fit trustworthy."""
     min_pixels: int = 64
     """Fewest comparable pixels; under it there is nothing to fit."""
+    min_agreement: float | None = 0.3
+    """Smallest share of what the target sees of the scene that must agree with an affine fitted
+    through the anchor, before one that is fitted at the target may take its place. None trusts the
+    anchor always, as the paper does."""
     min_depth_spread: float = 0.05
     """Smallest spread of the predicted depths ((p95 - p5) / median) that tells scale and shift
     apart; under it only a scale is fitted."""
@@ -117,10 +121,37 @@ def fit_bridge(
     """The affine that brings the lifted depths to the scene's, compared in the bridge view.
 
     The anchor is the paper's bridge: the scene is dense there, while at the target it has the very
-    holes that are to be filled.
+    holes that are to be filled. What the target sees nevertheless may contradict it.
     """
     if config.bridge == "none":
         return DepthAffine()
     if config.bridge == "target":
         return fit_affine(lift.reference_depth, at_target.depth_map(), generator, config)
-    return fit_affine(lift.anchor_depth, at_anchor.depth_map(), generator, config)
+    affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), generator, config)
+    return unless_contradicted(
+        affine, lift.reference_depth, at_target.depth_map(), generator, config
+    )
+
+
+def unless_contradicted(
+    affine: DepthAffine,
+    predicted: DepthMap,
+    context: DepthMap,
+    generator: torch.Generator,
+    config: AffineConfig,
+) -> DepthAffine:
+    """`affine`, unless the scene that the target sees has other depths and one other affine.
+
+    Where a pair shares too little for stereo (hardly any overlap, poses that drift), Ψ's depths of
+    its two views need not be of one scale, and what fits the anchor is wrong at the target.
+    """
+    comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
+    if config.min_agreement is None or comparable.sum() < config.min_pixels:
+        return affine
+    x, y = predicted.depth[comparable].double(), context.depth[comparable].double()
+    agree = affine_inliers(x, y, affine.scale, affine.shift, config).double().mean().item()
+    if agree >= config.min_agreement:
+        return affine
+    own = fit_affine(predicted, context, generator, config)
+    # Twice as many: where neither fits well, the paper's choice stands.
+    return replace(own, contradicted=True) if own.inliers > 2 * agree else affine
