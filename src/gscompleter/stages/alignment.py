@@ -153,5 +153,6 @@ def unless_contradicted(
     if agree >= config.min_agreement:
         return affine
     own = fit_affine(predicted, context, generator, config)
-    # Twice as many: where neither fits well, the paper's choice stands.
-    return replace(own, contradicted=True) if own.inliers > 2 * agree else affine
+    # Where neither fits well, the paper's choice stands.
+    trusted = own.inliers >= max(config.min_inliers, 2 * agree)
+    return replace(own, contradicted=True) if trusted else affine
