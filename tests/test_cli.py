@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 
+from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.cli import main
 from gscompleter.io.image import write_image
 from gscompleter.io.scene import write_cameras
 from scenes import Room, camera_at, view_of
@@ -33,16 +33,6 @@ def scene(tmp_path_factory) -> Path:
         write_image(folder / name, view_of(Room(), camera).image)
     write_cameras(folder / "transforms.json", cameras, names)
     return folder
-
-
-def run(monkeypatch, *arguments) -> int:
-    """Run the command in this process; returns its exit code."""
-    monkeypatch.setattr(sys, "argv", ["gscompleter", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as stop:
-        return stop.code or 0
-    return 0
 
 
 def complete(scene, out, *more, context=(0, 1), target=(2,)) -> list:

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from chunk_files import as_tensor, example, save_chunk
+from command import run
 from gscompleter import GSCompleter, InputError
-from gscompleter.cli import main
 from gscompleter.completer import STAGES
 from gscompleter.evaluation import runs
 from gscompleter.evaluation.cases import Case
@@ -331,16 +331,6 @@ def test_wrong_runs_are_refused(finished, cases, tmp_path):
         evaluate(cases, ["context"], tmp_path, CONFIG)
     with pytest.raises(InputError, match="holds no run"):
         tables(tmp_path)
-
-
-def run(monkeypatch, *arguments) -> int:
-    """Run the command in this process; returns its exit code."""
-    monkeypatch.setattr(sys, "argv", ["gscompleter", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as stop:
-        return stop.code or 0
-    return 0
 
 
 def test_the_commands_run_end_to_end(scenes, tmp_path, monkeypatch, capsys):

@@ -2,14 +2,13 @@
 the authors' (which were not at hand): what is loaded, what is refused, and a whole completion."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
+from command import run
 from gscompleter import InputError, load_reconstructor
-from gscompleter.cli import main
 from gscompleter.io.image import write_image
 from gscompleter.io.scene import write_cameras
 from gscompleter.reconstructors import RECONSTRUCTORS
@@ -92,9 +91,7 @@ def test_a_completion_with_random_weights_runs_end_to_end(mvsplat_file, tmp_path
     arguments = ["complete", scene, "--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20]
     model = ["--reconstructor", "mvsplat-re10k", "--weights", mvsplat_file, "--device", "cpu"]
     out = tmp_path / "out"
-    command = ["gscompleter", *arguments, *model, "--out", out, "--quiet"]
-    monkeypatch.setattr(sys, "argv", [str(word) for word in command])
-    main()
+    assert run(monkeypatch, *arguments, *model, "--out", out, "--quiet") == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["settings"]["reconstructor"] == "mvsplat-re10k"
     assert summary["settings"]["weights"] == str(mvsplat_file)

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from command import run
 from gscompleter import InputError
 from gscompleter.baselines.reggs import RegGSConfig
-from gscompleter.cli import main
 from gscompleter.evaluation import methods, sequences
 from gscompleter.evaluation.clips import Skipped
 from gscompleter.evaluation.methods import Parts, Start, start_of
@@ -388,16 +387,6 @@ def test_without_sequences_there_are_no_tables(tmp_path):
 
 
 # The command.
-
-
-def run(monkeypatch, *arguments) -> int:
-    """Run the command in this process; returns its exit code."""
-    monkeypatch.setattr(sys, "argv", ["gscompleter", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as stop:
-        return stop.code or 0
-    return 0
 
 
 def test_the_command_runs_end_to_end(tmp_path, monkeypatch, capsys):
