@@ -85,7 +85,8 @@ def save_curves(path: Path, steps: Mapping[str, Sequence[dict[str, Any]]]) -> Pa
                 axes.plot(*zip(*known, strict=True), label=method, linewidth=1, **_style(number))
         axes.set_ylabel(title)
         axes.grid(alpha=0.3)
-    panels[-1].set_yscale("log")
+    if any(step["seconds"]["total"] > 0 for found in steps.values() for step in found):
+        panels[-1].set_yscale("log")
     panels[-1].set_xlabel("frame")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
     return _write(figure, path)
