@@ -125,7 +125,7 @@ def inpaint_pipeline() -> Any:
         text_encoder=clip_text_encoder(16),
         tokenizer=clip_tokenizer(),
         unet=unet,
-        scheduler=DDIMScheduler(),
+        scheduler=DDIMScheduler(steps_offset=1),
         safety_checker=None,
         feature_extractor=None,
         requires_safety_checker=False,

@@ -59,17 +59,17 @@ class Painter:
     ) -> Float[Tensor, "h w 3"]:
         """`image` with the hole painted, as the pipeline returns all of it."""
         size = self.size_for(*hole.shape)
+        mask = (resized(hole[..., None].float(), size) > 0).float()
         wanted: dict[str, Any] = {
             "prompt": prompt,
             "image": resized(image, size).permute(2, 0, 1)[None].cpu(),
-            "mask_image": resized(hole[..., None].float(), size).permute(2, 0, 1)[None].cpu(),
+            "mask_image": mask.permute(2, 0, 1)[None].cpu(),
             "height": size[0],
             "width": size[1],
             "strength": 1.0,  # the hole starts from noise alone
             "generator": torch.Generator().manual_seed(seed),
             "output_type": "pt",
         }
-        wanted["mask_image"] = (wanted["mask_image"] > 0).float()
         if steps is not None:
             wanted["num_inference_steps"] = steps
         known = inspect.signature(self.pipeline.__call__).parameters
@@ -175,7 +175,7 @@ def inpainting(place: str, arguments: dict[str, str], dtype: torch.dtype) -> Any
     """The pipeline that a folder or repository names, as an inpainting one."""
     from diffusers import AutoPipelineForInpainting, DiffusionPipeline
 
-    pipeline = DiffusionPipeline.from_pretrained(place, torch_dtype=dtype, **arguments)
+    pipeline = DiffusionPipeline.from_pretrained(place, dtype=dtype, **arguments)
     if {"image", "mask_image"} <= set(inspect.signature(pipeline.__call__).parameters):
         return pipeline
     return AutoPipelineForInpainting.from_pipe(pipeline)

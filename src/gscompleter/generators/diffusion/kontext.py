@@ -181,8 +181,8 @@ def nearest_size(height: int, width: int) -> tuple[int, int]:
 
 
 def resized(
-    image: Float[Tensor, "h w 3"], size: tuple[int, int]
-) -> Float[Tensor, "height width 3"]:
+    image: Float[Tensor, "h w c"], size: tuple[int, int]
+) -> Float[Tensor, "height width c"]:
     """`image` at `size`: linear where it grows, averaged over areas where it shrinks."""
     if tuple(image.shape[:2]) == size:
         return image

@@ -92,7 +92,7 @@ def encode_prompt(base: Source, device: str, dtype: torch.dtype) -> Prompt:
     from diffusers import FluxKontextPipeline
 
     readers = FluxKontextPipeline.from_pretrained(
-        base.place, transformer=None, vae=None, torch_dtype=dtype, **base.arguments
+        base.place, transformer=None, vae=None, dtype=dtype, **base.arguments
     ).to(device)
     with torch.inference_mode():
         tokens, pooled, _ = readers.encode_prompt(PROMPT, device=device)
@@ -104,9 +104,9 @@ def load_pipeline(base: Source, transformer: Source, dtype: torch.dtype) -> Any:
     from diffusers import FluxKontextPipeline, FluxTransformer2DModel
 
     network = FluxTransformer2DModel.from_pretrained(
-        transformer.place, torch_dtype=dtype, **transformer.arguments
+        transformer.place, dtype=dtype, **transformer.arguments
     )
     unused = dict.fromkeys(("text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2"))
     return FluxKontextPipeline.from_pretrained(
-        base.place, transformer=network, torch_dtype=dtype, **unused, **base.arguments
+        base.place, transformer=network, dtype=dtype, **unused, **base.arguments
     )
