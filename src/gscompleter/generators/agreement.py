@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.generators.robust import robust_affine
 from gscompleter.generators.warp_inpaint.warp import Warped
 from gscompleter.interpolation import smoothed
 
@@ -95,7 +96,7 @@ def compare(
         return Agreement(ones, zeros, 0.0, share, True, image)
     ours = smoothed(image, known, config.blur)[known]
     theirs = smoothed(observed, known, config.blur)[known]
-    gain, offset = fitted_shift(ours, theirs, config)
+    gain, offset = robust_affine(ours, theirs, config.rounds)
     residual = (gain * ours + offset - theirs).abs().mean(dim=-1).median().item()
     plausible = bool(
         ((gain >= 1 / config.max_gain) & (gain <= config.max_gain)).all()
@@ -104,30 +105,6 @@ def compare(
     agrees = plausible and residual <= config.max_residual
     corrected = (gain * image + offset).clamp(0, 1) if agrees else image
     return Agreement(gain, offset, residual, share, agrees, corrected)
-
-
-def fitted_shift(
-    ours: Float[Tensor, "n 3"], theirs: Float[Tensor, "n 3"], config: AgreementConfig
-) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Gain and offset of each channel by least squares, over the pixels that go with them.
-
-    Pixels off by more than 2.5 times the usual difference are left out. Where a channel hardly
-    varies its gain cannot be told from its offset, and stays near 1.
-    """
-    gain = torch.ones(3).to(ours)
-    offset = (theirs - ours).median(dim=0).values
-    for _ in range(config.rounds):
-        error = (gain * ours + offset - theirs).abs()
-        usual = 1.4826 * error.median(dim=0).values
-        weight = (error <= 2.5 * usual.clamp_min(1e-3)).to(ours)
-        total = weight.sum(dim=0).clamp_min(1.0)
-        mean_ours = (weight * ours).sum(dim=0) / total
-        mean_theirs = (weight * theirs).sum(dim=0) / total
-        a, b = ours - mean_ours, theirs - mean_theirs
-        variance = (weight * a * a).sum(dim=0) / total
-        gain = ((weight * a * b).sum(dim=0) / total + 1e-4) / (variance + 1e-4)
-        offset = mean_theirs - gain * mean_ours
-    return gain, offset
 
 
 def notes_on(found: Agreement, tried: int, config: AgreementConfig) -> tuple[str, ...]:
