@@ -193,3 +193,23 @@ def test_a_smoke_test_of_a_whole_completion_with_random_weights(
     assert summary["targets"][0]["hole_fraction"] > 0
     if name == "pe-field":
         assert "disagrees with the photographs" in " ".join(summary["targets"][0]["notes"])
+
+
+@pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
+def test_a_smoke_test_on_photographs_with_random_weights(
+    name, kontext_folder, inpaint_folder, shared, tmp_path, monkeypatch
+):
+    scene, out = shared / "data" / "re10k_000c3ab1", tmp_path / "out"
+    if not scene.is_dir():
+        pytest.skip(f"needs the photographs in {scene}")
+    folder = kontext_folder if name == "pe-field" else inpaint_folder
+    command = ["gscompleter", "complete", scene, "--context", 0, 4, "--target", 12]
+    command += ["--resolution", 96, 128, "--near", 1, "--far", 100, "--device", "cpu"]
+    command += ["--generator", name, "--generator-path", folder, "--out", out, "--quiet"]
+    monkeypatch.setattr(sys, "argv", [str(word) for word in command])
+    main()
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["targets"][0]["hole_fraction"] > 0
+    assert (out / "images" / "target1_reference.png").is_file()
+    if name == "pe-field":
+        assert "disagrees with the photographs" in " ".join(summary["targets"][0]["notes"])

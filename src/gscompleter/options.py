@@ -41,6 +41,8 @@ class CompleteOptions:
     generator_path: str | None = None
     """Its weights: a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the Hugging
     Face hub. pe-field knows its published ones; diffusers-inpaint must be told."""
+    generator_offload: bool = False
+    """Keep on the GPU only the part of the generator that is at work, the rest in main memory."""
     resolution: tuple[int, int] | None = None
     """Height and width to work at: photographs are scaled to cover it and cropped around the
     centre. If not given, they keep their own size."""

@@ -67,7 +67,12 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     completer = GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
         load_generator(
-            options.generator, options.seed, photographs, options.generator_path, device
+            options.generator,
+            options.seed,
+            photographs,
+            options.generator_path,
+            device,
+            options.generator_offload,
         ),
         renderer,
         config,

@@ -54,6 +54,8 @@ class GeneratorRequest:
     """Folder or hub id of its weights; None takes the published ones."""
     device: str = "cpu"
     """Where its network runs."""
+    offload: bool = False
+    """Keep on the GPU only the part of the network that is at work."""
 
 
 def _warp_inpaint(request: GeneratorRequest) -> Generator:
@@ -72,13 +74,15 @@ def _pe_field(request: GeneratorRequest) -> Generator:
     from gscompleter.generators.diffusion.loading import load_kontext
     from gscompleter.generators.diffusion.pe_field import PEField
 
-    return PEField(load_kontext(request.path, request.device), request.seed)
+    return PEField(load_kontext(request.path, request.device, request.offload), request.seed)
 
 
 def _diffusers_inpaint(request: GeneratorRequest) -> Generator:
     from gscompleter.generators.diffusion.inpaint import DiffusersInpaint, load_painter
 
-    return DiffusersInpaint(load_painter(request.path, request.device), request.seed)
+    return DiffusersInpaint(
+        load_painter(request.path, request.device, request.offload), request.seed
+    )
 
 
 GENERATORS: dict[str, Callable[[GeneratorRequest], Generator]] = {
@@ -97,6 +101,7 @@ def load_generator(
     photographs: Sequence[View] = (),
     path: str | None = None,
     device: str = "cpu",
+    offload: bool = False,
 ) -> Generator:
     """The generator called `name`.
 
@@ -107,6 +112,7 @@ def load_generator(
         path: Folder or hub id of its weights, for those that have any; None takes the published
             ones.
         device: Where its network runs, if it has one: cpu or cuda.
+        offload: Keep on a GPU only the part of it that is at work: slower, and less memory.
 
     Raises:
         InputError: where there is none of that name, packages or weights are missing, or a path
@@ -119,4 +125,4 @@ def load_generator(
             f"The generator {name!r} has no weights to load from {path}; leave --generator-path "
             f"out, or choose one of {', '.join(WITH_WEIGHTS)}."
         )
-    return GENERATORS[name](GeneratorRequest(seed, photographs, path, device))
+    return GENERATORS[name](GeneratorRequest(seed, photographs, path, device, offload))

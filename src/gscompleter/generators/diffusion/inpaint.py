@@ -22,6 +22,7 @@ from gscompleter.generators.diffusion.published import (
     announce,
     cannot_load,
     needs_diffusers,
+    silent,
     source_of,
 )
 from gscompleter.generators.warp_inpaint import background_first
@@ -160,7 +161,8 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
     announce([source])
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
     try:
-        pipeline = inpainting(source.place, source.arguments, dtype)
+        with silent([source]):
+            pipeline = inpainting(source.place, source.arguments, dtype)
     except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
         raise cannot_load(source, error) from error
     pipeline.set_progress_bar_config(disable=True)

@@ -17,6 +17,7 @@ from gscompleter.generators.diffusion.published import (
     announce,
     cannot_load,
     needs_diffusers,
+    silent,
     source_of,
 )
 from gscompleter.generators.diffusion.rotary import HEADS, with_per_head_positions
@@ -47,8 +48,9 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
     announce([base, transformer])
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
     try:
-        prompt = encode_prompt(base, device, dtype)
-        pipeline = load_pipeline(base, transformer, dtype)
+        with silent([base, transformer]):
+            prompt = encode_prompt(base, device, dtype)
+            pipeline = load_pipeline(base, transformer, dtype)
     except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
         raise cannot_load(base if path is None else transformer, error) from error
     heads = pipeline.transformer.config.num_attention_heads

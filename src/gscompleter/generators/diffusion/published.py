@@ -7,6 +7,8 @@ sizes and licences are what the authors' pages state, and no commit is known to 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -125,6 +127,25 @@ def needs_diffusers(name: str) -> None:
             f"The generator {name!r} needs {' and '.join(missing)}; run `{INSTALL}`, or choose "
             "'warp-inpaint', which needs no weights."
         )
+
+
+@contextmanager
+def silent(sources: list[Source]) -> Iterator[None]:
+    """No progress bars of diffusers and transformers where nothing is downloaded."""
+    from diffusers.utils import logging as of_diffusers
+    from transformers.utils import logging as of_transformers
+
+    local = all(one.is_local for one in sources)
+    bars = [
+        log for log in (of_diffusers, of_transformers) if local and log.is_progress_bar_enabled()
+    ]
+    for log in bars:
+        log.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for log in bars:
+            log.enable_progress_bar()
 
 
 def cannot_load(source: Source, error: Exception) -> InputError:

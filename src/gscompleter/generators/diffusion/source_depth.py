@@ -15,6 +15,7 @@ from gscompleter.generators.diffusion.published import (
     announce,
     cannot_load,
     needs_diffusers,
+    silent,
     source_of,
 )
 from gscompleter.generators.robust import robust_affine
@@ -141,8 +142,9 @@ def load_monocular(
     try:
         from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
-        network = AutoModelForDepthEstimation.from_pretrained(source.place, **source.arguments)
-        processor = AutoImageProcessor.from_pretrained(source.place, **source.arguments)
+        with silent([source]):
+            network = AutoModelForDepthEstimation.from_pretrained(source.place, **source.arguments)
+            processor = AutoImageProcessor.from_pretrained(source.place, **source.arguments)
     except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
         raise cannot_load(source, error) from error
     return MonocularDepth(network.eval().to(device), processor, device)
