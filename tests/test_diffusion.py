@@ -45,7 +45,7 @@ def kontext_folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def inpaint_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models") / "inpaint"
-    return tiny_diffusion.saved(tiny_diffusion.inpaint_pipeline(), folder)
+    return tiny_diffusion.saved(tiny_diffusion.stable_diffusion(), folder)
 
 
 def test_the_sizes_are_those_of_diffusers_and_the_nearest_aspect_wins():
@@ -129,9 +129,12 @@ def test_a_scene_that_the_photograph_does_not_see_is_refused(kontext_folder):
         )
 
 
-def test_inpainting_keeps_what_was_warped_and_fills_the_rest(inpaint_folder):
-    context = known_room()
-    generator = DiffusersInpaint(load_painter(str(inpaint_folder)), steps=2)
+@pytest.mark.parametrize("name", tiny_diffusion.INPAINTERS)
+def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
+    folder = tiny_diffusion.saved(tiny_diffusion.INPAINTERS[name](), tmp_path)
+    context, painter = known_room(), load_painter(str(folder))
+    painter = replace(painter, side=min(painter.side, 256))  # Flux counts 128 latents
+    generator = DiffusersInpaint(painter, steps=2)
     image = generator(context.views[1], TARGET, context)
     warped = completed_warp(context.views[1], TARGET, context)
     assert 0.05 < (~warped.known).float().mean() < 0.9

@@ -103,33 +103,93 @@ def kontext_pipeline(heads: int = 24) -> Any:
     )
 
 
-def inpaint_pipeline() -> Any:
-    """Stable Diffusion's inpainting at 64 pixels."""
-    from diffusers import DDIMScheduler, StableDiffusionInpaintPipeline, UNet2DConditionModel
+def unet(**settings: Any) -> Any:
+    """A UNet of two levels at 64 pixels; SDXL's has no cross attention on its first."""
+    from diffusers import UNet2DConditionModel
 
-    torch.manual_seed(0)
-    unet = UNet2DConditionModel(
+    return UNet2DConditionModel(
         sample_size=32,
-        in_channels=9,
         out_channels=4,
         block_out_channels=(8, 16),
         layers_per_block=1,
         down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
         up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
-        cross_attention_dim=16,
         attention_head_dim=4,
         norm_num_groups=4,
+        **settings,
     )
-    return StableDiffusionInpaintPipeline(
+
+
+def stable_diffusion(inpainting: bool = True) -> Any:
+    """Stable Diffusion at 64 pixels: that for inpainting, or the one that knows text alone."""
+    import diffusers
+
+    torch.manual_seed(0)
+    kind = "StableDiffusionInpaintPipeline" if inpainting else "StableDiffusionPipeline"
+    return getattr(diffusers, kind)(
         vae=vae(2),
         text_encoder=clip_text_encoder(16),
         tokenizer=clip_tokenizer(),
-        unet=unet,
-        scheduler=DDIMScheduler(steps_offset=1),
+        unet=unet(in_channels=9 if inpainting else 4, cross_attention_dim=16),
+        scheduler=diffusers.DDIMScheduler(steps_offset=1, clip_sample=False),
         safety_checker=None,
         feature_extractor=None,
         requires_safety_checker=False,
     )
+
+
+def sdxl() -> Any:
+    """SDXL's inpainting at 64 pixels."""
+    from diffusers import EulerDiscreteScheduler, StableDiffusionXLInpaintPipeline
+    from transformers import CLIPTextModelWithProjection
+
+    torch.manual_seed(0)
+    second = CLIPTextModelWithProjection(clip_text_encoder(16).config)
+    return StableDiffusionXLInpaintPipeline(
+        vae=vae(2),
+        text_encoder=clip_text_encoder(16),
+        tokenizer=clip_tokenizer(),
+        text_encoder_2=second,
+        tokenizer_2=clip_tokenizer(),
+        unet=unet(
+            in_channels=9,
+            cross_attention_dim=32,
+            addition_embed_type="text_time",
+            addition_time_embed_dim=8,
+            projection_class_embeddings_input_dim=8 * 6 + second.config.projection_dim,
+        ),
+        scheduler=EulerDiscreteScheduler(),
+    )
+
+
+def flux_fill() -> Any:
+    """Flux Fill, whose tokens are 64 pixels wide as those of `kontext_pipeline`."""
+    from diffusers import FluxFillPipeline, FluxTransformer2DModel
+
+    parts = kontext_pipeline().components
+    mask = 4 * 32**2
+    transformer = FluxTransformer2DModel(
+        in_channels=2 * 16 + mask,
+        out_channels=16,
+        num_layers=1,
+        num_single_layers=1,
+        attention_head_dim=16,
+        num_attention_heads=2,
+        joint_attention_dim=32,
+        pooled_projection_dim=24,
+        guidance_embeds=True,
+        axes_dims_rope=(4, 6, 6),
+    )
+    kept = ("scheduler", "vae", "text_encoder", "tokenizer", "text_encoder_2", "tokenizer_2")
+    return FluxFillPipeline(transformer=transformer, **{name: parts[name] for name in kept})
+
+
+INPAINTERS = {
+    "stable-diffusion": stable_diffusion,
+    "stable-diffusion-of-text": lambda: stable_diffusion(inpainting=False),
+    "sdxl": sdxl,
+    "flux-fill": flux_fill,
+}
 
 
 def saved(pipeline: Any, folder: Path) -> Path:

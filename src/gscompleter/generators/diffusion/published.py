@@ -124,7 +124,7 @@ def needs_diffusers(name: str) -> None:
     missing = [package for package in PACKAGES if find_spec(package) is None]
     if missing:
         raise InputError(
-            f"The generator {name!r} needs {' and '.join(missing)}; run `{INSTALL}`, or choose "
+            f"The generator {name!r} needs {', '.join(missing)}; run `{INSTALL}`, or choose "
             "'warp-inpaint', which needs no weights."
         )
 
