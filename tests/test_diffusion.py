@@ -56,6 +56,10 @@ def test_the_sizes_are_those_of_diffusers_and_the_nearest_aspect_wins():
     assert nearest_size(256, 256) == (1024, 1024)
     assert nearest_size(480, 720) == (832, 1248)
     assert nearest_size(720, 480) == (1248, 832)
+    for height, width in ((256, 448), (448, 256), (360, 640), (193, 640), (640, 360), (96, 100)):
+        aspect = width / height
+        _, w, h = min((abs(aspect - w / h), w, h) for w, h in PREFERRED_KONTEXT_RESOLUTIONS)
+        assert nearest_size(height, width) == (h, w)
 
 
 def test_with_plain_positions_our_loop_is_the_pipeline_of_diffusers(kontext_folder):

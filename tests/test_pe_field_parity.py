@@ -123,6 +123,31 @@ def test_a_camera_that_moves_by_one_token_moves_the_positions_by_one_token():
     assert (step - torch.tensor([0.0, 0.0, -1.0])).abs().max() < 1e-5
 
 
+def test_the_number_of_pixels_of_the_target_does_not_matter():
+    """Two pixels for each one of the same view; the first one's centre lies half a new pixel in."""
+    camera, depth = centred_camera(), IDS["depth"]
+    finer = replace(
+        camera,
+        K=torch.diag(torch.tensor([2.0, 2.0, 1.0])) @ camera.K,
+        width=2 * camera.width,
+        height=2 * camera.height,
+    )
+    once = source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
+    twice = source_ids(depth, camera, finer, GRID, GRID).reshape(48, 21, 3)
+    assert (twice - once - torch.tensor([0, 0.25 / 16, 0.25 / 16])).abs().max() < 1e-5
+
+
+def test_a_target_that_sees_farther_to_the_left_counts_from_there():
+    """Two tokens of 16 pixels more on the left."""
+    camera, depth = centred_camera(), IDS["depth"]
+    K = camera.K.clone()
+    K[0, 2] += 32
+    wider = replace(camera, K=K, width=camera.width + 32)
+    once = source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
+    moved = source_ids(depth, camera, wider, GRID, (6, 10)).reshape(48, 21, 3)
+    assert (moved - once - torch.tensor([0.0, 0.0, 2.0])).abs().max() < 1e-5
+
+
 def test_what_lies_behind_the_target_is_finite_and_far_outside_of_its_image():
     camera, depth = centred_camera(), torch.full(SIZE, 2.0)
     c2w = torch.eye(4)
