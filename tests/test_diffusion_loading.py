@@ -4,6 +4,7 @@ import pytest
 
 from gscompleter import InputError, load_generator
 from gscompleter.generators.diffusion import published
+from gscompleter.generators.diffusion.loading import sources
 from gscompleter.generators.diffusion.published import (
     KONTEXT,
     PE_FIELD,
@@ -61,3 +62,18 @@ def test_gate_licence_and_missing_pin_are_named_before_a_download_and_a_folder_n
     assert "https://huggingface.co/yunpeng1998/PE-Field" in said
     assert said.count("pins nothing") == 2
     assert said.count("Non-Commercial") + said.count("non-commercial") == 2
+
+
+def test_a_pipeline_brings_its_own_transformer_and_a_transformer_joins_the_published_base(tmp_path):
+    assert sources(None) == (KONTEXT, PE_FIELD)
+    whole, alone = tmp_path / "whole", tmp_path / "alone"
+    for folder, file in ((whole, "model_index.json"), (alone, "config.json")):
+        folder.mkdir()
+        (folder / file).write_text("{}")
+    base, transformer = sources(str(whole))
+    assert (base.place, base.subfolder) == (str(whole), None)
+    assert (transformer.place, transformer.subfolder) == (str(whole), "transformer")
+    assert sources(str(alone)) == (KONTEXT, Source(place=str(alone)))
+    base, transformer = sources("somebody/something@abc")
+    assert base.arguments == {"revision": "abc"}
+    assert transformer.arguments == {"revision": "abc", "subfolder": "transformer"}
