@@ -196,7 +196,7 @@ class GSCompleter:
             affine=registration.affine,
             added=added,
             losses={"register": registration.losses, "refine": refine_losses},
-            notes=notes_of(choice.fallback, registration.affine),
+            notes=(*reference.notes, *notes_of(choice.fallback, registration.affine)),
         )
 
     def refine(

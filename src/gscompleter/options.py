@@ -36,7 +36,13 @@ class CompleteOptions:
     weights: Path | None = None
     """The file of its weights, where they are not to be downloaded."""
     generator: str = "warp-inpaint"
-    """The model that synthesizes the image at the target."""
+    """The model that synthesizes the image at the target: warp-inpaint, which needs no weights,
+    pe-field, diffusers-inpaint (any inpainting pipeline), or oracle (the true photograph)."""
+    generator_path: str | None = None
+    """Its weights: a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the Hugging
+    Face hub. pe-field knows its published ones; diffusers-inpaint must be told."""
+    generator_offload: bool = False
+    """Keep on the GPU only the part of the generator that is at work, the rest in main memory."""
     resolution: tuple[int, int] | None = None
     """Height and width to work at: photographs are scaled to cover it and cropped around the
     centre. If not given, they keep their own size."""
@@ -116,7 +122,11 @@ class EvaluateOptions:
     weights: Path | None = None
     """The file of its weights, where they are not to be downloaded."""
     generator: str = "warp-inpaint"
-    """The model that synthesizes the image at the target."""
+    """The model that synthesizes the image at the target: warp-inpaint, which needs no weights,
+    pe-field, diffusers-inpaint (any inpainting pipeline), or oracle (the true photograph)."""
+    generator_path: str | None = None
+    """Its weights: a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the Hugging
+    Face hub. pe-field knows its published ones; diffusers-inpaint must be told."""
     device: Device = "auto"
     """Where to run."""
     seed: int = 0

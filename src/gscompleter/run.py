@@ -66,7 +66,14 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     ]
     completer = GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
-        load_generator(options.generator, options.seed, photographs),
+        load_generator(
+            options.generator,
+            options.seed,
+            photographs,
+            options.generator_path,
+            device,
+            options.generator_offload,
+        ),
         renderer,
         config,
         options.seed,
@@ -144,6 +151,7 @@ def settings_of(options: CompleteOptions, config: CompleterConfig) -> dict[str, 
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
         "generator": options.generator,
+        "generator_path": options.generator_path,
         "uses_target_photographs": options.generator == "oracle",
         "resolution": None if options.resolution is None else list(options.resolution),
         "near": options.near,

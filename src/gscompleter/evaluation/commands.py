@@ -67,6 +67,7 @@ def run_evaluation(options: EvaluateOptions) -> None:
         reconstructor=options.reconstructor,
         weights=None if options.weights is None else str(options.weights),
         generator=options.generator,
+        generator_path=options.generator_path,
         device=choose_device(options.device),
         seed=options.seed,
         source=source_of(options),

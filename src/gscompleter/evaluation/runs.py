@@ -86,6 +86,8 @@ class RunConfig:
     weights: str | None = None
     """The file of the reconstructor's weights; None takes the published ones."""
     generator: str = "warp-inpaint"
+    generator_path: str | None = None
+    """Folder or hub id of the generator's weights; None takes the published ones."""
     device: Literal["cpu", "cuda"] = "cpu"
     seed: int = 0
     """Of everything random."""
@@ -103,7 +105,7 @@ class RunConfig:
         """The models for a case. Only the generator `oracle` looks at the images of `targets`."""
         return Parts(
             self.load_reconstructor(),
-            load_generator(self.generator, self.seed, targets),
+            load_generator(self.generator, self.seed, targets, self.generator_path, self.device),
             load_renderer(self.device),
             self.seed,
             0.0 if self.generator == "oracle" else None,
@@ -179,7 +181,7 @@ def begin(
     if slow and config.device != "cpu":
         raise InputError(f"{', '.join(slow)} can only run on a CPU; use --device cpu.")
     config.load_reconstructor()
-    load_generator(config.generator)
+    load_generator(config.generator, path=config.generator_path, device=config.device)
     claim(out, config)
 
 

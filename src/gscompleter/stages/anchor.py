@@ -9,7 +9,7 @@ from typing import Literal
 
 import torch
 
-from gscompleter.generators import Generator
+from gscompleter.generators import Generator, NotingGenerator
 from gscompleter.geometry import baseline_between, inside, project, rotation_between
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.types import Camera, Lift, SceneContext, View
@@ -66,17 +66,29 @@ def select_anchor(
     return AnchorChoice(max(overlapping, key=baselines.__getitem__), fallback=False)
 
 
-def synthesize(generator: Generator, target: Camera, context: SceneContext) -> View:
+@dataclass(frozen=True)
+class Synthesized(View):
+    """The image at the target, as a view, and what its generator tells of it."""
+
+    notes: tuple[str, ...] = ()
+    """A sentence each; empty for a generator that tells nothing."""
+
+
+def synthesize(generator: Generator, target: Camera, context: SceneContext) -> Synthesized:
     """`Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 5)."""
     nearest = context.views[nearest_view(target, context.views)]
-    image = generator(nearest, target, context)
+    notes: tuple[str, ...] = ()
+    if isinstance(generator, NotingGenerator):
+        image, notes = generator.with_notes(nearest, target, context)
+    else:
+        image = generator(nearest, target, context)
     expected = (target.height, target.width, 3)
     if tuple(image.shape) != expected or not torch.isfinite(image).all():
         raise ValueError(
             f"the generator must return a finite image of shape {expected}, "
             f"got {tuple(image.shape)}"
         )
-    return View(image, target)
+    return Synthesized(image, target, notes=notes)
 
 
 def lift(reconstructor: Reconstructor, reference: View, anchor: View) -> Lift:

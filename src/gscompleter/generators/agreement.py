@@ -1,0 +1,127 @@
+"""Does a synthesized image agree with what the photographs show of the target?
+
+A model that paints the whole image anew shifts its colours, and may paint something else. The
+shift is measured and taken back; a painting of something else is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.generators.robust import robust_affine
+from gscompleter.generators.warp_inpaint.warp import Warped
+from gscompleter.interpolation import smoothed
+
+
+@dataclass(frozen=True)
+class AgreementConfig:
+    blur: int = 2
+    """Radius, in pixels, over which colours are averaged before they are compared: a painted edge
+    may lie a pixel beside the photographed one."""
+    max_residual: float = 0.1
+    """Median difference of colours, once the shift is taken back, from which an image counts as
+    another scene. Colours are in [0, 1]."""
+    max_gain: float = 1.6
+    """Largest factor of a channel, and its inverse the smallest, that counts as a colour shift."""
+    max_offset: float = 0.25
+    """Largest number added to a channel that counts as a colour shift."""
+    min_pixels: int = 200
+    """Fewest observed pixels that say anything."""
+    rounds: int = 5
+    """Fits of the shift; each leaves out what disagrees with the one before."""
+    retries: int = 0
+    """How many further seeds are tried where an image disagrees. The best one is kept."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How an image compares with the photographs: `observed = gain * image + offset`."""
+
+    gain: Float[Tensor, "3"]
+    offset: Float[Tensor, "3"]
+    residual: float
+    """Median difference of colours after the shift was taken back, over the observed pixels."""
+    share: float
+    """Share of the image that was observed."""
+    agrees: bool
+    """Whether it shows the same scene, as far as there is anything to compare."""
+    image: Float[Tensor, "h w 3"]
+    """The image with the shift taken back where it agrees, else as it was."""
+
+    @property
+    def shift(self) -> float:
+        """Largest change of a mid-grey by the colour shift."""
+        return float((0.5 * self.gain + self.offset - 0.5).abs().max())
+
+
+def checked(
+    paint: Callable[[int], Float[Tensor, "h w 3"]],
+    seed: int,
+    observed: Warped,
+    config: AgreementConfig = AgreementConfig(),
+) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]:
+    """An image painted from a seed, its colours brought to those observed, and notes on it.
+
+    Args:
+        paint: Seed -> image in [0, 1].
+        seed: The first to try; `config.retries` more follow while the image disagrees.
+        observed: What the photographs show of the target.
+        config: What counts as agreement.
+    """
+    found: list[Agreement] = []
+    for attempt in range(config.retries + 1):
+        image = paint(seed + attempt)
+        found.append(compare(image, observed.image, observed.known, config))
+        if found[-1].agrees:
+            break
+    best = min(found, key=lambda one: (not one.agrees, one.residual))
+    return best.image, notes_on(best, len(found), config)
+
+
+def compare(
+    image: Float[Tensor, "h w 3"],
+    observed: Float[Tensor, "h w 3"],
+    known: Bool[Tensor, "h w"],
+    config: AgreementConfig = AgreementConfig(),
+) -> Agreement:
+    """Measure the colour shift of `image` against `observed` where that is `known`."""
+    ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
+    share = known.float().mean().item()
+    if int(known.sum()) < config.min_pixels:
+        return Agreement(ones, zeros, 0.0, share, True, image)
+    ours = smoothed(image, known, config.blur)[known]
+    theirs = smoothed(observed, known, config.blur)[known]
+    gain, offset = robust_affine(ours, theirs, config.rounds)
+    residual = (gain * ours + offset - theirs).abs().mean(dim=-1).median().item()
+    plausible = bool(
+        ((gain >= 1 / config.max_gain) & (gain <= config.max_gain)).all()
+        and (offset.abs() <= config.max_offset).all()
+    )
+    agrees = plausible and residual <= config.max_residual
+    corrected = (gain * image + offset).clamp(0, 1) if agrees else image
+    return Agreement(gain, offset, residual, share, agrees, corrected)
+
+
+def notes_on(found: Agreement, tried: int, config: AgreementConfig) -> tuple[str, ...]:
+    """What a reader of the results should know of it."""
+    if not found.agrees:
+        seeds = "" if tried == 1 else f" (best of {tried} seeds)"
+        return (
+            f"The synthesized image disagrees with the photographs: over the {found.share:.0%} of "
+            f"it that they show, colours differ by {found.residual:.2f} in the median{seeds}, and "
+            f"{config.max_residual:.2f} is the limit. It was used as it is.",
+        )
+    notes = []
+    if found.shift > 0.5 / 255:
+        notes.append(
+            "The colours of the synthesized image were brought to those of the photographs "
+            f"(mid-grey moved by {255 * found.shift:.1f} of 255)."
+        )
+    if tried > 1:
+        notes.append(f"{tried} seeds were tried before the synthesized image agreed.")
+    return tuple(notes)

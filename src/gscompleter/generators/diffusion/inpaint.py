@@ -1,0 +1,197 @@
+"""Any inpainting pipeline of diffusers, given the photographs warped into the target.
+
+The pipeline paints the hole; what the photographs show stays as it was warped. Sizes and the
+arguments of a pipeline are read from its configuration and its signature.
+"""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.generators.agreement import AgreementConfig, checked
+from gscompleter.generators.diffusion.kontext import resized
+from gscompleter.generators.diffusion.published import (
+    announce,
+    cannot_load,
+    needs_diffusers,
+    silent,
+    source_of,
+)
+from gscompleter.generators.warp_inpaint import background_first
+from gscompleter.generators.warp_inpaint.warp import Warped, warp_photographs, with_unexplained
+from gscompleter.types import Camera, SceneContext, View
+
+SIDE = 512
+"""Side of the square whose area is painted where a pipeline's configuration names none."""
+
+
+@dataclass(frozen=True)
+class Painter:
+    """A loaded inpainting pipeline, and how its images must be sized."""
+
+    pipeline: Any
+    """A pipeline of diffusers that takes `image` and `mask_image`."""
+    side: int
+    """Side of the square image that it was trained on, in pixels."""
+    multiple: int
+    """Both sides of an image must be multiples of this."""
+
+    def size_for(self, height: int, width: int) -> tuple[int, int]:
+        """Height and width of about `side`² pixels, in the proportions of the image."""
+        scale = self.side / (height * width) ** 0.5
+        h, w = (max(1, round(scale * n / self.multiple)) for n in (height, width))
+        return h * self.multiple, w * self.multiple
+
+    def paint(
+        self,
+        image: Float[Tensor, "h w 3"],
+        hole: Bool[Tensor, "h w"],
+        prompt: str,
+        seed: int,
+        steps: int | None,
+    ) -> Float[Tensor, "h w 3"]:
+        """`image` with the hole painted, as the pipeline returns all of it."""
+        size = self.size_for(*hole.shape)
+        mask = (resized(hole[..., None].float(), size) > 0).float()
+        wanted: dict[str, Any] = {
+            "prompt": prompt,
+            "image": resized(image, size).permute(2, 0, 1)[None].cpu(),
+            "mask_image": mask.permute(2, 0, 1)[None].cpu(),
+            "height": size[0],
+            "width": size[1],
+            "strength": 1.0,  # the hole starts from noise alone
+            "generator": torch.Generator().manual_seed(seed),
+            "output_type": "pt",
+        }
+        if steps is not None:
+            wanted["num_inference_steps"] = steps
+        known = inspect.signature(self.pipeline.__call__).parameters
+        painted = self.pipeline(**{k: v for k, v in wanted.items() if k in known}).images[0]
+        back = resized(painted.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
+        return back.clamp(0, 1).to(image.device)
+
+
+@dataclass(frozen=True)
+class DiffusersInpaint:
+    """Φ by any inpainting pipeline. `load_painter` gives it."""
+
+    painter: Painter
+    """What paints."""
+    seed: int = 0
+    """Of its noise; the same seed gives the same image on the same device."""
+    prompt: str = "a photograph"
+    """What it is told, whatever the image."""
+    steps: int | None = None
+    """Denoising steps; the pipeline's own number if None."""
+    margin: int = 4
+    """Pixels around a hole that the pipeline may paint anew, so that it meets no hard border. In
+    the image that is returned they are as they were warped."""
+    agreement: AgreementConfig = AgreementConfig()
+    """How the painted image is compared with what was warped, before that is put back."""
+
+    def __call__(
+        self, nearest: View, target: Camera, context: SceneContext
+    ) -> Float[Tensor, "h w 3"]:
+        """The image `target` would take, in [0, 1]; outside the hole it is the warped one."""
+        return self.with_notes(nearest, target, context)[0]
+
+    def with_notes(
+        self, nearest: View, target: Camera, context: SceneContext
+    ) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]:
+        """The image, and what to know of it."""
+        observed = completed_warp(nearest, target, context)
+        hole = widened_mask(~observed.known, self.margin)
+
+        def paint(seed: int) -> Float[Tensor, "h w 3"]:
+            return self.painter.paint(observed.image, hole, self.prompt, seed, self.steps)
+
+        compared = replace(observed, known=~hole)
+        painted, notes = checked(paint, self.seed, compared, self.agreement)
+        return torch.where(observed.known[..., None], observed.image, painted), notes
+
+
+def completed_warp(nearest: View, target: Camera, context: SceneContext) -> Warped:
+    """What the photographs show of the target, over a smooth continuation of its colours."""
+    warped = warp_photographs(nearest, target, context)
+    if not warped.known.any():
+        mean = nearest.image.mean(dim=(0, 1)).expand_as(warped.image)
+        return replace(warped, image=mean)
+    _, log_depth = background_first(warped)
+    guess = log_depth.exp().to(warped.depth.device)
+    warped = with_unexplained(warped, guess, target, context)
+    tone, _ = background_first(warped)
+    tone = tone.to(warped.image.device)
+    image = torch.where(warped.known[..., None], warped.image, tone)
+    return replace(warped, image=image.clamp(0, 1))
+
+
+def widened_mask(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
+    """`mask` and all within a square of `radius` pixels around it."""
+    size = 2 * radius + 1
+    return torch.nn.functional.max_pool2d(mask[None].float(), size, 1, radius)[0] > 0
+
+
+@lru_cache(maxsize=1)
+def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -> Painter:
+    """An inpainting pipeline, loaded once in a process.
+
+    Args:
+        path: A folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the hub.
+        device: cpu or cuda. On a GPU all is bfloat16, on a CPU float32.
+        offload: Keep on the GPU only the part that is at work. Slower, and needs accelerate.
+
+    Raises:
+        InputError: packages are missing, no path was given, or there is no inpainting pipeline.
+    """
+    needs_diffusers("diffusers-inpaint")
+    if path is None:
+        raise InputError(
+            "The generator 'diffusers-inpaint' needs a model; name one with --generator-path, a "
+            "folder that diffusers saved or USER/NAME on the Hugging Face hub."
+        )
+    source = source_of(path)
+    announce([source])
+    dtype = torch.float32 if device == "cpu" else torch.bfloat16
+    try:
+        with silent([source]):
+            pipeline = inpainting(source.place, source.arguments, dtype)
+    except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
+        raise cannot_load(source, error) from error
+    pipeline.set_progress_bar_config(disable=True)
+    if offload and device != "cpu":
+        pipeline.enable_model_cpu_offload(device=device)
+    else:
+        pipeline.to(device)
+    return Painter(pipeline, *size_rules(pipeline))
+
+
+def inpainting(place: str, arguments: dict[str, str], dtype: torch.dtype) -> Any:
+    """The pipeline that a folder or repository names, as an inpainting one."""
+    from diffusers import AutoPipelineForInpainting, DiffusionPipeline
+
+    pipeline = DiffusionPipeline.from_pretrained(place, dtype=dtype, **arguments)
+    if {"image", "mask_image"} <= set(inspect.signature(pipeline.__call__).parameters):
+        return pipeline
+    return AutoPipelineForInpainting.from_pipe(pipeline)
+
+
+def size_rules(pipeline: Any) -> tuple[int, int]:
+    """Side of the trained square in pixels, and what an image's sides must be multiples of.
+
+    A UNet halves its latents on every level but the first; a transformer pairs them up.
+    """
+    latent = int(getattr(pipeline, "vae_scale_factor", 8))
+    unet = getattr(pipeline, "unet", None)
+    if unet is None:
+        return int(getattr(pipeline, "default_sample_size", SIDE // latent)) * latent, 2 * latent
+    side = unet.config.get("sample_size") or SIDE // latent
+    side = max(side) if isinstance(side, (list, tuple)) else int(side)
+    return side * latent, latent * 2 ** (len(unet.config.block_out_channels) - 1)

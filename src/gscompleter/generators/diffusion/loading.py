@@ -1,0 +1,114 @@
+"""Load FLUX Kontext for PE-Field: the prompt is encoded first, then its encoders leave memory."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gscompleter.errors import InputError
+from gscompleter.generators.diffusion.kontext import Kontext, Prompt
+from gscompleter.generators.diffusion.published import (
+    KONTEXT,
+    PE_FIELD,
+    Source,
+    announce,
+    cannot_load,
+    needs_diffusers,
+    silent,
+    source_of,
+)
+from gscompleter.generators.diffusion.rotary import HEADS, with_per_head_positions
+
+PROMPT = "Ensure that the picture does not change in any way"
+"""What the model was trained to be told, whatever the image."""
+
+
+@lru_cache(maxsize=1)
+def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = False) -> Kontext:
+    """The model of PE-Field, loaded once in a process.
+
+    T5 and CLIP encode the prompt and are dropped before the transformer is loaded, so that both
+    are never in memory together. On a GPU all is bfloat16, on a CPU float32.
+
+    Args:
+        path: A folder or repository: a whole pipeline with the transformer of PE-Field, or a
+            folder that holds the transformer alone, which then joins the published base. None
+            takes both as published.
+        device: cpu or cuda.
+        offload: Keep on the GPU only the part that is at work. Slower, and needs accelerate.
+
+    Raises:
+        InputError: packages are missing, or the weights cannot be had or do not fit.
+    """
+    needs_diffusers("pe-field")
+    base, transformer = sources(path)
+    announce([base, transformer])
+    dtype = torch.float32 if device == "cpu" else torch.bfloat16
+    try:
+        with silent([base, transformer]):
+            prompt = encode_prompt(base, device, dtype)
+            pipeline = load_pipeline(base, transformer, dtype)
+    except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
+        raise cannot_load(base if path is None else transformer, error) from error
+    heads = pipeline.transformer.config.num_attention_heads
+    if heads != HEADS:
+        raise InputError(
+            f"The transformer of {transformer.place} has {heads} heads, and PE-Field needs "
+            f"{HEADS}; give that of PE-Field."
+        )
+    with_per_head_positions(pipeline.transformer)
+    pipeline.set_progress_bar_config(disable=True)
+    if offload and device != "cpu":
+        pipeline.enable_model_cpu_offload(device=device)
+    else:
+        pipeline.to(device)
+    return Kontext(pipeline, prompt, device, dtype)
+
+
+def sources(path: str | None) -> tuple[Source, Source]:
+    """Where the base pipeline and the transformer come from."""
+    if path is None:
+        return KONTEXT, PE_FIELD
+    given = source_of(path)
+    if not given.is_local or (Path(given.place) / "model_index.json").is_file():
+        inside = Source(
+            place=given.place,
+            revision=given.revision,
+            subfolder="transformer",
+            terms=given.terms,
+        )
+        return given, inside
+    if (Path(given.place) / "config.json").is_file():
+        return KONTEXT, given
+    raise InputError(
+        f"{path} holds neither a model_index.json (a pipeline) nor a config.json (a transformer); "
+        "give a folder that diffusers saved."
+    )
+
+
+def encode_prompt(base: Source, device: str, dtype: torch.dtype) -> Prompt:
+    """The prompt in the words of T5 and CLIP, both of which are dropped afterwards."""
+    from diffusers import FluxKontextPipeline
+
+    readers = FluxKontextPipeline.from_pretrained(
+        base.place, transformer=None, vae=None, dtype=dtype, **base.arguments
+    ).to(device)
+    with torch.inference_mode():
+        tokens, pooled, _ = readers.encode_prompt(PROMPT, device=device)
+    return Prompt(tokens.to(dtype), pooled.to(dtype))
+
+
+def load_pipeline(base: Source, transformer: Source, dtype: torch.dtype) -> Any:
+    """What denoises: transformer, VAE and scheduler."""
+    from diffusers import FluxKontextPipeline, FluxTransformer2DModel
+
+    network = FluxTransformer2DModel.from_pretrained(
+        transformer.place, dtype=dtype, **transformer.arguments
+    )
+    unused = dict.fromkeys(("text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2"))
+    return FluxKontextPipeline.from_pretrained(
+        base.place, transformer=network, dtype=dtype, **unused, **base.arguments
+    )

@@ -1,0 +1,162 @@
+"""The published folders that the generators load, and where they come from.
+
+Nothing here imports torch or diffusers. The hub was out of reach when this was written: names,
+sizes and licences are what the authors' pages state, and no commit is known to pin them by.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from gscompleter.errors import InputError
+
+PACKAGES = ("diffusers", "transformers", "accelerate")
+"""What the generators import; the rest comes with these."""
+INSTALL = "pip install 'gscompleter[diffusion]'"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A folder that diffusers reads: on this machine, or in a repository of the hub."""
+
+    place: str
+    """Path of the folder, or id of the repository."""
+    revision: str | None = None
+    """Commit or branch of the repository; None for a folder on this machine."""
+    subfolder: str | None = None
+    """Where in it the files lie; None for its top."""
+    terms: str = "the licence that its page states"
+    """Licence of the weights, in words that go into a sentence."""
+
+    @property
+    def is_local(self) -> bool:
+        """Whether nothing is downloaded for it."""
+        return self.revision is None
+
+    @property
+    def is_pinned(self) -> bool:
+        """Whether its files can never change: it is here, or named by its commit."""
+        revision = self.revision
+        return revision is None or (
+            len(revision) == 40 and set(revision) <= set("0123456789abcdef")
+        )
+
+    @property
+    def arguments(self) -> dict[str, str]:
+        """What `from_pretrained` is told beside the place."""
+        pairs = {"revision": self.revision, "subfolder": self.subfolder}
+        return {key: value for key, value in pairs.items() if value is not None}
+
+
+KONTEXT = Source(
+    place="black-forest-labs/FLUX.1-Kontext-dev",
+    revision="main",
+    terms=(
+        "the FLUX.1 [dev] Non-Commercial License, which must be accepted on its page and needs a "
+        "logged-in account (`hf auth login`)"
+    ),
+)
+"""The base model: VAE, text encoders, tokenizers and scheduler. Gated."""
+
+PE_FIELD = Source(
+    place="yunpeng1998/PE-Field",
+    revision="main",
+    subfolder="FLUX.1-Kontext-dev/transformer",
+    terms=(
+        "no licence of its own that is known; it is fine-tuned from FLUX.1-Kontext-dev, whose "
+        "non-commercial licence covers derivatives"
+    ),
+)
+"""The authors' transformer: 1160 tensors, 23.8 GB in bfloat16."""
+
+LICENCES = {
+    "flux": "the FLUX.1 [dev] Non-Commercial License for the [dev] models, and a gated page",
+    "stable-diffusion-xl": "CreativeML Open RAIL++-M for Stability's own",
+    "stable-diffusion": "CreativeML Open RAIL-M for Stability's and Runway's own",
+}
+"""What weights of a family are usually under, by a part of their id."""
+
+
+def source_of(path: str) -> Source:
+    """The folder or repository that a user names: PATH, USER/NAME, or USER/NAME@COMMIT.
+
+    Raises:
+        InputError: where it is neither a folder nor the id of a repository.
+    """
+    if Path(path).expanduser().is_dir():
+        return Source(place=str(Path(path).expanduser()))
+    name, _, revision = path.partition("@")
+    if name.count("/") != 1 or name.startswith((".", "/", "~")) or name.endswith("/"):
+        raise InputError(
+            f"There is no folder {path}, and it is no repository of the Hugging Face hub either; "
+            "give a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT."
+        )
+    usual = next((terms for part, terms in LICENCES.items() if part in name.lower()), None)
+    terms = "the licence that its page states" + (f" (usually {usual})" if usual else "")
+    return Source(place=name, revision=revision or "main", terms=terms)
+
+
+def announce(sources: list[Source]) -> None:
+    """Say on stderr, before anything is downloaded, what is fetched and under which terms."""
+    for source in sources:
+        if source.is_local:
+            continue
+        page = f"https://huggingface.co/{source.place}"
+        pinned = (
+            f"at commit {source.revision}"
+            if source.is_pinned
+            else (f"at {source.revision!r}, which pins nothing: what is fetched may change")
+        )
+        print(f"Weights of {page} {pinned}. Terms: {source.terms}.", file=sys.stderr)
+
+
+def needs_diffusers(name: str) -> None:
+    """See that the extra packages are there.
+
+    Raises:
+        InputError: where one is missing; the sentence says what to install.
+    """
+    missing = [package for package in PACKAGES if find_spec(package) is None]
+    if missing:
+        raise InputError(
+            f"The generator {name!r} needs {', '.join(missing)}; run `{INSTALL}`, or choose "
+            "'warp-inpaint', which needs no weights."
+        )
+
+
+@contextmanager
+def silent(sources: list[Source]) -> Iterator[None]:
+    """No progress bars of diffusers and transformers where nothing is downloaded."""
+    from diffusers.utils import logging as of_diffusers
+    from transformers.utils import logging as of_transformers
+
+    local = all(one.is_local for one in sources)
+    bars = [
+        log for log in (of_diffusers, of_transformers) if local and log.is_progress_bar_enabled()
+    ]
+    for log in bars:
+        log.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for log in bars:
+            log.enable_progress_bar()
+
+
+def cannot_load(source: Source, error: Exception) -> InputError:
+    """The sentence for a folder or repository that did not load."""
+    reason = " ".join(str(error).split())[:400]
+    way_out = (
+        "see that it is complete, as `save_pretrained` of diffusers writes it"
+        if source.is_local
+        else f"see that you accepted its terms at https://huggingface.co/{source.place} and are "
+        "logged in, or give a folder by --generator-path"
+    )
+    return InputError(
+        f"Could not load {source.place} ({type(error).__name__}: {reason.rstrip('.')}); {way_out}."
+    )

@@ -1,0 +1,130 @@
+"""Rotary embeddings that differ from head to head, for the FLUX transformer of diffusers.
+
+The heads form four groups, one for each quarter of a token. In a group the first head turns by
+the token's position, the second by that of the quarter, and the others by those of the quarter's
+own four quarters, in equal shares. No parameter is added: published weights fit as they are.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.generators.diffusion.position_ids import IDS
+
+GROUPS = 4
+"""Groups of heads, one for each quarter of a token."""
+HEADS = 24
+"""Heads that the scheme is made for: six in a group, on levels 0, 1, 2, 2, 2 and 2."""
+TRIPLE_OF_HEAD = tuple(
+    triple
+    for quarter in range(GROUPS)
+    for triple in (0, 1 + quarter, *(5 + 4 * quarter + inner for inner in range(4)))
+)
+"""Which of the 21 triples of a token each head turns by."""
+
+
+class PerHeadRotary(nn.Module):
+    """Position ids of tokens -> cosines and sines for each of their heads."""
+
+    def __init__(self, axes: tuple[int, int, int], theta: float = 10_000.0) -> None:
+        """`axes` are the channels of a head that z, row and column turn; their sum is its size."""
+        super().__init__()
+        self.axes = axes
+        self.theta = theta
+
+    def forward(
+        self, ids: Float[Tensor, "tokens 63"]
+    ) -> tuple[Float[Tensor, "tokens 24 d"], Float[Tensor, "tokens 24 d"]]:
+        """Cosines and sines; each pair of channels shares an angle."""
+        triples = ids.reshape(len(ids), IDS // 3, 3).double()
+        angles = torch.cat(
+            [triples[..., axis, None] * self.frequencies(axis, ids) for axis in range(3)], dim=-1
+        )
+        angles = angles.repeat_interleave(2, dim=-1)
+        cosines, sines = angles.cos().float(), angles.sin().float()
+        heads = torch.tensor(TRIPLE_OF_HEAD, device=ids.device)
+        return cosines[:, heads], sines[:, heads]
+
+    def frequencies(self, axis: int, ids: Tensor) -> Float[Tensor, "pairs"]:
+        """Radians per token for each pair of the axis's channels."""
+        channels = torch.arange(0, self.axes[axis], 2, dtype=torch.float64, device=ids.device)
+        return 1.0 / self.theta ** (channels / self.axes[axis])
+
+
+class PerHeadAttention:
+    """An attention processor for FLUX blocks that turns each head by its own table."""
+
+    # Diffusers calls it with names of its own, and hands over whichever its version knows.
+    def __call__(
+        self,
+        attn: Any,
+        hidden_states: Float[Tensor, "b tokens c"],
+        encoder_hidden_states: Float[Tensor, "b text c"] | None = None,
+        attention_mask: Tensor | None = None,
+        image_rotary_emb: tuple[Tensor, Tensor] | None = None,
+    ) -> Float[Tensor, "b tokens c"] | tuple[Tensor, Tensor]:
+        """Attention of text and image tokens; in single blocks they come as one sequence."""
+        query, key, value = projected(attn, hidden_states)
+        if encoder_hidden_states is not None:
+            of_text = projected_text(attn, encoder_hidden_states)
+            query, key, value = (
+                torch.cat([text, image], dim=1)
+                for text, image in zip(of_text, (query, key, value), strict=True)
+            )
+        if image_rotary_emb is not None:
+            query, key = turned(query, *image_rotary_emb), turned(key, *image_rotary_emb)
+        query, key, value = (part.transpose(1, 2) for part in (query, key, value))
+        mixed = nn.functional.scaled_dot_product_attention(query, key, value, attention_mask)
+        joined = mixed.transpose(1, 2).flatten(2).to(query.dtype)
+        if encoder_hidden_states is None:
+            return joined
+        text, image = joined.split([encoder_hidden_states.shape[1], hidden_states.shape[1]], dim=1)
+        image = attn.to_out[1](attn.to_out[0](image))
+        return image, attn.to_add_out(text)
+
+
+def projected(attn: Any, tokens: Float[Tensor, "b n c"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Query, key and value [b, n, heads, d] of image tokens, the first two normalised."""
+    query, key, value = (
+        layer(tokens).unflatten(-1, (-1, attn.head_dim))
+        for layer in (attn.to_q, attn.to_k, attn.to_v)
+    )
+    return attn.norm_q(query), attn.norm_k(key), value
+
+
+def projected_text(attn: Any, tokens: Float[Tensor, "b n c"]) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of text tokens, by layers of their own."""
+    query, key, value = (
+        layer(tokens).unflatten(-1, (-1, attn.head_dim))
+        for layer in (attn.add_q_proj, attn.add_k_proj, attn.add_v_proj)
+    )
+    return attn.norm_added_q(query), attn.norm_added_k(key), value
+
+
+def turned(
+    states: Float[Tensor, "b n heads d"],
+    cosines: Float[Tensor, "n heads d"],
+    sines: Float[Tensor, "n heads d"],
+) -> Float[Tensor, "b n heads d"]:
+    """`states` with each pair of channels turned by its angle, computed in float32."""
+    real, imaginary = states.unflatten(-1, (-1, 2)).unbind(-1)
+    quarter_turned = torch.stack([-imaginary, real], dim=-1).flatten(-2)
+    return (states.float() * cosines + quarter_turned.float() * sines).to(states.dtype)
+
+
+def with_per_head_positions(transformer: Any) -> Any:
+    """`transformer`, a FluxTransformer2DModel, made to take ids [tokens, 63]; its weights stay.
+
+    Raises:
+        ValueError: where it has not 24 heads, which the scheme needs.
+    """
+    heads = transformer.config.num_attention_heads
+    if heads != HEADS:
+        raise ValueError(f"PE-Field needs a transformer of {HEADS} heads, got {heads}")
+    transformer.pos_embed = PerHeadRotary(tuple(transformer.config.axes_dims_rope))
+    transformer.set_attn_processor(PerHeadAttention())
+    return transformer

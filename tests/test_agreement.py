@@ -1,0 +1,99 @@
+"""A synthesized image is compared with the photographs: its colours are brought to theirs, and
+an image of something else is told of."""
+
+import torch
+
+from gscompleter.generators import NotingGenerator
+from gscompleter.generators.agreement import AgreementConfig, checked, compare
+from gscompleter.generators.warp_inpaint import WarpInpaint
+from gscompleter.generators.warp_inpaint.warp import Warped
+from gscompleter.stages.anchor import synthesize
+from scenes import Room, camera_at, view_of
+from test_generators import TARGET, known_room
+
+TRUTH = view_of(Room(), camera_at(0.0)).image
+SEEN = torch.arange(96).expand(96, 96) < 60
+GAIN, OFFSET = torch.tensor([0.9, 1.1, 1.05]), torch.tensor([0.05, -0.04, 0.02])
+SHIFTED = (TRUTH - OFFSET) / GAIN
+NOISE = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
+
+
+def observed() -> Warped:
+    """The left of the image; what is stored elsewhere means nothing."""
+    image = torch.where(SEEN[..., None], TRUTH, torch.zeros_like(TRUTH))
+    return Warped(image, SEEN, torch.ones(96, 96), ())
+
+
+def test_a_colour_shift_is_measured_and_taken_back_in_the_unseen_part_too():
+    found = compare(SHIFTED, observed().image, SEEN)
+    assert found.agrees
+    assert torch.allclose(found.gain, GAIN, atol=0.01)
+    assert torch.allclose(found.offset, OFFSET, atol=0.01)
+    assert (found.image - TRUTH).abs().max() < 0.01
+
+
+def test_a_fifth_of_the_image_that_shows_something_else_does_not_bend_the_colours():
+    spoiled = SHIFTED.clone()
+    spoiled[:, :12] = 1.0
+    found = compare(spoiled, observed().image, SEEN)
+    assert found.agrees
+    assert (found.image - TRUTH)[:, 14:].abs().max() < 0.03
+
+
+def test_an_image_that_agrees_stays_and_is_worth_no_note():
+    image, notes = checked(lambda seed: TRUTH, 0, observed())
+    assert (image - TRUTH).abs().max() < 1e-3
+    assert notes == ()
+
+
+def test_something_else_is_told_and_left_as_it_is():
+    image, notes = checked(lambda seed: NOISE, 0, observed())
+    assert torch.equal(image, NOISE)
+    assert len(notes) == 1
+    assert "disagrees with the photographs" in notes[0]
+    assert "62% of it" in notes[0]
+
+
+def test_an_image_in_negative_is_no_colour_shift():
+    assert not compare(1 - TRUTH, observed().image, SEEN).agrees
+
+
+def test_further_seeds_are_tried_where_asked_and_only_until_one_agrees():
+    tried = []
+
+    def paint(seed: int) -> torch.Tensor:
+        tried.append(seed)
+        return SHIFTED if seed == 9 else NOISE
+
+    image, notes = checked(paint, 7, observed(), AgreementConfig(retries=5))
+    assert tried == [7, 8, 9]
+    assert (image - TRUTH).abs().max() < 0.01
+    assert notes[-1].startswith("3 seeds were tried")
+    tried.clear()
+    _, notes = checked(paint, 0, observed(), AgreementConfig(retries=1))
+    assert tried == [0, 1]
+    assert "best of 2 seeds" in notes[0]
+
+
+def test_where_nothing_was_seen_nothing_is_said():
+    nothing = Warped(TRUTH, torch.zeros_like(SEEN), torch.ones(96, 96), ())
+    image, notes = checked(lambda seed: NOISE, 0, nothing)
+    assert torch.equal(image, NOISE)
+    assert notes == ()
+
+
+class Talking:
+    """A generator of a user's own that tells something."""
+
+    def __call__(self, nearest, target, context):
+        raise AssertionError("the notes would be lost")
+
+    def with_notes(self, nearest, target, context):
+        return torch.full((target.height, target.width, 3), 0.5), ("Painted grey.",)
+
+
+def test_the_stage_takes_the_notes_of_a_generator_that_has_some():
+    context = known_room()
+    assert isinstance(Talking(), NotingGenerator)
+    assert synthesize(Talking(), TARGET, context).notes == ("Painted grey.",)
+    assert synthesize(WarpInpaint(), TARGET, context).notes == ()

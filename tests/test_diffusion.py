@@ -1,0 +1,222 @@
+"""PE-Field and inpainting pipelines as generators.
+
+The models are tiny and random, so that these are smoke tests: what is computed is compared with
+diffusers, and what is asked of a generator with the protocol. No image here looks like anything.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
+pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
+pytest.importorskip("accelerate", reason="needs gscompleter[diffusion]")
+
+import tiny_diffusion
+from gscompleter import InputError, load_generator
+from gscompleter.cli import main
+from gscompleter.generators.diffusion.inpaint import (
+    DiffusersInpaint,
+    completed_warp,
+    load_painter,
+)
+from gscompleter.generators.diffusion.kontext import SIZES, nearest_size
+from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
+from gscompleter.generators.diffusion.pe_field import PEField
+from gscompleter.io.image import write_image
+from gscompleter.io.scene import write_cameras
+from scenes import Room, camera_at, view_of
+from test_generators import TARGET, known_room
+
+SIZE = 64
+
+
+@pytest.fixture(scope="module")
+def kontext_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models") / "kontext"
+    return tiny_diffusion.saved(tiny_diffusion.kontext_pipeline(), folder)
+
+
+@pytest.fixture(scope="module")
+def inpaint_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models") / "inpaint"
+    return tiny_diffusion.saved(tiny_diffusion.stable_diffusion(), folder)
+
+
+def test_the_sizes_are_those_of_diffusers_and_the_nearest_aspect_wins():
+    from diffusers.pipelines.flux.pipeline_flux_kontext import PREFERRED_KONTEXT_RESOLUTIONS
+
+    assert {(h, w) for w, h in PREFERRED_KONTEXT_RESOLUTIONS} == set(SIZES)
+    assert len(SIZES) == 17
+    assert nearest_size(256, 256) == (1024, 1024)
+    assert nearest_size(480, 720) == (832, 1248)
+    assert nearest_size(720, 480) == (1248, 832)
+    for height, width in ((256, 448), (448, 256), (360, 640), (193, 640), (640, 360), (96, 100)):
+        aspect = width / height
+        _, w, h = min((abs(aspect - w / h), w, h) for w, h in PREFERRED_KONTEXT_RESOLUTIONS)
+        assert nearest_size(height, width) == (h, w)
+
+
+def test_with_plain_positions_our_loop_is_the_pipeline_of_diffusers(kontext_folder):
+    """The same noise, prompt, photograph and steps give the same image."""
+    from diffusers import FluxKontextPipeline
+
+    model = load_kontext(str(kontext_folder))
+    photograph = view_of(Room(), camera_at(0.0, size=128)).image
+    size, grid = (128, 192), (2, 3)
+    rows, columns = torch.meshgrid(torch.arange(2.0), torch.arange(3.0), indexing="ij")
+    target = torch.stack([torch.zeros(6), rows.flatten(), columns.flatten()], dim=-1)
+    rows, columns = torch.meshgrid(torch.arange(2.0), torch.arange(2.0), indexing="ij")
+    source = torch.stack([torch.ones(4), rows.flatten(), columns.flatten()], dim=-1)
+    found = model.generate(photograph, size, target.repeat(1, 21), source.repeat(1, 21), 5, 3, 2.5)
+
+    stock = FluxKontextPipeline.from_pretrained(kontext_folder)
+    stock.set_progress_bar_config(disable=True)
+    expected = stock(
+        image=photograph.permute(2, 0, 1)[None],
+        prompt=PROMPT,
+        height=size[0],
+        width=size[1],
+        num_inference_steps=3,
+        guidance_scale=2.5,
+        generator=torch.Generator().manual_seed(5),
+        output_type="pt",
+        max_area=size[0] * size[1],
+        _auto_resize=False,
+    ).images[0]
+    assert model.grid(size) == grid
+    assert found.std() > 0.01
+    assert (found - expected.permute(1, 2, 0)).abs().max() < 1e-5
+
+
+def test_the_text_encoders_leave_memory_and_the_model_is_loaded_once(kontext_folder):
+    model = load_kontext(str(kontext_folder))
+    assert model.pipeline.text_encoder is None
+    assert model.pipeline.text_encoder_2 is None
+    assert model.prompt.tokens.shape == (1, 512, 32)
+    assert load_kontext(str(kontext_folder)) is model
+
+
+def test_pe_field_depends_on_seed_and_depth_and_on_nothing_else(kontext_folder):
+    model, context = load_kontext(str(kontext_folder)), known_room()
+
+    def image(context=context, **changes):
+        return PEField(model, **({"steps": 1} | changes))(context.views[1], TARGET, context)
+
+    first = image(seed=1)
+    assert first.shape == (TARGET.height, TARGET.width, 3)
+    assert torch.equal(first, image(seed=1))
+    assert not torch.equal(first, image(seed=2))
+    renders = tuple(replace(r, depth=r.depth**2) for r in context.at_views)
+    assert not torch.equal(first, image(replace(context, at_views=renders), seed=1))
+
+
+def test_noise_in_place_of_the_scene_is_told(kontext_folder):
+    context = known_room()
+    generator = PEField(load_kontext(str(kontext_folder)), steps=1)
+    _, notes = generator.with_notes(context.views[1], TARGET, context)
+    assert len(notes) == 1
+    assert "disagrees with the photographs" in notes[0]
+
+
+def test_a_scene_that_the_photograph_does_not_see_is_refused(kontext_folder):
+    context = known_room()
+    empty = tuple(replace(r, alpha=0 * r.alpha) for r in context.at_views)
+    with pytest.raises(InputError, match="sees nothing of the scene"):
+        PEField(load_kontext(str(kontext_folder)))(
+            context.views[1], TARGET, replace(context, at_views=empty)
+        )
+
+
+@pytest.mark.parametrize("name", tiny_diffusion.INPAINTERS)
+def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
+    folder = tiny_diffusion.saved(tiny_diffusion.INPAINTERS[name](), tmp_path)
+    context, painter = known_room(), load_painter(str(folder))
+    painter = replace(painter, side=min(painter.side, 256))  # Flux counts 128 latents
+    generator = DiffusersInpaint(painter, steps=2)
+    image = generator(context.views[1], TARGET, context)
+    warped = completed_warp(context.views[1], TARGET, context)
+    assert 0.05 < (~warped.known).float().mean() < 0.9
+    assert torch.equal(image[warped.known], warped.image[warped.known])
+    assert (image - warped.image)[~warped.known].abs().mean() > 0.01
+    assert image.min() >= 0
+    assert image.max() <= 1
+    assert torch.equal(image, generator(context.views[1], TARGET, context))
+    other = replace(generator, seed=1)(context.views[1], TARGET, context)
+    assert not torch.equal(image, other)
+
+
+def test_the_size_follows_the_pipeline_and_the_aspect(inpaint_folder):
+    painter = load_painter(str(inpaint_folder))
+    assert (painter.side, painter.multiple) == (64, 4)
+    assert painter.size_for(500, 500) == (64, 64)
+    h, w = painter.size_for(200, 800)
+    assert (h % 4, w % 4) == (0, 0)
+    assert h * w == pytest.approx(64 * 64, rel=0.1)
+    assert w / h == pytest.approx(4, rel=0.15)
+
+
+def test_a_pipeline_of_another_kind_is_refused(tmp_path, kontext_folder):
+    with pytest.raises(InputError, match="has 12 heads"):
+        folder = tiny_diffusion.saved(tiny_diffusion.kontext_pipeline(heads=12), tmp_path / "few")
+        load_generator("pe-field", path=str(folder))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="neither a model_index.json"):
+        load_generator("pe-field", path=str(tmp_path / "empty"))
+    with pytest.raises(InputError, match="Could not load"):
+        load_generator("diffusers-inpaint", path=str(tmp_path / "empty"))
+
+
+def completed(tmp_path, monkeypatch, *model) -> dict:
+    """The summary of a completion of the room by the command line."""
+    scene, out = tmp_path / "scene", tmp_path / "out"
+    scene.mkdir()
+    cameras = [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)]
+    for number, camera in enumerate(cameras):
+        write_image(scene / f"{number}.png", view_of(Room(), camera).image)
+    write_cameras(scene / "transforms.json", cameras, ["0.png", "1.png", "2.png"])
+    command = ["gscompleter", "complete", scene, "--context", 0, 1, "--target", 2]
+    command += ["--near", 0.5, "--far", 20, "--device", "cpu", "--out", out, "--quiet", *model]
+    monkeypatch.setattr(sys, "argv", [str(word) for word in command])
+    main()
+    assert (out / "completed.ply").is_file()
+    assert (out / "images" / "target1_reference.png").is_file()
+    return json.loads((out / "summary.json").read_text())
+
+
+@pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
+def test_a_smoke_test_of_a_whole_completion_with_random_weights(
+    name, kontext_folder, inpaint_folder, tmp_path, monkeypatch
+):
+    folder = kontext_folder if name == "pe-field" else inpaint_folder
+    summary = completed(tmp_path, monkeypatch, "--generator", name, "--generator-path", folder)
+    assert summary["settings"]["generator"] == name
+    assert summary["settings"]["generator_path"] == str(folder)
+    assert summary["targets"][0]["hole_fraction"] > 0
+    if name == "pe-field":
+        assert "disagrees with the photographs" in " ".join(summary["targets"][0]["notes"])
+
+
+@pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
+def test_a_smoke_test_on_photographs_with_random_weights(
+    name, kontext_folder, inpaint_folder, shared, tmp_path, monkeypatch
+):
+    scene, out = shared / "data" / "re10k_000c3ab1", tmp_path / "out"
+    if not scene.is_dir():
+        pytest.skip(f"needs the photographs in {scene}")
+    folder = kontext_folder if name == "pe-field" else inpaint_folder
+    command = ["gscompleter", "complete", scene, "--context", 0, 4, "--target", 12]
+    command += ["--resolution", 96, 128, "--near", 1, "--far", 100, "--device", "cpu"]
+    command += ["--generator", name, "--generator-path", folder, "--out", out, "--quiet"]
+    monkeypatch.setattr(sys, "argv", [str(word) for word in command])
+    main()
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["targets"][0]["hole_fraction"] > 0
+    assert (out / "images" / "target1_reference.png").is_file()
+    if name == "pe-field":
+        assert "disagrees with the photographs" in " ".join(summary["targets"][0]["notes"])

@@ -1,0 +1,79 @@
+"""What is said when a generator with weights cannot be had. Nothing here needs diffusers."""
+
+import pytest
+
+from gscompleter import InputError, load_generator
+from gscompleter.generators.diffusion import published
+from gscompleter.generators.diffusion.loading import sources
+from gscompleter.generators.diffusion.published import (
+    KONTEXT,
+    PE_FIELD,
+    Source,
+    announce,
+    source_of,
+)
+
+
+@pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
+def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatch):
+    monkeypatch.setattr(published, "PACKAGES", ("a_package_nobody_has", "torch"))
+    with pytest.raises(InputError) as told:
+        load_generator(name, path="somebody/something")
+    message = str(told.value)
+    assert "a_package_nobody_has" in message
+    assert "torch" not in message
+    assert "pip install 'gscompleter[diffusion]'" in message
+
+
+def test_a_path_for_a_generator_without_weights_is_refused():
+    with pytest.raises(InputError, match="'warp-inpaint' has no weights"):
+        load_generator("warp-inpaint", path="somebody/something")
+
+
+def test_an_inpainter_must_be_named(monkeypatch):
+    monkeypatch.setattr(published, "PACKAGES", ())
+    with pytest.raises(InputError, match="name one with --generator-path"):
+        load_generator("diffusers-inpaint")
+
+
+def test_a_path_is_a_folder_or_an_id_with_or_without_its_commit(tmp_path):
+    assert source_of(str(tmp_path)) == Source(place=str(tmp_path))
+    assert source_of(str(tmp_path)).is_pinned
+    loose = source_of("somebody/something")
+    assert (loose.place, loose.revision, loose.is_pinned) == ("somebody/something", "main", False)
+    commit = "0123456789abcdef" * 2 + "01234567"
+    pinned = source_of(f"somebody/something@{commit}")
+    assert (pinned.revision, pinned.is_pinned) == (commit, True)
+    assert source_of("somebody/flux-fill").terms != loose.terms
+    for wrong in ("nothing", "./a/b", "/a/b", "a/b/c", "a/"):
+        with pytest.raises(InputError, match="no repository"):
+            source_of(wrong)
+
+
+def test_gate_licence_and_missing_pin_are_named_before_a_download_and_a_folder_needs_no_word(
+    capsys, tmp_path
+):
+    announce([Source(place=str(tmp_path))])
+    assert capsys.readouterr().err == ""
+    announce([KONTEXT, PE_FIELD])
+    said = capsys.readouterr().err
+    assert "https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev" in said
+    assert "must be accepted on its page" in said
+    assert "https://huggingface.co/yunpeng1998/PE-Field" in said
+    assert said.count("pins nothing") == 2
+    assert said.count("Non-Commercial") + said.count("non-commercial") == 2
+
+
+def test_a_pipeline_brings_its_own_transformer_and_a_transformer_joins_the_published_base(tmp_path):
+    assert sources(None) == (KONTEXT, PE_FIELD)
+    whole, alone = tmp_path / "whole", tmp_path / "alone"
+    for folder, file in ((whole, "model_index.json"), (alone, "config.json")):
+        folder.mkdir()
+        (folder / file).write_text("{}")
+    base, transformer = sources(str(whole))
+    assert (base.place, base.subfolder) == (str(whole), None)
+    assert (transformer.place, transformer.subfolder) == (str(whole), "transformer")
+    assert sources(str(alone)) == (KONTEXT, Source(place=str(alone)))
+    base, transformer = sources("somebody/something@abc")
+    assert base.arguments == {"revision": "abc"}
+    assert transformer.arguments == {"revision": "abc", "subfolder": "transformer"}

@@ -1,0 +1,197 @@
+"""Tiny diffusion models of the real classes with random weights, saved as diffusers saves them.
+
+What they paint is noise: they are for smoke tests of frames, sizes and stages.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
+
+def clip_tokenizer() -> Any:
+    from transformers import CLIPTokenizer
+
+    words = [*LETTERS, *(f"{letter}</w>" for letter in LETTERS)]
+    words += ["<|startoftext|>", "<|endoftext|>"]
+    vocabulary = {word: number for number, word in enumerate(words)}
+    return CLIPTokenizer(vocab=vocabulary, merges=[], model_max_length=77)
+
+
+def clip_text_encoder(width: int) -> Any:
+    from transformers import CLIPTextConfig, CLIPTextModel
+
+    config = CLIPTextConfig(
+        vocab_size=54,
+        hidden_size=width,
+        intermediate_size=width,
+        num_hidden_layers=1,
+        num_attention_heads=2,
+        eos_token_id=53,
+        bos_token_id=52,
+        pad_token_id=53,
+    )
+    return CLIPTextModel(config)
+
+
+def t5(width: int) -> tuple[Any, Any]:
+    from transformers import T5Config, T5EncoderModel, T5TokenizerFast
+
+    pieces = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), ("▁", -1.0)]
+    pieces += [(letter, -2.0) for letter in LETTERS]
+    tokenizer = T5TokenizerFast(vocab=pieces, extra_ids=0)
+    config = T5Config(
+        vocab_size=len(pieces), d_model=width, d_kv=8, d_ff=width, num_layers=1, num_heads=2
+    )
+    return tokenizer, T5EncoderModel(config)
+
+
+def vae(levels: int, **settings: Any) -> Any:
+    """An autoencoder that halves the image on all levels but the last."""
+    from diffusers import AutoencoderKL
+
+    return AutoencoderKL(
+        block_out_channels=(4,) * levels,
+        down_block_types=("DownEncoderBlock2D",) * levels,
+        up_block_types=("UpDecoderBlock2D",) * levels,
+        layers_per_block=1,
+        latent_channels=4,
+        norm_num_groups=2,
+        **settings,
+    )
+
+
+def kontext_pipeline(heads: int = 24) -> Any:
+    """FLUX Kontext whose tokens are 64 pixels wide, so that a million pixels are 256 tokens."""
+    from diffusers import (
+        FlowMatchEulerDiscreteScheduler,
+        FluxKontextPipeline,
+        FluxTransformer2DModel,
+    )
+
+    torch.manual_seed(0)
+    transformer = FluxTransformer2DModel(
+        in_channels=16,
+        num_layers=1,
+        num_single_layers=1,
+        attention_head_dim=16,
+        num_attention_heads=heads,
+        joint_attention_dim=32,
+        pooled_projection_dim=24,
+        guidance_embeds=True,
+        axes_dims_rope=(4, 6, 6),
+    )
+    tokenizer, encoder = t5(32)
+    return FluxKontextPipeline(
+        scheduler=FlowMatchEulerDiscreteScheduler(use_dynamic_shifting=True, shift=3.0),
+        vae=vae(
+            6,
+            shift_factor=0.1159,
+            scaling_factor=0.3611,
+            use_quant_conv=False,
+            use_post_quant_conv=False,
+        ),
+        text_encoder=clip_text_encoder(24),
+        tokenizer=clip_tokenizer(),
+        text_encoder_2=encoder,
+        tokenizer_2=tokenizer,
+        transformer=transformer,
+    )
+
+
+def unet(**settings: Any) -> Any:
+    """A UNet of two levels at 64 pixels; SDXL's has no cross attention on its first."""
+    from diffusers import UNet2DConditionModel
+
+    return UNet2DConditionModel(
+        sample_size=32,
+        out_channels=4,
+        block_out_channels=(8, 16),
+        layers_per_block=1,
+        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
+        up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
+        attention_head_dim=4,
+        norm_num_groups=4,
+        **settings,
+    )
+
+
+def stable_diffusion(inpainting: bool = True) -> Any:
+    """Stable Diffusion at 64 pixels: that for inpainting, or the one that knows text alone."""
+    import diffusers
+
+    torch.manual_seed(0)
+    kind = "StableDiffusionInpaintPipeline" if inpainting else "StableDiffusionPipeline"
+    return getattr(diffusers, kind)(
+        vae=vae(2),
+        text_encoder=clip_text_encoder(16),
+        tokenizer=clip_tokenizer(),
+        unet=unet(in_channels=9 if inpainting else 4, cross_attention_dim=16),
+        scheduler=diffusers.DDIMScheduler(steps_offset=1, clip_sample=False),
+        safety_checker=None,
+        feature_extractor=None,
+        requires_safety_checker=False,
+    )
+
+
+def sdxl() -> Any:
+    """SDXL's inpainting at 64 pixels."""
+    from diffusers import EulerDiscreteScheduler, StableDiffusionXLInpaintPipeline
+    from transformers import CLIPTextModelWithProjection
+
+    torch.manual_seed(0)
+    second = CLIPTextModelWithProjection(clip_text_encoder(16).config)
+    return StableDiffusionXLInpaintPipeline(
+        vae=vae(2),
+        text_encoder=clip_text_encoder(16),
+        tokenizer=clip_tokenizer(),
+        text_encoder_2=second,
+        tokenizer_2=clip_tokenizer(),
+        unet=unet(
+            in_channels=9,
+            cross_attention_dim=32,
+            addition_embed_type="text_time",
+            addition_time_embed_dim=8,
+            projection_class_embeddings_input_dim=8 * 6 + second.config.projection_dim,
+        ),
+        scheduler=EulerDiscreteScheduler(),
+    )
+
+
+def flux_fill() -> Any:
+    """Flux Fill, whose tokens are 64 pixels wide as those of `kontext_pipeline`."""
+    from diffusers import FluxFillPipeline, FluxTransformer2DModel
+
+    parts = kontext_pipeline().components
+    mask = 4 * 32**2
+    transformer = FluxTransformer2DModel(
+        in_channels=2 * 16 + mask,
+        out_channels=16,
+        num_layers=1,
+        num_single_layers=1,
+        attention_head_dim=16,
+        num_attention_heads=2,
+        joint_attention_dim=32,
+        pooled_projection_dim=24,
+        guidance_embeds=True,
+        axes_dims_rope=(4, 6, 6),
+    )
+    kept = ("scheduler", "vae", "text_encoder", "tokenizer", "text_encoder_2", "tokenizer_2")
+    return FluxFillPipeline(transformer=transformer, **{name: parts[name] for name in kept})
+
+
+INPAINTERS = {
+    "stable-diffusion": stable_diffusion,
+    "stable-diffusion-of-text": lambda: stable_diffusion(inpainting=False),
+    "sdxl": sdxl,
+    "flux-fill": flux_fill,
+}
+
+
+def saved(pipeline: Any, folder: Path) -> Path:
+    pipeline.save_pretrained(folder)
+    return folder
