@@ -247,7 +247,8 @@ class Bench:
             made = attempt(lambda: measured(method, start, parts))
             if isinstance(made, str):
                 return self._row_of(method, error=made)
-            save_outcome(path, saved := made)
+            save_outcome(path, made)
+            saved = load_outcome(path, start) or made
         row = attempt(lambda: self._scored(method, saved, start, parts, truth))
         return self._row_of(method, error=row) if isinstance(row, str) else row
 
@@ -303,11 +304,16 @@ class Bench:
 
 
 def start_at(path: Path, views: Sequence[View], target: View, parts: Parts) -> Start:
-    """The context that is saved at `path`, else computed and saved there."""
+    """The context that is saved at `path`, where it is computed and saved first if it is not there.
+
+    It is read back in any case, so that a run that was stopped goes on with the very same tensors.
+    """
     start = load_start(path, views, target)
     if start is None:
-        start = start_of(views, target.camera, parts)
-        save_start(path, start)
+        save_start(path, start_of(views, target.camera, parts))
+        start = load_start(path, views, target)
+    if start is None:
+        raise OutputError(f"{path} cannot be read back; look whether the disk is sound.")
     return start
 
 

@@ -159,6 +159,7 @@ def outcome_of(method: str, start: Start, number: int, parts: Parts, path: Path 
         saved = Saved(numbered(METHODS[method](start, parts), number), None)
         if path is not None:
             save_outcome(path, saved)
+            saved = load_outcome(path, start) or saved  # as a sequence that was stopped reads it
     return saved.outcome
 
 

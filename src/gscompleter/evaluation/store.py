@@ -151,7 +151,8 @@ def _arrays_of(gaussians: Gaussians) -> Arrays:
 
 
 def _gaussians_of(arrays: Mapping[str, np.ndarray], device: torch.device) -> Gaussians:
-    return Gaussians(*(torch.from_numpy(arrays[name]).to(device) for name in _FIELDS))
+    """Copies, which lie in memory as torch's own tensors do: how a sum is rounded depends on it."""
+    return Gaussians(*(torch.from_numpy(arrays[name]).clone().to(device) for name in _FIELDS))
 
 
 def load_arrays(path: Path) -> Arrays | None:
