@@ -139,24 +139,29 @@ def die(before):
     time.sleep(float(delay))
     os.kill(os.getpid(), signal.SIGKILL)
 
-threading.Thread(target=die, args=(written(),), daemon=True).start()
+if delay != "never":
+    threading.Thread(target=die, args=(written(),), daemon=True).start()
 config = RunConfig(baseline_iterations=int(iterations))
 evaluate(read_cases(Path(cases)), methods.split(), Path(out), config)
 """
-"""A run that is killed some seconds after it has written something new."""
+"""A run that is killed some seconds after it has written something new, or never."""
 
 
-def test_a_run_killed_five_times_ends_as_one_that_was_not(finished, scenes, cases, tmp_path):
-    out, random = tmp_path / "out", Random(0)
-    arguments = [scenes / "cases.json", out, " ".join(METHOD_NAMES), CONFIG.baseline_iterations]
+def test_a_run_killed_five_times_ends_as_one_that_was_not(scenes, tmp_path):
+    """Every life is a process of its own, as it is for a user."""
+
+    def live(out: Path, delay: float | str) -> int:
+        words = [scenes / "cases.json", out, " ".join(METHOD_NAMES), 6, delay]
+        life = subprocess.run([sys.executable, "-c", LIFE, *map(str, words)], check=False)
+        return life.returncode
+
+    out, whole, random = tmp_path / "out", tmp_path / "whole", Random(0)
     for _ in range(5):
-        words = [*map(str, arguments), str(random.uniform(0, 0.2))]
-        life = subprocess.run([sys.executable, "-c", LIFE, *words], check=False)
-        assert life.returncode == -signal.SIGKILL
-    tally = evaluate(cases, METHOD_NAMES, out, CONFIG)
-    assert tally.failed == 0
-    assert 0 < tally.done < 8
-    same_tables(out, finished)
+        assert live(out, random.uniform(0, 0.2)) == -signal.SIGKILL
+    assert 0 < len(list((out / "cases").glob("*/*.json"))) < 8
+    assert live(out, "never") == live(whole, "never") == 0
+    tables(whole)
+    same_tables(out, whole)
 
 
 def test_failures_and_scores_can_be_done_again(cases, tmp_path, monkeypatch):
