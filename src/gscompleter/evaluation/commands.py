@@ -28,7 +28,7 @@ from gscompleter.evaluation.protocols import (
     write_evaluation_index,
 )
 from gscompleter.evaluation.runs import EvaluationCase, RunConfig, evaluate
-from gscompleter.evaluation.sequence_tables import overview, read_sequences, sequence_tables
+from gscompleter.evaluation.sequence_tables import overview, sequence_tables
 from gscompleter.evaluation.sequences import evaluate_sequences
 from gscompleter.evaluation.store import CASES, SEQUENCES
 from gscompleter.evaluation.tables import (
@@ -235,8 +235,7 @@ def tell_sequences(out: Path, quiet: bool) -> None:
     Raises:
         InputError: where a row is damaged, or a file cannot be written.
     """
-    sequence_tables(out)
-    summary = read_sequences(out)
+    summary = sequence_tables(out)
     if summary is None:
         return
     draw(quiet, lambda: plot_sequences(summary, out))

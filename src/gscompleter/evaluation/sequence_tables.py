@@ -17,7 +17,7 @@ from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.sequences import scale_drift
 from gscompleter.evaluation.store import SEQUENCES, read_json
-from gscompleter.evaluation.tables import markdown
+from gscompleter.evaluation.tables import markdown, place_of
 from gscompleter.io.files import replacing
 
 Row = dict[str, Any]
@@ -75,17 +75,17 @@ class SequenceSummary:
     """Sequence, method, steps before it, reason."""
 
 
-def sequence_tables(out: Path) -> None:
+def sequence_tables(out: Path) -> SequenceSummary | None:
     """Write sequences.md and .json, and sequence_timings.md and .json, from the rows below `out`.
 
-    Where no sequence has a row, nothing is written.
+    Where no sequence has a row, nothing is written, and None comes back.
 
     Raises:
         InputError: where a row is damaged, or a file cannot be written.
     """
     summary = read_sequences(out)
     if summary is None:
-        return
+        return None
     texts = {
         "sequences.md": score_markdown(summary),
         "sequences.json": score_json(summary),
@@ -95,6 +95,7 @@ def sequence_tables(out: Path) -> None:
     for name, text in texts.items():
         with replacing(out / name) as file:
             file.write(text.encode())
+    return summary
 
 
 def read_sequences(out: Path) -> SequenceSummary | None:
@@ -106,9 +107,8 @@ def read_sequences(out: Path) -> SequenceSummary | None:
     rows = [_read_row(path) for path in sorted((out / SEQUENCES).glob("*/*.json"))]
     if not rows:
         return None
-    order = {name: number for number, name in enumerate(METHODS)}
-    methods = tuple(sorted({row["method"] for row in rows}, key=lambda name: order[name]))
-    rows.sort(key=lambda row: (row["sequence"]["name"], order[row["method"]]))
+    methods = tuple(sorted({row["method"] for row in rows}, key=place_of))
+    rows.sort(key=lambda row: (row["sequence"]["name"], *place_of(row["method"])))
     steps: dict[str, dict[str, Steps]] = {row["sequence"]["name"]: {} for row in rows}
     for row in rows:
         steps[row["sequence"]["name"]][row["method"]] = row["steps"]
