@@ -16,7 +16,7 @@ def _hash(value):
     return value ^ (value >> np.uint64(31))
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath={"contract"})
 def _patch_cost(image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias):
     """Mean squared difference of two patches after the best small shift of each colour channel.
 
@@ -53,7 +53,7 @@ def _patch_cost(image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_
     return cost
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath={"contract"})
 def _prior(log_depth, expected, distance, diagonal, depth_penalty, distance_penalty):
     """What a source costs for lying before the expected depth, and for being far away."""
     nearer = max(expected - log_depth, np.float32(0))
@@ -62,7 +62,7 @@ def _prior(log_depth, expected, distance, diagonal, depth_penalty, distance_pena
     )
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(cache=True, parallel=True, fastmath={"contract"})
 def search(
     image,
     weight,
@@ -195,7 +195,7 @@ def search(
     return cost, shift
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(cache=True, parallel=True, fastmath={"contract"})
 def vote(shape, pixels, query_at, vote_weight, sources, field, shift, radius):
     """Weighted mean of what all patches over a pixel say about it, for `pixels` [p, 2].
 

@@ -8,19 +8,18 @@ ratio of the two z-depths.
 import numpy as np
 from numba import njit, prange
 
-MATH = {"nnan", "ninf", "nsz", "arcp", "contract", "reassoc"}
 UNSEEN = 255
 """Cost of a plane at which the pixel falls outside of the other image."""
 BLOCK = 16
 """Rows that are swept together, so that their part of the cost volume stays in the cache."""
 
 
-@njit(cache=True, fastmath=MATH, inline="always")
+@njit(cache=True, fastmath={"contract"}, inline="always")
 def _clip(value, low, high):
     return min(max(value, low), high)
 
 
-@njit(cache=True, fastmath=MATH)
+@njit(cache=True, fastmath={"contract"})
 def _box_sums(values, sums, column, rows, width, radius):
     """Sums over (2 radius + 1)^2 windows of `values` [rows + 2 radius, width + 2 radius]."""
     for x in range(width + 2 * radius):
@@ -40,7 +39,7 @@ def _box_sums(values, sums, column, rows, width, radius):
             column[x] -= values[y, x]
 
 
-@njit(cache=True, parallel=True, fastmath=MATH)
+@njit(cache=True, parallel=True, fastmath={"contract"})
 def matching_costs(reference, source, transform, inverse_depths, radius, noise, detail):
     """Dissimilarity of every reference pixel to the source at every plane.
 
@@ -214,7 +213,7 @@ def best_mean(costs, share, unseen_cost):
     return merged
 
 
-@njit(cache=True, fastmath=MATH, inline="always")
+@njit(cache=True, fastmath={"contract"}, inline="always")
 def _step(cost, before, lowest, after, total, small, large):
     """One step of a path: returns the lowest cost at the new pixel."""
     planes = cost.shape[0]
@@ -230,7 +229,7 @@ def _step(cost, before, lowest, after, total, small, large):
     return best
 
 
-@njit(cache=True, fastmath=MATH)
+@njit(cache=True, fastmath={"contract"})
 def _sweep_half(costs, large_x, large_y, large_d, large_u, small, down, total):
     """Four of the eight paths: along the row, and from the three neighbours of the row before."""
     h, w, planes = costs.shape
@@ -277,7 +276,7 @@ def _sweep_half(costs, large_x, large_y, large_d, large_u, small, down, total):
                 )
 
 
-@njit(cache=True, parallel=True, fastmath=MATH)
+@njit(cache=True, parallel=True, fastmath={"contract"})
 def semi_global(costs, large_x, large_y, large_d, large_u, small):
     """Costs aggregated along eight paths (Hirschmüller 2008).
 
@@ -303,7 +302,7 @@ def semi_global(costs, large_x, large_y, large_d, large_u, small):
     return total[0]
 
 
-@njit(cache=True, parallel=True, fastmath=MATH)
+@njit(cache=True, parallel=True, fastmath={"contract"})
 def winners(total):
     """The best plane of every pixel, to a fraction, and how much the second best costs more.
 
@@ -338,7 +337,7 @@ def winners(total):
     return index, margin
 
 
-@njit(cache=True, parallel=True, fastmath=MATH)
+@njit(cache=True, parallel=True, fastmath={"contract"})
 def reproject(depth, other, there, back):
     """Carry every pixel to another view and back by the two views' inverse depths.
 

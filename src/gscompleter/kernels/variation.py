@@ -3,7 +3,6 @@
 import numpy as np
 from numba import njit, prange
 
-MATH = {"nnan", "ninf", "nsz", "arcp", "contract", "reassoc"}
 PRIMAL_STEP = 0.25
 SLOPE_STEP = 0.2
 DUAL_STEP = 1 / 3
@@ -11,7 +10,7 @@ SLOPE_DUAL_STEP = 0.5
 """Steps of the four variables: inverse row sums of the operator, as in Pock and Chambolle 2011."""
 
 
-@njit(cache=True, parallel=True, fastmath=MATH, error_model="numpy")
+@njit(cache=True, parallel=True, fastmath={"contract"}, error_model="numpy")
 def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations):
     """Heights u and slopes v that minimise, by the first-order primal-dual algorithm,
 
