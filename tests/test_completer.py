@@ -66,6 +66,20 @@ class KnowingGenerator:
         return view_of(Room(unit=self.unit), target).image
 
 
+class KnowingTogether(KnowingGenerator):
+    """The same, two targets at a time."""
+
+    at_once = 2
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[int] = []
+
+    def batch(self, calls):
+        self.asked.append(len(calls))
+        return [(self(*call), (f"One of {len(calls)}.",)) for call in calls]
+
+
 def knowing(config: CompleterConfig = CompleterConfig(), unit: float = 1.0) -> GSCompleter:
     return GSCompleter(KnowingReconstructor(unit), KnowingGenerator(unit), config=config)
 
@@ -147,6 +161,25 @@ def test_several_targets_are_completed_one_after_the_other_into_one_scene():
     again = completion.targets[2]
     assert again.hole_fraction < 0.3 * completion.targets[0].hole_fraction
     assert len(completion.scene) == len(completion.context) + len(completion.added)
+
+
+def test_targets_are_synthesized_together_where_the_generator_can():
+    views, (_, target) = photographs(), cameras()
+    others = [camera_at(x, yaw=12, size=SIZE) for x in (0.9, 1.1, 1.3)]
+    targets = [target, views[0].camera, *others]
+    generator = KnowingTogether()
+    together = GSCompleter(KnowingReconstructor(), generator)(views, targets)
+    assert generator.asked == [1, 2, 1]
+    assert [result.notes[0] for result in together.targets] == [
+        "One of 1.",
+        "The target is a context view: nothing to complete.",
+        "One of 2.",
+        "One of 2.",
+        "One of 1.",
+    ]
+    one_by_one = knowing()(views, targets)
+    assert torch.equal(together.scene.means, one_by_one.scene.means)
+    assert torch.equal(together.scene.opacities, one_by_one.scene.opacities)
 
 
 def test_numbers_of_targets_go_on_where_the_given_scene_ends():

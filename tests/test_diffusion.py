@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -18,8 +19,10 @@ pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
 pytest.importorskip("accelerate", reason="needs gscompleter[diffusion]")
 
 import tiny_diffusion
-from gscompleter import InputError, load_generator
+from gscompleter import InputError, load_generator, load_renderer
 from gscompleter.cli import main
+from gscompleter.generators import DiffusionSettings
+from gscompleter.generators.agreement import AgreementConfig
 from gscompleter.generators.diffusion.inpaint import (
     DiffusersInpaint,
     completed_warp,
@@ -27,13 +30,19 @@ from gscompleter.generators.diffusion.inpaint import (
 )
 from gscompleter.generators.diffusion.kontext import SIZES, nearest_size
 from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
-from gscompleter.generators.diffusion.pe_field import PEField
+from gscompleter.generators.diffusion.pe_field import PEField, grouped
+from gscompleter.generators.diffusion.source_depth import context_depth
 from gscompleter.io.image import write_image
 from gscompleter.io.scene import write_cameras
-from scenes import Room, camera_at, view_of
+from gscompleter.types import Gaussians, SceneContext, merge
+from scenes import Room, camera_at, gaussians_of, view_of
 from test_generators import TARGET, known_room
 
 SIZE = 64
+
+
+def scene_of(context: SceneContext) -> Gaussians:
+    return merge([gaussians_of(view) for view in context.views])
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +82,8 @@ def test_with_plain_positions_our_loop_is_the_pipeline_of_diffusers(kontext_fold
     target = torch.stack([torch.zeros(6), rows.flatten(), columns.flatten()], dim=-1)
     rows, columns = torch.meshgrid(torch.arange(2.0), torch.arange(2.0), indexing="ij")
     source = torch.stack([torch.ones(4), rows.flatten(), columns.flatten()], dim=-1)
-    found = model.generate(photograph, size, target.repeat(1, 21), source.repeat(1, 21), 5, 3, 2.5)
+    target, source = target.repeat(1, 21), source.repeat(1, 21)
+    found = model.generate(photograph[None], size, target, source[None], 5, 3, 2.5)[0]
 
     stock = FluxKontextPipeline.from_pretrained(kontext_folder)
     stock.set_progress_bar_config(disable=True)
@@ -114,6 +124,63 @@ def test_pe_field_depends_on_seed_and_depth_and_on_nothing_else(kontext_folder):
     assert not torch.equal(first, image(seed=2))
     renders = tuple(replace(r, depth=r.depth**2) for r in context.at_views)
     assert not torch.equal(first, image(replace(context, at_views=renders), seed=1))
+
+
+def test_images_made_together_are_those_made_alone(kontext_folder):
+    context, flat = known_room(), camera_at(0.6, yaw=8, size=96)
+    flat = replace(flat, height=48)  # another size, which is painted by itself
+    targets = [TARGET, camera_at(0.5, yaw=10, size=96), flat, camera_at(0.4, yaw=9, size=96)]
+    contexts = [
+        replace(context, at_target=load_renderer("cpu").render(scene_of(context), target))
+        for target in targets
+    ]
+    generator = PEField(load_kontext(str(kontext_folder)), steps=2, at_once=2)
+    calls = [
+        (context.views[1], target, known) for target, known in zip(targets, contexts, strict=True)
+    ]
+    conditions = [generator.condition(*call) for call in calls]
+    assert grouped(conditions, 2) == [[0, 1], [3], [2]]
+    together = [image for image, _ in generator.batch(calls)]
+    alone = [generator(*call) for call in calls]
+    for image, expected in zip(together, alone, strict=True):
+        assert (image - expected).abs().max() < 1e-5
+    assert (together[0] - together[1]).abs().max() > 1e-4
+
+
+def test_further_seeds_are_tried_and_the_best_is_kept(kontext_folder):
+    context = known_room()
+    generator = load_generator(
+        "pe-field", 7, settings=DiffusionSettings(str(kontext_folder), steps=1, retries=2)
+    )
+    image, (note,) = generator.with_notes(context.views[1], TARGET, context)
+    assert "best of 3 seeds" in note
+    single = replace(generator, agreement=AgreementConfig())
+    seeds = [replace(single, seed=7 + i)(context.views[1], TARGET, context) for i in range(3)]
+    assert sum(bool(torch.equal(image, one)) for one in seeds) == 1
+
+
+def test_settings_reach_the_generators(kontext_folder, inpaint_folder, monkeypatch):
+    asked = DiffusionSettings(str(kontext_folder), steps=3, retries=2)
+    generator = load_generator("pe-field", 5, settings=asked)
+    assert (generator.seed, generator.steps, generator.agreement.retries) == (5, 3, 2)
+    assert generator.depth is context_depth
+    assert load_generator("pe-field", settings=DiffusionSettings(asked.path)).steps == 4
+    with pytest.raises(InputError, match=r"Could not load .*/nowhere"):
+        depth = str(kontext_folder / ".." / "nowhere")
+        Path(depth).mkdir()
+        load_generator("pe-field", settings=replace(asked, depth=depth))
+    asked = DiffusionSettings(str(inpaint_folder), steps=3, retries=1, prompt="a quiet street")
+    painter = load_generator("diffusers-inpaint", settings=asked)
+    assert (painter.prompt, painter.steps, painter.agreement.retries) == ("a quiet street", 3, 1)
+
+
+def test_an_inpainter_reads_its_prompt(inpaint_folder):
+    context = known_room()
+    asked = DiffusionSettings(str(inpaint_folder), steps=2, prompt="a quiet street")
+    generator = load_generator("diffusers-inpaint", settings=asked)
+    other = replace(generator, prompt="a b c")
+    images = [one(context.views[1], TARGET, context) for one in (generator, other)]
+    assert not torch.equal(*images)
 
 
 def test_noise_in_place_of_the_scene_is_told(kontext_folder):
@@ -164,12 +231,13 @@ def test_the_size_follows_the_pipeline_and_the_aspect(inpaint_folder):
 def test_a_pipeline_of_another_kind_is_refused(tmp_path, kontext_folder):
     with pytest.raises(InputError, match="has 12 heads"):
         folder = tiny_diffusion.saved(tiny_diffusion.kontext_pipeline(heads=12), tmp_path / "few")
-        load_generator("pe-field", path=str(folder))
+        load_generator("pe-field", settings=DiffusionSettings(path=str(folder)))
     (tmp_path / "empty").mkdir()
+    empty = DiffusionSettings(path=str(tmp_path / "empty"))
     with pytest.raises(InputError, match="neither a model_index.json"):
-        load_generator("pe-field", path=str(tmp_path / "empty"))
+        load_generator("pe-field", settings=empty)
     with pytest.raises(InputError, match="Could not load"):
-        load_generator("diffusers-inpaint", path=str(tmp_path / "empty"))
+        load_generator("diffusers-inpaint", settings=empty)
 
 
 def completed(tmp_path, monkeypatch, *model) -> dict:
@@ -194,12 +262,17 @@ def test_a_smoke_test_of_a_whole_completion_with_random_weights(
     name, kontext_folder, inpaint_folder, tmp_path, monkeypatch
 ):
     folder = kontext_folder if name == "pe-field" else inpaint_folder
-    summary = completed(tmp_path, monkeypatch, "--generator", name, "--generator-path", folder)
+    words = ["--generator", name, "--generator-path", folder]
+    words += ["--generator-steps", 2, "--generator-retries", 1]
+    summary = completed(tmp_path, monkeypatch, *words)
     assert summary["settings"]["generator"] == name
     assert summary["settings"]["generator_path"] == str(folder)
+    assert summary["settings"]["generator_steps"] == 2
     assert summary["targets"][0]["hole_fraction"] > 0
     if name == "pe-field":
-        assert "disagrees with the photographs" in " ".join(summary["targets"][0]["notes"])
+        notes = " ".join(summary["targets"][0]["notes"])
+        assert "disagrees with the photographs" in notes
+        assert "best of 2 seeds" in notes
 
 
 @pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])

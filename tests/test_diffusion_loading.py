@@ -2,7 +2,9 @@
 
 import pytest
 
+from command import run
 from gscompleter import InputError, load_generator
+from gscompleter.generators import DiffusionSettings
 from gscompleter.generators.diffusion import published
 from gscompleter.generators.diffusion.loading import sources
 from gscompleter.generators.diffusion.published import (
@@ -12,22 +14,55 @@ from gscompleter.generators.diffusion.published import (
     announce,
     source_of,
 )
+from gscompleter.io.image import write_image
+from gscompleter.io.scene import write_cameras
+from scenes import Room, camera_at, view_of
 
 
 @pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
 def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatch):
     monkeypatch.setattr(published, "PACKAGES", ("a_package_nobody_has", "torch"))
     with pytest.raises(InputError) as told:
-        load_generator(name, path="somebody/something")
+        load_generator(name, settings=DiffusionSettings(path="somebody/something"))
     message = str(told.value)
     assert "a_package_nobody_has" in message
     assert "torch" not in message
     assert "pip install 'gscompleter[diffusion]'" in message
 
 
-def test_a_path_for_a_generator_without_weights_is_refused():
-    with pytest.raises(InputError, match="'warp-inpaint' has no weights"):
-        load_generator("warp-inpaint", path="somebody/something")
+@pytest.mark.parametrize(
+    ("name", "setting", "way_out"),
+    [
+        ("warp-inpaint", {"path": "somebody/something"}, "choose pe-field or diffusers-inpaint"),
+        ("oracle", {"steps": 8}, "choose pe-field or diffusers-inpaint"),
+        ("pe-field", {"prompt": "a cat"}, "choose diffusers-inpaint"),
+        ("diffusers-inpaint", {"depth": "monocular"}, "choose pe-field"),
+    ],
+)
+def test_a_setting_that_a_generator_does_not_know_is_refused(name, setting, way_out):
+    ((key, value),) = setting.items()
+    with pytest.raises(InputError) as told:
+        load_generator(name, settings=DiffusionSettings(**setting))
+    assert f"{name!r} knows no --generator-{key} ({value})" in str(told.value)
+    assert way_out in str(told.value)
+
+
+@pytest.mark.parametrize(("key", "value"), [("steps", 0), ("steps", -1), ("retries", -1)])
+def test_numbers_that_mean_nothing_are_refused(key, value):
+    with pytest.raises(InputError, match=f"--generator-{key} is {value}"):
+        load_generator("pe-field", settings=DiffusionSettings(**{key: value}))
+
+
+def test_the_command_refuses_them_too_and_writes_nothing(tmp_path, capsys, monkeypatch):
+    cameras = [camera_at(x, size=32) for x in (-0.3, 0.1, 0.6)]
+    names = [f"{number}.png" for number in range(3)]
+    for name, camera in zip(names, cameras, strict=True):
+        write_image(tmp_path / name, view_of(Room(), camera).image)
+    write_cameras(tmp_path / "transforms.json", cameras, names)
+    words = ["complete", tmp_path, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]
+    assert run(monkeypatch, *words, "--generator-steps", 8) == 2
+    assert "'warp-inpaint' knows no --generator-steps (8)" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_inpainter_must_be_named(monkeypatch):

@@ -14,6 +14,8 @@ import pytest
 import torch
 
 from feed_forward_fixtures import rule_v1
+from gscompleter.evaluation.metrics import psnr
+from gscompleter.generators.diffusion.pe_field import preview
 from gscompleter.generators.diffusion.position_ids import (
     LEVELS,
     packed,
@@ -26,7 +28,10 @@ from gscompleter.generators.diffusion.rotary import (
     PerHeadRotary,
     with_per_head_positions,
 )
+from gscompleter.generators.diffusion.splat import forward_splat
 from gscompleter.types import Camera
+from scenes import Room, view_of
+from test_generators import TARGET, known_room
 
 STORED = Path(__file__).parent / "fixtures" / "pefield"
 SIZE, GRID = (96, 128), (6, 8)
@@ -173,8 +178,36 @@ def test_every_position_of_a_token_is_used_and_the_token_itself_by_each_group():
 
 def test_the_rotary_tables_are_the_authors():
     cosines, sines = PerHeadRotary((4, 6, 6))(levels_of(TINY, "source_ids_{}"))
-    assert (cosines.flatten(1) - TINY["source_cos"]).abs().max() < 1e-6
-    assert (sines.flatten(1) - TINY["source_sin"]).abs().max() < 1e-6
+    assert len(cosines) == len(sines) == 1
+    assert (cosines[0].flatten(1) - TINY["source_cos"]).abs().max() < 1e-6
+    assert (sines[0].flatten(1) - TINY["source_sin"]).abs().max() < 1e-6
+
+
+def test_the_picture_of_the_positions_is_the_photograph_where_the_cameras_are_equal():
+    context = known_room()
+    view = context.views[1]
+    assert (preview(view, view.camera, context) - view.image).abs().max() < 1e-5
+    from_aside = preview(view, TARGET, context)
+    empty = from_aside.sum(dim=-1) == 0
+    assert 0.1 < empty.float().mean() < 0.9
+    truth = view_of(Room(), TARGET).image
+    assert psnr(from_aside[~empty][None], truth[~empty][None]) > 15
+
+
+def test_each_image_of_a_batch_has_tables_of_its_own():
+    ids, rotary = levels_of(TINY, "source_ids_{}"), PerHeadRotary((4, 6, 6))
+    together = rotary(torch.cat([ids, ids + 3], dim=-1))
+    for table, alone, shifted in zip(together, rotary(ids), rotary(ids + 3), strict=True):
+        assert torch.equal(table, torch.cat([alone, shifted]))
+        assert not torch.equal(alone, shifted)
+
+
+def test_the_picture_of_the_positions_is_the_authors():
+    splat = stored("splat")
+    image, expected = (splat[key][0].permute(1, 2, 0) for key in ("image", "warped"))
+    found = forward_splat(image, splat["uv"].reshape(*SIZE, 2), SIZE)
+    assert (found - expected).abs().max() < 1e-6
+    assert (found.sum(dim=-1) == 0).any()
 
 
 @pytest.fixture(scope="module")

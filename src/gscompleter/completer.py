@@ -8,15 +8,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
-from gscompleter.generators import Generator, load_generator
+from gscompleter.generators import BatchGenerator, Generator, load_generator
 from gscompleter.geometry import same_camera, widened
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_range
 from gscompleter.render import FrozenView, Renderer, load_renderer
-from gscompleter.stages.anchor import lift, select_anchor, synthesize
+from gscompleter.stages.anchor import (
+    Synthesized,
+    lift,
+    select_anchor,
+    synthesize,
+    synthesize_all,
+)
 from gscompleter.stages.context import depth_range_of_scene, init_context
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
@@ -103,13 +111,47 @@ class GSCompleter:
             context = init_context(self.reconstructor, views) if scene is None else scene
             allowed = self.allowed_errors(context, views)
 
-        current, results = context, []
-        for number, camera in enumerate(targets, start=first_number):
-            result = self.complete_target(current, views, camera, number, allowed, clock)
-            if len(result.added) > 0:
-                current = merge([current, result.added])
-            results.append(result)
+        current = context
+        results: list[TargetCompletion] = []
+        at_once = self.generator.at_once if isinstance(self.generator, BatchGenerator) else 1
+        for start in range(0, len(targets), at_once):
+            together = targets[start : start + at_once]
+            references = self.synthesize_together(current, views, together, clock)
+            for camera, reference in zip(together, references, strict=True):
+                number = first_number + len(results)
+                result = self.complete_target(
+                    current, views, camera, number, allowed, clock, reference
+                )
+                if len(result.added) > 0:
+                    current = merge([current, result.added])
+                results.append(result)
         return Completion(current, context, tuple(results), clock.seconds())
+
+    def synthesize_together(
+        self, scene: Gaussians, views: Sequence[View], targets: Sequence[Camera], clock: Clock
+    ) -> list[Synthesized | None]:
+        """Images of several targets from a generator that takes them all at once.
+
+        None for a target at which there is nothing to complete, and for all where the generator
+        takes one at a time: it then sees what was completed for the targets before.
+        """
+        images: list[Synthesized | None] = [None] * len(targets)
+        if not isinstance(self.generator, BatchGenerator):
+            return images
+        asked: dict[int, tuple[Camera, SceneContext]] = {}
+        with clock("context"):
+            renders = tuple(self.renderer.render(scene, view.camera) for view in views)
+            for i, target in enumerate(targets):
+                wide, left, top = widened(target, self.config.margin)
+                at_target = self.renderer.render(scene, wide)
+                inner = at_target.cropped(left, top, target.width, target.height)
+                if nothing_to_do(target, views, hole_mask(inner, self.config.holes)) is None:
+                    asked[i] = (wide, SceneContext(tuple(views), renders, at_target))
+        with clock("generate"):
+            found = synthesize_all(self.generator, list(asked.values()))
+        for i, image in zip(asked, found, strict=True):
+            images[i] = image
+        return images
 
     def complete_target(
         self,
@@ -119,8 +161,12 @@ class GSCompleter:
         number: int,
         allowed_errors: Sequence[float],
         clock: Clock,
+        reference: Synthesized | None = None,
     ) -> TargetCompletion:
-        """Stages 2 to 4 for one target: what it adds to `scene`, and how it came about."""
+        """Stages 2 to 4 for one target: what it adds to `scene`, and how it came about.
+
+        The generator is asked for the `reference` where there is none yet.
+        """
         random = torch.Generator().manual_seed(self.seed)
         wide, left, top = widened(target, self.config.margin)
         with clock("context"):
@@ -139,16 +185,16 @@ class GSCompleter:
             affine=DepthAffine(),
             added=scene[:0],
         )
-        if any(same_camera(target, view.camera) for view in views):
-            return replace(nothing, notes=("The target is a context view: nothing to complete.",))
-        if not nothing.hole_mask.any():
-            return replace(nothing, notes=("The scene has no hole here: nothing to complete.",))
+        reason = nothing_to_do(target, views, nothing.hole_mask)
+        if reason is not None:
+            return replace(nothing, notes=(reason,))
 
         with clock("generate"):
             at_views = [self.renderer.freeze(scene, view.camera) for view in views]
             renders = tuple(frozen.context for frozen in at_views)
             known = SceneContext(tuple(views), renders, at_target.context)
-            reference = synthesize(self.generator, wide, known)
+            if reference is None:
+                reference = synthesize(self.generator, wide, known)
 
         with clock("lift"):
             lifted = lift(self.reconstructor, reference, anchor)
@@ -240,6 +286,15 @@ class GSCompleter:
             error_with_loss(squared_error(image, view.image).item(), tolerance)
             for image, view in zip(renders, views, strict=True)
         ]
+
+
+def nothing_to_do(target: Camera, views: Sequence[View], holes: Bool[Tensor, "h w"]) -> str | None:
+    """Why a target needs no completion, in a sentence; None where it does."""
+    if any(same_camera(target, view.camera) for view in views):
+        return "The target is a context view: nothing to complete."
+    if not holes.any():
+        return "The scene has no hole here: nothing to complete."
+    return None
 
 
 def ranged(camera: Camera, near: float, far: float) -> Camera:

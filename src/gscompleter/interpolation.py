@@ -17,7 +17,7 @@ def fill_smoothly(
     membrane that is clamped to what is known.
     """
     weight = known.to(values.dtype)
-    filled = push_pull(values[..., None], weight, blend=False)[None, None, ..., 0]
+    filled = push_pull(values[..., None], weight)[None, None, ..., 0]
     kernel = values.new_tensor([[0, 1, 0], [1, 0, 1], [0, 1, 0]])[None, None] / 4
     for _ in range(num_relaxations):
         around = conv2d(pad(filled, (1, 1, 1, 1), mode="replicate"), kernel)
@@ -26,22 +26,20 @@ def fill_smoothly(
 
 
 def push_pull(
-    values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"], blend: bool = True
+    values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w c"]:
     """`values` where `weight` is 1; where it is 0, a smooth continuation of what surrounds it.
 
     Averages are pushed up a pyramid, and whatever a level lacks is pulled down from the coarser
     one (Gortler et al., The Lumigraph, 1996). Where no weight is positive at all the result is 0.
-    With `blend`, a level that knows little gives way to the coarser one, which is smoother;
-    without, whatever it knows counts, which stays closer to the nearest known values.
     """
     weighted = (values * weight[..., None]).permute(2, 0, 1)[None]
-    filled = _fill(weighted, weight[None, None], blend)
+    filled = _fill(weighted, weight[None, None])
     return filled[0].permute(1, 2, 0)
 
 
 def _fill(
-    weighted: Float[Tensor, "1 c h w"], weight: Float[Tensor, "1 1 h w"], blend: bool
+    weighted: Float[Tensor, "1 c h w"], weight: Float[Tensor, "1 1 h w"]
 ) -> Float[Tensor, "1 c h w"]:
     own = weighted / weight.clamp_min(1e-8)
     size = (weight.shape[2], weight.shape[3])
@@ -50,11 +48,9 @@ def _fill(
     coarse = _fill(
         avg_pool2d(weighted, 2, ceil_mode=True, count_include_pad=False),
         avg_pool2d(weight, 2, ceil_mode=True, count_include_pad=False),
-        blend,
     )
     below = interpolate(coarse, size=size, mode="bilinear", align_corners=False)
-    trust = weight.clamp(0, 1) if blend else (weight > 0).to(weight.dtype)
-    return torch.lerp(below, own, trust)
+    return torch.where(weight > 0, own, below)
 
 
 def smoothed(

@@ -15,6 +15,30 @@ Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True, kw_only=True)
+class GeneratorOptions:
+    """How the image at a target comes about."""
+
+    generator: str = "warp-inpaint"
+    """The model that synthesizes the image at the target: warp-inpaint, which needs no weights,
+    pe-field, diffusers-inpaint (any inpainting pipeline), or oracle (the true photograph)."""
+    generator_path: str | None = None
+    """Its weights: a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the Hugging
+    Face hub. pe-field knows its published ones; diffusers-inpaint must be told."""
+    generator_steps: int | None = None
+    """Its denoising steps. If not given, 4 for pe-field, and what an inpainting pipeline itself
+    takes."""
+    generator_retries: int = 0
+    """How many further seeds are tried where its image disagrees with the photographs."""
+    generator_prompt: str | None = None
+    """What diffusers-inpaint is told of the image, in words."""
+    generator_depth: str | None = None
+    """Where pe-field takes the depth of the photograph from: context, the scene itself (if not
+    given); monocular, a published network; or the folder or hub id of another one."""
+    generator_offload: bool = False
+    """Keep on the GPU only the part of the generator that is at work, the rest in main memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CompleteOptions:
     """Fill what the photographs never saw, as seen from the targets, and write the scene."""
 
@@ -35,14 +59,7 @@ class CompleteOptions:
     those that `gscompleter models` lists."""
     weights: Path | None = None
     """The file of its weights, where they are not to be downloaded."""
-    generator: str = "warp-inpaint"
-    """The model that synthesizes the image at the target: warp-inpaint, which needs no weights,
-    pe-field, diffusers-inpaint (any inpainting pipeline), or oracle (the true photograph)."""
-    generator_path: str | None = None
-    """Its weights: a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the Hugging
-    Face hub. pe-field knows its published ones; diffusers-inpaint must be told."""
-    generator_offload: bool = False
-    """Keep on the GPU only the part of the generator that is at work, the rest in main memory."""
+    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
     resolution: tuple[int, int] | None = None
     """Height and width to work at: photographs are scaled to cover it and cropped around the
     centre. If not given, they keep their own size."""
@@ -121,12 +138,7 @@ class EvaluateOptions:
     those that `gscompleter models` lists."""
     weights: Path | None = None
     """The file of its weights, where they are not to be downloaded."""
-    generator: str = "warp-inpaint"
-    """The model that synthesizes the image at the target: warp-inpaint, which needs no weights,
-    pe-field, diffusers-inpaint (any inpainting pipeline), or oracle (the true photograph)."""
-    generator_path: str | None = None
-    """Its weights: a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the Hugging
-    Face hub. pe-field knows its published ones; diffusers-inpaint must be told."""
+    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
     device: Device = "auto"
     """Where to run."""
     seed: int = 0

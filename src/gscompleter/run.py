@@ -13,11 +13,11 @@ from rich.table import Table
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.errors import InputError
-from gscompleter.generators import load_generator
+from gscompleter.generators import DiffusionSettings, load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.ply import load_ply
 from gscompleter.io.scene import load_camera, load_cameras, load_views, read_index
-from gscompleter.options import CompleteOptions
+from gscompleter.options import CompleteOptions, GeneratorOptions
 from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
@@ -50,7 +50,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     device = choose_device(options.device)
     renderer = load_renderer(device)
     config = load_config(options.config)
-    if options.generator == "oracle":  # a photograph ends where the target's image ends
+    if options.synthesis.generator == "oracle":  # a photograph ends where the target's image ends
         config = replace(config, margin=0.0)
     check_context(options)
     views = [view.to(device) for view in read_views(options, options.context)]
@@ -67,12 +67,11 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     completer = GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
         load_generator(
-            options.generator,
+            options.synthesis.generator,
             options.seed,
             photographs,
-            options.generator_path,
             device,
-            options.generator_offload,
+            generator_settings(options.synthesis),
         ),
         renderer,
         config,
@@ -86,6 +85,18 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
             folder, completion, views, targets, renderer, settings, options.seed, device
         )
     return summary, completion
+
+
+def generator_settings(options: GeneratorOptions) -> DiffusionSettings:
+    """What the generator is told."""
+    return DiffusionSettings(
+        path=options.generator_path,
+        steps=options.generator_steps,
+        retries=options.generator_retries,
+        prompt=options.generator_prompt,
+        depth=options.generator_depth,
+        offload=options.generator_offload,
+    )
 
 
 def check_context(options: CompleteOptions) -> None:
@@ -150,9 +161,8 @@ def settings_of(options: CompleteOptions, config: CompleterConfig) -> dict[str, 
         "scene": None if options.scene is None else str(options.scene),
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
-        "generator": options.generator,
-        "generator_path": options.generator_path,
-        "uses_target_photographs": options.generator == "oracle",
+        **asdict(options.synthesis),
+        "uses_target_photographs": options.synthesis.generator == "oracle",
         "resolution": None if options.resolution is None else list(options.resolution),
         "near": options.near,
         "far": options.far,

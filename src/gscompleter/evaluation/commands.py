@@ -43,6 +43,7 @@ from gscompleter.io.framing import check_resolution
 from gscompleter.options import EvaluateOptions, IndexOptions, TablesOptions
 from gscompleter.progress import shown_on
 from gscompleter.render import choose_device
+from gscompleter.run import generator_settings
 
 
 def run_evaluation(options: EvaluateOptions) -> None:
@@ -66,8 +67,8 @@ def run_evaluation(options: EvaluateOptions) -> None:
     config = RunConfig(
         reconstructor=options.reconstructor,
         weights=None if options.weights is None else str(options.weights),
-        generator=options.generator,
-        generator_path=options.generator_path,
+        generator=options.synthesis.generator,
+        generator_settings=generator_settings(options.synthesis),
         device=choose_device(options.device),
         seed=options.seed,
         source=source_of(options),

@@ -39,7 +39,7 @@ from gscompleter.evaluation.store import (
     slug,
     write_json,
 )
-from gscompleter.generators import load_generator
+from gscompleter.generators import DiffusionSettings, Generator, load_generator
 from gscompleter.io.image import write_image
 from gscompleter.progress import shown_on, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
@@ -49,7 +49,7 @@ from gscompleter.types import View
 T = TypeVar("T")
 C = TypeVar("C", bound="Named")
 
-VERSION = 1
+VERSION = 2
 """Of the files in a folder of results."""
 
 
@@ -86,8 +86,8 @@ class RunConfig:
     weights: str | None = None
     """The file of the reconstructor's weights; None takes the published ones."""
     generator: str = "warp-inpaint"
-    generator_path: str | None = None
-    """Folder or hub id of the generator's weights; None takes the published ones."""
+    generator_settings: DiffusionSettings = DiffusionSettings()
+    """What a generator with weights is told."""
     device: Literal["cpu", "cuda"] = "cpu"
     seed: int = 0
     """Of everything random."""
@@ -101,11 +101,17 @@ class RunConfig:
         weights = None if self.weights is None else Path(self.weights)
         return load_reconstructor(self.reconstructor, weights, self.device)
 
+    def load_generator(self, targets: Sequence[View] = ()) -> Generator:
+        """Φ. One with weights is kept from one case to the next."""
+        return load_generator(
+            self.generator, self.seed, targets, self.device, self.generator_settings
+        )
+
     def parts(self, *targets: View) -> Parts:
         """The models for a case. Only the generator `oracle` looks at the images of `targets`."""
         return Parts(
             self.load_reconstructor(),
-            load_generator(self.generator, self.seed, targets, self.generator_path, self.device),
+            self.load_generator(targets),
             load_renderer(self.device),
             self.seed,
             0.0 if self.generator == "oracle" else None,
@@ -181,7 +187,7 @@ def begin(
     if slow and config.device != "cpu":
         raise InputError(f"{', '.join(slow)} can only run on a CPU; use --device cpu.")
     config.load_reconstructor()
-    load_generator(config.generator, path=config.generator_path, device=config.device)
+    config.load_generator()
     claim(out, config)
 
 

@@ -6,7 +6,7 @@ A generator is any callable of that form. The table of names serves the command 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
@@ -42,20 +42,58 @@ class NotingGenerator(Protocol):
     ) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]: ...
 
 
+@runtime_checkable
+class BatchGenerator(Protocol):
+    """A generator that synthesizes several targets at once, none of which waits for another."""
+
+    @property
+    def at_once(self) -> int:
+        """Most targets that it takes together."""
+
+    def __call__(
+        self, nearest: View, target: Camera, context: SceneContext
+    ) -> Float[Tensor, "h w 3"]: ...
+
+    def batch(
+        self, calls: Sequence[tuple[View, Camera, SceneContext]]
+    ) -> list[tuple[Tensor, tuple[str, ...]]]:
+        """Image [h, w, 3] and notes for each of `calls`, in their order."""
+
+
+@dataclass(frozen=True)
+class DiffusionSettings:
+    """What a generator with weights can be told. Whatever is None is left to it."""
+
+    path: str | None = None
+    """Folder or hub id of its weights; None takes the published ones."""
+    steps: int | None = None
+    """Denoising steps."""
+    retries: int = 0
+    """How many further seeds are tried where an image disagrees with the photographs."""
+    prompt: str | None = None
+    """What it is told of the image, in words."""
+    depth: str | None = None
+    """Where the depth of the photograph comes from: `context`, `monocular`, or the folder or hub id
+    of a depth estimation model of transformers."""
+    offload: bool = False
+    """Keep on the GPU only the part of the network that is at work: slower, and less memory."""
+
+
+TAKES: dict[str, tuple[str, ...]] = {
+    "pe-field": ("path", "steps", "retries", "depth", "offload"),
+    "diffusers-inpaint": ("path", "steps", "retries", "prompt", "offload"),
+}
+"""The settings that each generator with weights knows; the others know none."""
+
+
 @dataclass(frozen=True)
 class GeneratorRequest:
     """What a generator of the table may be made from."""
 
-    seed: int = 0
-    """Of everything random in it; the same seed gives the same image."""
-    photographs: Sequence[View] = ()
-    """True images of the targets, which only `oracle` looks at."""
-    path: str | None = None
-    """Folder or hub id of its weights; None takes the published ones."""
-    device: str = "cpu"
-    """Where its network runs."""
-    offload: bool = False
-    """Keep on the GPU only the part of the network that is at work."""
+    seed: int
+    photographs: Sequence[View]
+    device: str
+    settings: DiffusionSettings
 
 
 def _warp_inpaint(request: GeneratorRequest) -> Generator:
@@ -71,18 +109,15 @@ def _oracle(request: GeneratorRequest) -> Generator:
 
 
 def _pe_field(request: GeneratorRequest) -> Generator:
-    from gscompleter.generators.diffusion.loading import load_kontext
-    from gscompleter.generators.diffusion.pe_field import PEField
+    from gscompleter.generators.diffusion.pe_field import load_pe_field
 
-    return PEField(load_kontext(request.path, request.device, request.offload), request.seed)
+    return load_pe_field(request.seed, request.device, request.settings)
 
 
 def _diffusers_inpaint(request: GeneratorRequest) -> Generator:
-    from gscompleter.generators.diffusion.inpaint import DiffusersInpaint, load_painter
+    from gscompleter.generators.diffusion.inpaint import load_diffusers_inpaint
 
-    return DiffusersInpaint(
-        load_painter(request.path, request.device, request.offload), request.seed
-    )
+    return load_diffusers_inpaint(request.seed, request.device, request.settings)
 
 
 GENERATORS: dict[str, Callable[[GeneratorRequest], Generator]] = {
@@ -91,17 +126,14 @@ GENERATORS: dict[str, Callable[[GeneratorRequest], Generator]] = {
     "pe-field": _pe_field,
     "diffusers-inpaint": _diffusers_inpaint,
 }
-WITH_WEIGHTS = ("pe-field", "diffusers-inpaint")
-"""Those that load weights, and so can be told where these lie."""
 
 
 def load_generator(
     name: str,
     seed: int = 0,
     photographs: Sequence[View] = (),
-    path: str | None = None,
     device: str = "cpu",
-    offload: bool = False,
+    settings: DiffusionSettings = DiffusionSettings(),
 ) -> Generator:
     """The generator called `name`.
 
@@ -109,20 +141,34 @@ def load_generator(
         name: A name of the table.
         seed: Of everything random in it; the same seed gives the same image.
         photographs: True images of the targets, which only `oracle` looks at.
-        path: Folder or hub id of its weights, for those that have any; None takes the published
-            ones.
         device: Where its network runs, if it has one: cpu or cuda.
-        offload: Keep on a GPU only the part of it that is at work: slower, and less memory.
+        settings: For one with weights. The network itself is loaded once in a process.
 
     Raises:
-        InputError: where there is none of that name, packages or weights are missing, or a path
-            is given to one that has no weights.
+        InputError: where there is none of that name, packages or weights are missing, or a setting
+            is one that it does not know, or out of range.
     """
     if name not in GENERATORS:
         raise InputError(f"There is no generator {name!r}; choose one of {', '.join(GENERATORS)}.")
-    if path is not None and name not in WITH_WEIGHTS:
-        raise InputError(
-            f"The generator {name!r} has no weights to load from {path}; leave --generator-path "
-            f"out, or choose one of {', '.join(WITH_WEIGHTS)}."
-        )
-    return GENERATORS[name](GeneratorRequest(seed, photographs, path, device, offload))
+    check_settings(name, settings)
+    return GENERATORS[name](GeneratorRequest(seed, photographs, device, settings))
+
+
+def check_settings(name: str, settings: DiffusionSettings) -> None:
+    """Refuse settings that the generator called `name` does not know, and senseless numbers.
+
+    Raises:
+        InputError: where there is one.
+    """
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if value != field.default and field.name not in TAKES.get(name, ()):
+            others = [other for other, known in TAKES.items() if field.name in known]
+            raise InputError(
+                f"The generator {name!r} knows no --generator-{field.name} ({value}); leave that "
+                f"out, or choose {' or '.join(others)}."
+            )
+    if settings.steps is not None and settings.steps < 1:
+        raise InputError(f"--generator-steps is {settings.steps}; at least 1 is needed.")
+    if settings.retries < 0:
+        raise InputError(f"--generator-retries is {settings.retries}; 0 or more are possible.")

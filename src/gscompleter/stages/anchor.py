@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from torch import Tensor
 
-from gscompleter.generators import Generator, NotingGenerator
+from gscompleter.generators import BatchGenerator, Generator, NotingGenerator
 from gscompleter.geometry import baseline_between, inside, project, rotation_between
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.types import Camera, Lift, SceneContext, View
@@ -82,6 +83,26 @@ def synthesize(generator: Generator, target: Camera, context: SceneContext) -> S
         image, notes = generator.with_notes(nearest, target, context)
     else:
         image = generator(nearest, target, context)
+    return as_view(image, target, notes)
+
+
+def synthesize_all(
+    generator: BatchGenerator, asked: Sequence[tuple[Camera, SceneContext]]
+) -> list[Synthesized]:
+    """The same for several targets at once, each with what is known of the scene for it."""
+    calls = [
+        (context.views[nearest_view(target, context.views)], target, context)
+        for target, context in asked
+    ]
+    answers = generator.batch(calls)
+    return [
+        as_view(image, target, notes)
+        for (image, notes), (target, _) in zip(answers, asked, strict=True)
+    ]
+
+
+def as_view(image: Tensor, target: Camera, notes: tuple[str, ...]) -> Synthesized:
+    """What a generator returned, once it is seen to be an image of the target's size."""
     expected = (target.height, target.width, 3)
     if tuple(image.shape) != expected or not torch.isfinite(image).all():
         raise ValueError(

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
+from gscompleter.generators import DiffusionSettings
 from gscompleter.generators.agreement import AgreementConfig, checked
 from gscompleter.generators.diffusion.kontext import resized
 from gscompleter.generators.diffusion.published import (
@@ -29,6 +30,7 @@ from gscompleter.generators.warp_inpaint import background_first
 from gscompleter.generators.warp_inpaint.warp import Warped, warp_photographs, with_unexplained
 from gscompleter.types import Camera, SceneContext, View
 
+PROMPT = "a photograph"
 SIDE = 512
 """Side of the square whose area is painted where a pipeline's configuration names none."""
 
@@ -87,7 +89,7 @@ class DiffusersInpaint:
     """What paints."""
     seed: int = 0
     """Of its noise; the same seed gives the same image on the same device."""
-    prompt: str = "a photograph"
+    prompt: str = PROMPT
     """What it is told, whatever the image."""
     steps: int | None = None
     """Denoising steps; the pipeline's own number if None."""
@@ -137,6 +139,23 @@ def widened_mask(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
     """`mask` and all within a square of `radius` pixels around it."""
     size = 2 * radius + 1
     return torch.nn.functional.max_pool2d(mask[None].float(), size, 1, radius)[0] > 0
+
+
+def load_diffusers_inpaint(
+    seed: int = 0, device: str = "cpu", settings: DiffusionSettings = DiffusionSettings()
+) -> DiffusersInpaint:
+    """An inpainting pipeline as the settings want it.
+
+    Raises:
+        InputError: where packages or weights are missing, or no path was given.
+    """
+    return DiffusersInpaint(
+        load_painter(settings.path, device, settings.offload),
+        seed,
+        PROMPT if settings.prompt is None else settings.prompt,
+        settings.steps,
+        agreement=AgreementConfig(retries=settings.retries),
+    )
 
 
 @lru_cache(maxsize=1)

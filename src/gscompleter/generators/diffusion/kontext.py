@@ -75,64 +75,68 @@ class Kontext:
     @torch.inference_mode()
     def generate(
         self,
-        photograph: Float[Tensor, "h w 3"],
+        photographs: Float[Tensor, "b h w 3"],
         size: tuple[int, int],
         target_positions: Float[Tensor, "n k"],
-        source_positions: Float[Tensor, "m k"],
+        source_positions: Float[Tensor, "b m k"],
         seed: int,
         steps: int,
         guidance: float,
-    ) -> Float[Tensor, "height width 3"]:
-        """The image at the target, in [0, 1].
+    ) -> Float[Tensor, "b height width 3"]:
+        """The images at the targets, in [0, 1].
 
         Args:
-            photograph: What is known, in [0, 1], at a size that the tokens divide.
-            size: Height and width of the image, likewise.
-            target_positions: Ids of the image's tokens.
-            source_positions: Ids of the photograph's tokens.
-            seed: Of the noise, drawn on the CPU so that every device starts from the same.
+            photographs: What is known for each, in [0, 1], at a size that the tokens divide.
+            size: Height and width of the images, likewise.
+            target_positions: Ids of the tokens of an image, the same for all.
+            source_positions: Ids of the tokens of each photograph.
+            seed: Of the noise, drawn on the CPU so that every device starts from the same. All
+                images start from the same, too, so that none depends on the others.
             steps: Evaluations of the transformer.
             guidance: Scale of the distilled guidance.
         """
         pipeline = self.pipeline
-        grid = self.grid(size)
-        source = self.encoded(photograph)
+        count, grid = len(photographs), self.grid(size)
+        # one at a time: an image in the VAE needs more memory than all its tokens
+        source = torch.stack([self.encoded(photograph) for photograph in photographs])
         channels = pipeline.transformer.config.in_channels // 4
         noise = torch.randn(
             (1, channels, 2 * grid[0], 2 * grid[1]),
             generator=torch.Generator().manual_seed(seed),
             dtype=self.dtype,
         )
-        latents = in_tokens(noise.to(self.device))
-        positions = torch.cat([target_positions, source_positions]).to(self.device)
+        latents = in_tokens(noise.to(self.device)).expand(count, -1, -1)
+        of_target = target_positions.expand(count, -1, -1)
+        positions = torch.cat([of_target, source_positions], dim=1).to(self.device)
         for time in self.times(steps, len(target_positions)):
             velocity = self.velocity(latents, source, positions, time, guidance)
             latents = pipeline.scheduler.step(velocity, time, latents, return_dict=False)[0]
-        image = self.decoded(latents, grid)
+        images = torch.stack([self.decoded(tokens, grid) for tokens in latents])
         pipeline.maybe_free_model_hooks()
-        return image
+        return images
 
     def velocity(
         self,
-        latents: Float[Tensor, "1 n c"],
-        source: Float[Tensor, "1 m c"],
-        positions: Float[Tensor, "all k"],
+        latents: Float[Tensor, "b n c"],
+        source: Float[Tensor, "b m c"],
+        positions: Float[Tensor, "b all k"],
         time: Tensor,
         guidance: float,
-    ) -> Float[Tensor, "1 n c"]:
-        """What the transformer says about the latents, having read the photograph too."""
-        transformer = self.pipeline.transformer
+    ) -> Float[Tensor, "b n c"]:
+        """What the transformer says about the latents, having read the photographs too."""
+        transformer, count = self.pipeline.transformer, len(latents)
         scale = None
         if transformer.config.guidance_embeds:
-            scale = torch.full((1,), guidance, device=self.device, dtype=torch.float32)
+            scale = torch.full((count,), guidance, device=self.device, dtype=torch.float32)
+        ids = positions.transpose(0, 1).flatten(1)  # one image's beside the other's
         (predicted,) = transformer(
             hidden_states=torch.cat([latents, source], dim=1),
-            timestep=time.expand(1).to(self.device, latents.dtype) / 1000,
+            timestep=time.expand(count).to(self.device, latents.dtype) / 1000,
             guidance=scale,
-            pooled_projections=self.prompt.pooled,
-            encoder_hidden_states=self.prompt.tokens,
-            txt_ids=positions.new_zeros(self.prompt.tokens.shape[1], positions.shape[1]),
-            img_ids=positions,
+            pooled_projections=self.prompt.pooled.expand(count, -1),
+            encoder_hidden_states=self.prompt.tokens.expand(count, -1, -1),
+            txt_ids=ids.new_zeros(self.prompt.tokens.shape[1], ids.shape[1]),
+            img_ids=ids,
             return_dict=False,
         )
         return predicted[:, : latents.shape[1]]
@@ -149,28 +153,28 @@ class Kontext:
         scheduler.set_begin_index(0)
         return scheduler.timesteps
 
-    def encoded(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 m c"]:
+    def encoded(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "m c"]:
         """The latent tokens of an image in [0, 1]."""
         vae = self.pipeline.vae
         pixels = (2 * image.permute(2, 0, 1)[None] - 1).to(self.device, self.dtype)
         latents = vae.encode(pixels).latent_dist.mode()
-        return in_tokens((latents - vae.config.shift_factor) * vae.config.scaling_factor)
+        return in_tokens((latents - vae.config.shift_factor) * vae.config.scaling_factor)[0]
 
     def decoded(
-        self, tokens: Float[Tensor, "1 n c"], grid: tuple[int, int]
+        self, tokens: Float[Tensor, "n c"], grid: tuple[int, int]
     ) -> Float[Tensor, "h w 3"]:
         """The image in [0, 1] that latent tokens stand for."""
         vae = self.pipeline.vae
-        latents = tokens.unflatten(-1, (-1, 2, 2)).unflatten(1, grid)
+        latents = tokens[None].unflatten(-1, (-1, 2, 2)).unflatten(1, grid)
         latents = latents.permute(0, 3, 1, 4, 2, 5).flatten(4).flatten(2, 3)
         latents = latents / vae.config.scaling_factor + vae.config.shift_factor
         image = vae.decode(latents, return_dict=False)[0]
         return (image[0].permute(1, 2, 0).float() / 2 + 0.5).clamp(0, 1)
 
 
-def in_tokens(latents: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 tokens channels"]:
+def in_tokens(latents: Float[Tensor, "b c h w"]) -> Float[Tensor, "b tokens channels"]:
     """Two by two latent pixels side by side in a token, row after row."""
-    blocks = latents.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))  # 1 c h/2 2 w/2 2
+    blocks = latents.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))  # b c h/2 2 w/2 2
     return blocks.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2)
 
 

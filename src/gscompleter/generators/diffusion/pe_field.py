@@ -6,6 +6,7 @@ stands where the target camera sees what it shows. Holes are filled through atte
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,13 +14,35 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
+from gscompleter.generators import DiffusionSettings
 from gscompleter.generators.agreement import AgreementConfig, checked
 from gscompleter.generators.diffusion.kontext import Kontext, resized
-from gscompleter.generators.diffusion.position_ids import source_ids, target_ids
-from gscompleter.generators.diffusion.source_depth import SourceDepth, context_depth
+from gscompleter.generators.diffusion.loading import load_kontext
+from gscompleter.generators.diffusion.position_ids import seen_from, source_ids, target_ids
+from gscompleter.generators.diffusion.source_depth import (
+    SourceDepth,
+    context_depth,
+    source_depth_named,
+)
+from gscompleter.generators.diffusion.splat import forward_splat
 from gscompleter.generators.warp_inpaint.warp import warp_photographs
 from gscompleter.geometry import same_camera
 from gscompleter.types import Camera, Render, SceneContext, View
+
+STEPS = 4
+"""Evaluations of the transformer in the paper. The authors' own demonstration takes 28."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What the model is told of one target."""
+
+    photograph: Float[Tensor, "h w 3"]
+    """At the size that it is worked on."""
+    size: tuple[int, int]
+    """Height and width that the target is painted at."""
+    source_positions: Float[Tensor, "m 63"]
+    """Where the target camera sees the tokens of the photograph."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +53,8 @@ class PEField:
     """FLUX Kontext with per-head positions."""
     seed: int = 0
     """Of the noise; the same seed gives the same image on the same device."""
-    steps: int = 4
-    """Evaluations of the transformer. The paper takes 4, the authors' own demonstration 28."""
+    steps: int = STEPS
+    """Evaluations of the transformer."""
     guidance: float = 3.5
     """Scale of the distilled guidance."""
     depth: SourceDepth = context_depth
@@ -40,6 +63,8 @@ class PEField:
     """What positions of the target are rounded to: bfloat16 as in the authors' run."""
     agreement: AgreementConfig = AgreementConfig()
     """How the image is compared with what the photographs show."""
+    at_once: int = 4
+    """Most images that are denoised together."""
 
     def __call__(
         self, nearest: View, target: Camera, context: SceneContext
@@ -55,23 +80,86 @@ class PEField:
         self, nearest: View, target: Camera, context: SceneContext
     ) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]:
         """The image, its colours brought to those of the photographs, and what to know of it."""
+        return self.batch([(nearest, target, context)])[0]
+
+    def batch(
+        self, calls: Sequence[tuple[View, Camera, SceneContext]]
+    ) -> list[tuple[Tensor, tuple[str, ...]]]:
+        """What `with_notes` gives for each of `calls`; images of one size are denoised together."""
+        conditions = [self.condition(*call) for call in calls]
+        first: dict[int, Tensor] = {}
+        for group in grouped(conditions, self.at_once):
+            images = self.painted([conditions[i] for i in group], self.seed)
+            first.update(zip(group, images, strict=True))
+
+        def answer(i: int) -> tuple[Tensor, tuple[str, ...]]:
+            nearest, target, context = calls[i]
+
+            def paint(seed: int) -> Float[Tensor, "h w 3"]:
+                image = first[i] if seed == self.seed else self.painted([conditions[i]], seed)[0]
+                back = resized(image, (target.height, target.width)).clamp(0, 1)
+                return back.to(nearest.image.device)
+
+            observed = warp_photographs(nearest, target, context)
+            return checked(paint, self.seed, observed, self.agreement)
+
+        return [answer(i) for i in range(len(calls))]
+
+    def condition(self, nearest: View, target: Camera, context: SceneContext) -> Condition:
+        """What the model is told of a target.
+
+        Raises:
+            InputError: where the scene has no depth at the nearest photograph.
+        """
         size = self.model.size_for(target.height, target.width)
         source_size = self.model.size_for(nearest.camera.height, nearest.camera.width)
-        grid, source_grid = self.model.grid(size), self.model.grid(source_size)
+        grids = self.model.grid(source_size), self.model.grid(size)
         depth = self.depth(nearest, render_at(nearest, context))
-        photograph = resized(nearest.image, source_size)
-        of_target = target_ids(size, grid, self.ids_dtype)
-        of_source = source_ids(depth, nearest.camera, target, source_grid, grid).cpu()
+        positions = source_ids(depth, nearest.camera, target, *grids).cpu()
+        return Condition(resized(nearest.image, source_size), size, positions)
 
-        def paint(seed: int) -> Float[Tensor, "h w 3"]:
-            image = self.model.generate(
-                photograph, size, of_target, of_source, seed, self.steps, self.guidance
-            )
-            back = resized(image, (target.height, target.width)).clamp(0, 1)
-            return back.to(nearest.image.device)
+    def painted(self, conditions: Sequence[Condition], seed: int) -> Float[Tensor, "b h w 3"]:
+        """An image for each condition. All are of one size, and so are their photographs."""
+        size = conditions[0].size
+        return self.model.generate(
+            torch.stack([one.photograph for one in conditions]),
+            size,
+            target_ids(size, self.model.grid(size), self.ids_dtype),
+            torch.stack([one.source_positions for one in conditions]),
+            seed,
+            self.steps,
+            self.guidance,
+        )
 
-        observed = warp_photographs(nearest, target, context)
-        return checked(paint, self.seed, observed, self.agreement)
+
+def preview(
+    nearest: View,
+    target: Camera,
+    context: SceneContext,
+    depth: SourceDepth = context_depth,
+) -> Float[Tensor, "h w 3"]:
+    """What the positions say: the pixels of the photograph where `target` sees them, over black.
+
+    The model is not shown this picture. It is to be looked at: where it is torn or displaced, the
+    depth or the cameras are wrong, and the model is misled.
+
+    Raises:
+        InputError: where the scene has no depth at the nearest photograph.
+    """
+    pixels, _ = seen_from(depth(nearest, render_at(nearest, context)), nearest.camera, target)
+    return forward_splat(nearest.image, pixels, (target.height, target.width))
+
+
+def grouped(conditions: Sequence[Condition], most: int) -> list[list[int]]:
+    """Indices of conditions whose images and photographs have one size, at most `most` of them."""
+    alike: dict[tuple[tuple[int, int], torch.Size], list[int]] = {}
+    for i, one in enumerate(conditions):
+        alike.setdefault((one.size, one.photograph.shape), []).append(i)
+    return [
+        indices[start : start + most]
+        for indices in alike.values()
+        for start in range(0, len(indices), most)
+    ]
 
 
 def render_at(view: View, context: SceneContext) -> Render:
@@ -80,3 +168,21 @@ def render_at(view: View, context: SceneContext) -> Render:
         if known is view or same_camera(known.camera, view.camera):
             return render
     raise InputError("The photograph to start from is none of the scene's; give one of its views.")
+
+
+def load_pe_field(
+    seed: int = 0, device: str = "cpu", settings: DiffusionSettings = DiffusionSettings()
+) -> PEField:
+    """PE-Field as the settings want it.
+
+    Raises:
+        InputError: where packages or weights are missing.
+    """
+    depth = source_depth_named(settings.depth or "context", device)
+    return PEField(
+        load_kontext(settings.path, device, settings.offload),
+        seed,
+        settings.steps or STEPS,
+        depth=depth,
+        agreement=AgreementConfig(retries=settings.retries),
+    )

@@ -78,6 +78,7 @@ LICENCES = {
     "flux": "the FLUX.1 [dev] Non-Commercial License for the [dev] models, and a gated page",
     "stable-diffusion-xl": "CreativeML Open RAIL++-M for Stability's own",
     "stable-diffusion": "CreativeML Open RAIL-M for Stability's and Runway's own",
+    "depth-anything-v2-small": "Apache-2.0",
 }
 """What weights of a family are usually under, by a part of their id."""
 

@@ -37,17 +37,22 @@ class PerHeadRotary(nn.Module):
         self.theta = theta
 
     def forward(
-        self, ids: Float[Tensor, "tokens 63"]
-    ) -> tuple[Float[Tensor, "tokens 24 d"], Float[Tensor, "tokens 24 d"]]:
-        """Cosines and sines; each pair of channels shares an angle."""
-        triples = ids.reshape(len(ids), IDS // 3, 3).double()
+        self, ids: Float[Tensor, "tokens numbers"]
+    ) -> tuple[Float[Tensor, "b tokens 24 d"], Float[Tensor, "b tokens 24 d"]]:
+        """Cosines and sines; each pair of channels shares an angle.
+
+        Args:
+            ids: The 63 numbers of each token, for one image after the other: the transformer of
+                diffusers hands over a matrix, and has no images in a batch stand elsewhere.
+        """
+        triples = ids.unflatten(-1, (-1, IDS // 3, 3)).transpose(0, 1).double()
         angles = torch.cat(
             [triples[..., axis, None] * self.frequencies(axis, ids) for axis in range(3)], dim=-1
         )
         angles = angles.repeat_interleave(2, dim=-1)
         cosines, sines = angles.cos().float(), angles.sin().float()
         heads = torch.tensor(TRIPLE_OF_HEAD, device=ids.device)
-        return cosines[:, heads], sines[:, heads]
+        return cosines[:, :, heads], sines[:, :, heads]
 
     def frequencies(self, axis: int, ids: Tensor) -> Float[Tensor, "pairs"]:
         """Radians per token for each pair of the axis's channels."""
@@ -107,8 +112,8 @@ def projected_text(attn: Any, tokens: Float[Tensor, "b n c"]) -> tuple[Tensor, T
 
 def turned(
     states: Float[Tensor, "b n heads d"],
-    cosines: Float[Tensor, "n heads d"],
-    sines: Float[Tensor, "n heads d"],
+    cosines: Float[Tensor, "b n heads d"],
+    sines: Float[Tensor, "b n heads d"],
 ) -> Float[Tensor, "b n heads d"]:
     """`states` with each pair of channels turned by its angle, computed in float32."""
     real, imaginary = states.unflatten(-1, (-1, 2)).unbind(-1)
@@ -117,7 +122,7 @@ def turned(
 
 
 def with_per_head_positions(transformer: Any) -> Any:
-    """`transformer`, a FluxTransformer2DModel, made to take ids [tokens, 63]; its weights stay.
+    """`transformer`, a FluxTransformer2DModel, made to take ids [tokens, b * 63]; its weights stay.
 
     Raises:
         ValueError: where it has not 24 heads, which the scheme needs.

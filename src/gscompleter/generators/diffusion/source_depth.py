@@ -22,6 +22,8 @@ from gscompleter.generators.robust import robust_affine
 from gscompleter.generators.warp_inpaint.smooth import continued
 from gscompleter.types import Render, View
 
+MONOCULAR = "depth-anything/Depth-Anything-V2-Small-hf"
+"""A published model. The authors of PE-Field took MoGe-2, which transformers does not have."""
 MIN_ALPHA = 0.5
 """Opacity of the scene from which a pixel has a depth."""
 
@@ -122,15 +124,23 @@ def deviation(values: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     return (values - values.median()).abs().median()
 
 
+def source_depth_named(name: str, device: str = "cpu") -> SourceDepth:
+    """`context`, `monocular` (the published model), or a model by its folder or hub id.
+
+    Raises:
+        InputError: where packages are missing or the model cannot be had.
+    """
+    if name == "context":
+        return context_depth
+    return load_monocular(MONOCULAR if name == "monocular" else name, device)
+
+
 @lru_cache(maxsize=1)
-def load_monocular(
-    path: str = "depth-anything/Depth-Anything-V2-Small-hf", device: str = "cpu"
-) -> MonocularDepth:
+def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth:
     """A depth estimation model of transformers, for `PEField(depth=...)`.
 
     Args:
-        path: A folder, USER/NAME or USER/NAME@COMMIT. The authors of PE-Field took MoGe-2, which
-            transformers does not have.
+        path: A folder, USER/NAME or USER/NAME@COMMIT.
         device: cpu or cuda.
 
     Raises:

@@ -1,0 +1,208 @@
+"""PE-Field's transformer, random weights: positions for each head beside the plain ones of FLUX.
+
+    python benchmarks/bench_pe_field.py                        # a block of each kind, on a CPU
+    python benchmarks/bench_pe_field.py --device cuda --compile # all of it, on a GPU
+
+It is as wide as the published one; what it computes takes as long as with learned weights. Where
+not all blocks are built, their time is multiplied up to 19 double and 38 single ones, and the
+table says so. Needs `pip install 'gscompleter[diffusion]'`.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from gscompleter.generators.diffusion.kontext import nearest_size
+from gscompleter.generators.diffusion.position_ids import target_ids
+from gscompleter.generators.diffusion.rotary import with_per_head_positions
+
+BLOCKS = (19, 38)
+"""Double and single blocks of the published transformer."""
+TOKEN, TEXT = 16, 512
+"""Pixels along a side of a token; tokens of the prompt."""
+PAPER_SECONDS = 1.73
+"""What the paper states for 4 steps at 256 x 448, encoding and decoding included, on its GPU."""
+
+
+@dataclass(frozen=True)
+class Options:
+    height: int = 256
+    """Of the target."""
+    width: int = 448
+    """Of the target."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """bfloat16 on a GPU, float32 on a CPU, as the generator has it."""
+    blocks: tuple[int, int] | None = None
+    """Double and single blocks that are built; all on a GPU, one of each on a CPU."""
+    steps: int = 4
+    """Evaluations of the transformer."""
+    images: int = 1
+    """Targets that are denoised together."""
+    repetitions: int = 3
+    """The median of so many passes counts."""
+    compile: bool = False
+    """Time torch.compile too."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    seconds: float
+    """Of one evaluation, over all 57 blocks."""
+    peak_bytes: int | None
+    """Most memory on the GPU; None on a CPU."""
+
+
+def transformer(blocks: tuple[int, int], device: str) -> Any:
+    """FLUX's, as wide as it is published, with random weights."""
+    from diffusers import FluxTransformer2DModel
+
+    with torch.device("meta"):
+        model = FluxTransformer2DModel(
+            in_channels=64,
+            num_layers=blocks[0],
+            num_single_layers=blocks[1],
+            attention_head_dim=128,
+            num_attention_heads=24,
+            joint_attention_dim=4096,
+            pooled_projection_dim=768,
+            guidance_embeds=True,
+            axes_dims_rope=(16, 56, 56),
+        )
+    model = model.to(torch.float32 if device == "cpu" else torch.bfloat16).to_empty(device=device)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.normal_(std=0.02)
+    return model.eval()
+
+
+def call(model: Any, options: Options, numbers: int) -> Callable[[], None]:
+    """One evaluation for the photographs and the images; `numbers` is how many a position has."""
+    size = nearest_size(options.height, options.width)
+    grid = (size[0] // TOKEN, size[1] // TOKEN)
+    ids = target_ids(size, grid)[:, :numbers].repeat(2, 1).to(options.device)
+    if numbers > 3:
+        ids = ids.repeat(1, options.images)
+    device, dtype, b = options.device, next(model.parameters()).dtype, options.images
+
+    def once() -> None:
+        model(
+            hidden_states=torch.zeros(b, len(ids), 64, device=device, dtype=dtype),
+            timestep=torch.full((b,), 0.5, device=device, dtype=dtype),
+            guidance=torch.full((b,), 3.5, device=device),
+            pooled_projections=torch.zeros(b, 768, device=device, dtype=dtype),
+            encoder_hidden_states=torch.zeros(b, TEXT, 4096, device=device, dtype=dtype),
+            txt_ids=ids.new_zeros(TEXT, ids.shape[1]),
+            img_ids=ids,
+            return_dict=False,
+        )
+
+    return once
+
+
+def now(device: str) -> float:
+    """Seconds, once the GPU has done all that it was told."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+class Stopwatch:
+    """Seconds that some blocks of a network take."""
+
+    def __init__(self, blocks: Iterable[torch.nn.Module], device: str) -> None:
+        self.device = device
+        self.seconds = 0.0
+        self.hooks = []
+        for block in blocks:
+            self.hooks.append(block.register_forward_pre_hook(self.start))
+            self.hooks.append(block.register_forward_hook(self.stop))
+
+    def start(self, *_: Any) -> None:
+        self.seconds -= now(self.device)
+
+    def stop(self, *_: Any) -> None:
+        self.seconds += now(self.device)
+
+    def remove(self) -> None:
+        for hook in self.hooks:
+            hook.remove()
+
+
+def measured(model: Any, once: Callable[[], None], options: Options) -> Pass:
+    """Median of the passes; blocks that are missing count as those that are there."""
+    kinds = (model.transformer_blocks, model.single_transformer_blocks)
+    missing = [all_of_them / len(b) - 1 for b, all_of_them in zip(kinds, BLOCKS, strict=True)]
+    once()
+    if options.device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    passes = []
+    for _ in range(options.repetitions):
+        watches = [Stopwatch(blocks, options.device) for blocks in kinds] if any(missing) else []
+        start = now(options.device)
+        once()
+        seconds = now(options.device) - start
+        for watch, share in zip(watches, missing, strict=False):
+            watch.remove()
+            seconds += share * watch.seconds
+        passes.append(seconds)
+    peak = torch.cuda.max_memory_allocated() if options.device == "cuda" else None
+    return Pass(statistics.median(passes), peak)
+
+
+@torch.inference_mode()
+def main() -> None:
+    """Print the table."""
+    options = tyro.cli(Options, description=__doc__)
+    if options.device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("--device cuda was asked for, and there is no GPU; leave it out.")
+    built = options.blocks or ((1, 1) if options.device == "cpu" else BLOCKS)
+    model = transformer(built, options.device)
+    rows = {"plain positions": measured(model, call(model, options, 3), options)}
+    with_per_head_positions(model)
+    rows["a position for each head"] = measured(model, call(model, options, 63), options)
+    if options.compile:
+        compiled = torch.compile(model)
+        once = call(compiled, options, 63)
+        rows["the same, compiled"] = measured(model, once, options)
+    size = nearest_size(options.height, options.width)
+    tokens = 2 * (size[0] // TOKEN) * (size[1] // TOKEN) + TEXT
+    table = Table(
+        "",
+        "one pass",
+        f"{options.steps} steps",
+        "ratio",
+        "GPU memory",
+        title=f"{options.height} x {options.width}, worked on at {size[0]} x {size[1]}: "
+        f"{tokens:,} tokens, {options.images} at once, {options.device}",
+    )
+    first = next(iter(rows.values()))
+    for name, one in rows.items():
+        memory = "–" if one.peak_bytes is None else f"{one.peak_bytes / 2**30:.1f} GiB"
+        table.add_row(
+            name,
+            f"{one.seconds:.2f} s",
+            f"{options.steps * one.seconds:.1f} s",
+            f"{one.seconds / first.seconds:.2f}",
+            memory,
+        )
+    console = Console()
+    console.print(table)
+    if built != BLOCKS:
+        console.print(f"{built} blocks were run; their time stands for all {BLOCKS}.")
+    console.print(
+        f"The paper states {PAPER_SECONDS} s for 4 steps, with encoding and decoding, on its GPU."
+    )
+
+
+if __name__ == "__main__":
+    main()
