@@ -1,6 +1,7 @@
 """A synthesized image is compared with the photographs: its colours are brought to theirs, and
 an image of something else is told of."""
 
+import pytest
 import torch
 
 from gscompleter.generators import NotingGenerator
@@ -55,7 +56,28 @@ def test_something_else_is_told_and_left_as_it_is():
 
 
 def test_an_image_in_negative_is_no_colour_shift():
-    assert not compare(1 - TRUTH, observed().image, SEEN).agrees
+    found = compare(1 - TRUTH, observed().image, SEEN)
+    assert not found.agrees
+    assert found.residual < found.limit
+    _, (note,) = checked(lambda seed: 1 - TRUTH, 0, observed())
+    assert "a channel matches only as -1.00 of itself +1.00" in note
+
+
+@pytest.mark.parametrize("contrast", [0.2, 1.0])
+def test_the_limit_follows_the_contrast_of_the_scene(contrast):
+    """Half of what a single colour would leave, so that noise never passes for a dull scene."""
+    dull = 0.5 + contrast * (TRUTH - 0.5)
+    found = compare(dull, dull, SEEN)
+    assert found.agrees
+    config = AgreementConfig(least=0.0)
+    grey = compare(torch.full_like(TRUTH, 0.5) + 0.01 * NOISE, dull, SEEN, config)
+    assert grey.residual > grey.limit
+    assert grey.limit == pytest.approx(contrast * compare(TRUTH, TRUTH, SEEN, config).limit)
+
+
+def test_in_fog_anything_agrees():
+    fog = torch.full_like(TRUTH, 0.5) + 0.02 * NOISE
+    assert compare(torch.full_like(TRUTH, 0.45), fog, SEEN).agrees
 
 
 def test_further_seeds_are_tried_where_asked_and_only_until_one_agrees():

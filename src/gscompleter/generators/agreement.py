@@ -23,9 +23,11 @@ class AgreementConfig:
     blur: int = 2
     """Radius, in pixels, over which colours are averaged before they are compared: a painted edge
     may lie a pixel beside the photographed one."""
-    max_residual: float = 0.1
+    max_share: float = 0.5
     """Median difference of colours, once the shift is taken back, from which an image counts as
-    another scene. Colours are in [0, 1]."""
+    another scene: as a share of what a single colour would leave."""
+    least: float = 0.03
+    """A difference that counts as none, however dull the scene. Colours are in [0, 1]."""
     max_gain: float = 1.6
     """Largest factor of a channel, and its inverse the smallest, that counts as a colour shift."""
     max_offset: float = 0.25
@@ -46,6 +48,8 @@ class Agreement:
     offset: Float[Tensor, "3"]
     residual: float
     """Median difference of colours after the shift was taken back, over the observed pixels."""
+    limit: float
+    """The largest one at which the image counts as one of the same scene."""
     share: float
     """Share of the image that was observed."""
     agrees: bool
@@ -80,7 +84,7 @@ def checked(
         if found[-1].agrees:
             break
     best = min(found, key=lambda one: (not one.agrees, one.residual))
-    return best.image, notes_on(best, len(found), config)
+    return best.image, notes_on(best, len(found))
 
 
 def compare(
@@ -93,28 +97,37 @@ def compare(
     ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
     share = known.float().mean().item()
     if int(known.sum()) < config.min_pixels:
-        return Agreement(ones, zeros, 0.0, share, True, image)
+        return Agreement(ones, zeros, 0.0, config.least, share, True, image)
     ours = smoothed(image, known, config.blur)[known]
     theirs = smoothed(observed, known, config.blur)[known]
     gain, offset = robust_affine(ours, theirs, config.rounds)
     residual = (gain * ours + offset - theirs).abs().mean(dim=-1).median().item()
+    contrast = (theirs - theirs.median(dim=0).values).abs().mean(dim=-1).median().item()
+    limit = max(config.least, config.max_share * contrast)
     plausible = bool(
         ((gain >= 1 / config.max_gain) & (gain <= config.max_gain)).all()
         and (offset.abs() <= config.max_offset).all()
     )
-    agrees = plausible and residual <= config.max_residual
+    agrees = plausible and residual <= limit
     corrected = (gain * image + offset).clamp(0, 1) if agrees else image
-    return Agreement(gain, offset, residual, share, agrees, corrected)
+    return Agreement(gain, offset, residual, limit, share, agrees, corrected)
 
 
-def notes_on(found: Agreement, tried: int, config: AgreementConfig) -> tuple[str, ...]:
+def notes_on(found: Agreement, tried: int) -> tuple[str, ...]:
     """What a reader of the results should know of it."""
     if not found.agrees:
         seeds = "" if tried == 1 else f" (best of {tried} seeds)"
+        if found.residual > found.limit:
+            reason = f"colours differ by {found.residual:.3f} in the median"
+            limit = f"{found.limit:.3f} is the limit"
+        else:
+            worst = int(((found.gain - 1).abs() + found.offset.abs()).argmax())
+            gain, offset = found.gain[worst].item(), found.offset[worst].item()
+            reason = f"a channel matches only as {gain:.2f} of itself {offset:+.2f}"
+            limit = "that is no shift of colours"
         return (
             f"The synthesized image disagrees with the photographs: over the {found.share:.0%} of "
-            f"it that they show, colours differ by {found.residual:.2f} in the median{seeds}, and "
-            f"{config.max_residual:.2f} is the limit. It was used as it is.",
+            f"it that they show, {reason}{seeds}, and {limit}. It was used as it is.",
         )
     notes = []
     if found.shift > 0.5 / 255:
