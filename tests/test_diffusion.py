@@ -7,6 +7,7 @@ diffusers, and what is asked of a generator with the protocol. No image here loo
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,8 @@ import torch
 pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
 pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
 pytest.importorskip("accelerate", reason="needs gscompleter[diffusion]")
+
+from safetensors.torch import load_file, save_file
 
 import tiny_diffusion
 from gscompleter import InputError, load_generator, load_renderer
@@ -238,6 +241,29 @@ def test_a_pipeline_of_another_kind_is_refused(tmp_path, kontext_folder):
         load_generator("pe-field", settings=empty)
     with pytest.raises(InputError, match="Could not load"):
         load_generator("diffusers-inpaint", settings=empty)
+
+
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [
+        ("pe-field", "transformer"),
+        ("pe-field", "vae"),
+        ("pe-field", "text_encoder_2"),
+        ("diffusers-inpaint", "unet"),
+        ("diffusers-inpaint", "text_encoder"),
+    ],
+)
+def test_weights_that_lack_a_tensor_are_refused_and_never_made_up(
+    name, part, kontext_folder, inpaint_folder, tmp_path
+):
+    folder = tmp_path / "broken"
+    shutil.copytree(kontext_folder if name == "pe-field" else inpaint_folder, folder)
+    (file,) = (folder / part).glob("*.safetensors")
+    weights = load_file(file)
+    weights.pop(sorted(weights)[len(weights) // 2])
+    save_file(weights, file, metadata={"format": "pt"})
+    with pytest.raises(InputError, match=f"its {part} lacks the tensor"):
+        load_generator(name, settings=DiffusionSettings(str(folder)))
 
 
 def completed(tmp_path, monkeypatch, *model) -> dict:

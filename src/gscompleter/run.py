@@ -180,16 +180,17 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
     for row in summary["context"]:
         name = f"context {row['frame']}"
         table.add_row(name, "", cell(row["psnr_before"]), cell(row["psnr_after"]), "")
+    notes = []
     for row, target in zip(summary["targets"], completion.targets, strict=True):
         name = "target" if row["frame"] is None else f"target {row['frame']}"
+        notes += [f"{name}: {note}" for note in target.notes]
         hole = f"{100 * row['hole_fraction']:.1f} %"
         scores = cell(row["psnr_before"]), cell(row["psnr_after"])
         table.add_row(name, hole, *scores, f"{len(target.added):,}")
     console = Console()
     console.print(table)
-    for target in completion.targets:
-        for note in target.notes:
-            console.print(note, highlight=False)
+    for note in notes:
+        console.print(note, highlight=False)
     counts = summary["gaussians"]
     seconds = summary["seconds"]["total"]
     console.print(

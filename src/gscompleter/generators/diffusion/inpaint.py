@@ -18,8 +18,10 @@ from torch import Tensor
 from gscompleter.errors import InputError
 from gscompleter.generators import DiffusionSettings
 from gscompleter.generators.agreement import AgreementConfig, checked
+from gscompleter.generators.diffusion.complete import check_complete, text_encoders
 from gscompleter.generators.diffusion.kontext import resized
 from gscompleter.generators.diffusion.published import (
+    Source,
     announce,
     cannot_load,
     needs_diffusers,
@@ -181,7 +183,7 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
     try:
         with silent([source]):
-            pipeline = inpainting(source.place, source.arguments, dtype)
+            pipeline = inpainting(source, dtype)
     except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
         raise cannot_load(source, error) from error
     pipeline.set_progress_bar_config(disable=True)
@@ -192,11 +194,14 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
     return Painter(pipeline, *size_rules(pipeline))
 
 
-def inpainting(place: str, arguments: dict[str, str], dtype: torch.dtype) -> Any:
+def inpainting(source: Source, dtype: torch.dtype) -> Any:
     """The pipeline that a folder or repository names, as an inpainting one."""
     from diffusers import AutoPipelineForInpainting, DiffusionPipeline
 
-    pipeline = DiffusionPipeline.from_pretrained(place, dtype=dtype, **arguments)
+    pipeline = DiffusionPipeline.from_pretrained(
+        source.place, dtype=dtype, **text_encoders(source, dtype), **source.arguments
+    )
+    check_complete(pipeline)
     if {"image", "mask_image"} <= set(inspect.signature(pipeline.__call__).parameters):
         return pipeline
     return AutoPipelineForInpainting.from_pipe(pipeline)

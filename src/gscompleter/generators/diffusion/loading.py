@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from gscompleter.errors import InputError
+from gscompleter.generators.diffusion.complete import check_complete, text_encoders
 from gscompleter.generators.diffusion.kontext import Kontext, Prompt
 from gscompleter.generators.diffusion.published import (
     KONTEXT,
@@ -94,7 +95,12 @@ def encode_prompt(base: Source, device: str, dtype: torch.dtype) -> Prompt:
     from diffusers import FluxKontextPipeline
 
     readers = FluxKontextPipeline.from_pretrained(
-        base.place, transformer=None, vae=None, dtype=dtype, **base.arguments
+        base.place,
+        transformer=None,
+        vae=None,
+        dtype=dtype,
+        **text_encoders(base, dtype),
+        **base.arguments,
     ).to(device)
     with torch.inference_mode():
         tokens, pooled, _ = readers.encode_prompt(PROMPT, device=device)
@@ -109,6 +115,8 @@ def load_pipeline(base: Source, transformer: Source, dtype: torch.dtype) -> Any:
         transformer.place, dtype=dtype, **transformer.arguments
     )
     unused = dict.fromkeys(("text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2"))
-    return FluxKontextPipeline.from_pretrained(
+    pipeline = FluxKontextPipeline.from_pretrained(
         base.place, transformer=network, dtype=dtype, **unused, **base.arguments
     )
+    check_complete(pipeline)
+    return pipeline

@@ -132,19 +132,26 @@ def needs_diffusers(name: str) -> None:
 
 @contextmanager
 def silent(sources: list[Source]) -> Iterator[None]:
-    """No progress bars of diffusers and transformers where nothing is downloaded."""
+    """Nothing of diffusers and transformers but errors, and bars where something is downloaded.
+
+    What they would warn of is seen to (`complete.py`), or asks for torchvision without need.
+    """
     from diffusers.utils import logging as of_diffusers
     from transformers.utils import logging as of_transformers
 
     local = all(one.is_local for one in sources)
-    bars = [
-        log for log in (of_diffusers, of_transformers) if local and log.is_progress_bar_enabled()
-    ]
+    logs = (of_diffusers, of_transformers)
+    levels = [log.get_verbosity() for log in logs]
+    bars = [log for log in logs if local and log.is_progress_bar_enabled()]
+    for log in logs:
+        log.set_verbosity_error()
     for log in bars:
         log.disable_progress_bar()
     try:
         yield
     finally:
+        for log, level in zip(logs, levels, strict=True):
+            log.set_verbosity(level)
         for log in bars:
             log.enable_progress_bar()
 

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
+from gscompleter.generators.diffusion.complete import loaded
 from gscompleter.generators.diffusion.published import (
     announce,
     cannot_load,
@@ -153,7 +154,7 @@ def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth
         from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
         with silent([source]):
-            network = AutoModelForDepthEstimation.from_pretrained(source.place, **source.arguments)
+            network = loaded(AutoModelForDepthEstimation, source, "network")
             processor = AutoImageProcessor.from_pretrained(source.place, **source.arguments)
     except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
         raise cannot_load(source, error) from error
