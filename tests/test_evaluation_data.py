@@ -605,7 +605,7 @@ def test_an_evaluation_index_that_is_wrong_is_named(tmp_path, content, sentence)
 
 
 def test_an_evaluation_index_that_is_missing_is_named(tmp_path):
-    with pytest.raises(InputError, match="Cannot read the evaluation index"):
+    with pytest.raises(InputError, match="index.json cannot be read: No such file"):
         read_evaluation_index(tmp_path / "index.json")
 
 

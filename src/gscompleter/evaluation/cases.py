@@ -8,11 +8,11 @@ cannot satisfy. A file of cases is JSON: `{"resolution": [h, w], "cases": [{"sce
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 from gscompleter.errors import InputError
+from gscompleter.io.json_file import read_json
 from gscompleter.io.scene import load_views
 from gscompleter.types import View
 
@@ -47,8 +47,8 @@ def read_cases(path: Path) -> list[Case]:
     Raises:
         InputError: where the file is missing or holds no cases.
     """
+    content = read_json(path, "name a file of cases")
     try:
-        content = json.loads(path.read_text())
         height, width = content["resolution"]
         return [
             Case(
@@ -62,8 +62,6 @@ def read_cases(path: Path) -> list[Case]:
             )
             for row in content["cases"]
         ]
-    except OSError as error:
-        raise InputError(f"Cannot read the cases {path}: {error.strerror}.") from error
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path} is no file of cases ({type(error).__name__}: {error}); it needs resolution "

@@ -8,7 +8,6 @@ are held, and an image is decoded only when its frame is asked for.
 
 from __future__ import annotations
 
-import json
 import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,6 +30,7 @@ from gscompleter.evaluation.clips import (
 )
 from gscompleter.io.framing import check_resolution
 from gscompleter.io.image import decode_pixels, decoded_size
+from gscompleter.io.json_file import read_json
 from gscompleter.types import View
 
 STAGES = ("test", "train")
@@ -199,12 +199,7 @@ def _holds_chunks(folder: Path) -> bool:
 
 
 def _read_index(path: Path) -> Chunks:
-    try:
-        content = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not JSON ({error}); download it again.") from error
+    content = read_json(path, "download it again")
     if (
         not isinstance(content, dict)
         or not content

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterator, Sequence
@@ -26,6 +25,7 @@ from gscompleter.evaluation.clips import (
 )
 from gscompleter.io.framing import check_resolution
 from gscompleter.io.image import image_size, read_pixels
+from gscompleter.io.json_file import read_json
 from gscompleter.io.scene import load_cameras, load_views
 from gscompleter.io.transforms import read_index
 from gscompleter.types import View
@@ -252,10 +252,7 @@ def _clips_of_file(path: Path) -> Iterator[Clip] | None:
 
 
 def _peek(path: Path) -> Any:
-    try:
-        return json.loads(_read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not JSON ({error}); name {ACCEPTED}.") from error
+    return read_json(path, f"name {ACCEPTED}")
 
 
 def _is_camera_file(path: Path) -> bool:

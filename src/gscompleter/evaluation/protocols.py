@@ -19,6 +19,7 @@ from gscompleter.completer import MAX_TARGETS
 from gscompleter.errors import InputError
 from gscompleter.evaluation.clips import Clip, Skipped
 from gscompleter.io.files import replacing
+from gscompleter.io.json_file import read_json
 from gscompleter.types import View
 
 VERSION = 1
@@ -279,7 +280,7 @@ def read_evaluation_index(path: Path | str) -> EvaluationIndex:
         InputError: where it is missing or damaged, or from a later version.
     """
     path = Path(path)
-    content = _read_json(path)
+    content = _read_named(path)
     if "version" not in content:
         return _index(path.stem, content, path)
     if content["version"] != VERSION:
@@ -314,13 +315,8 @@ def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
         file.write(text.encode())
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"Cannot read the evaluation index {path}: {error.strerror}.") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not JSON ({error}); download it again.") from error
+def _read_named(path: Path) -> dict[str, Any]:
+    content = read_json(path, "download it again")
     if not isinstance(content, dict):
         raise InputError(
             f"{path} is no evaluation index: it has to map the name of each scene to its context "

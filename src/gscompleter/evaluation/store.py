@@ -30,6 +30,7 @@ import torch
 from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import Start
 from gscompleter.evaluation.scores import Outcome, ranged_truth
+from gscompleter.io import json_file
 from gscompleter.io.files import replacing
 from gscompleter.types import Gaussians, View, merge
 
@@ -198,12 +199,7 @@ def read_json(path: Path) -> Any:
     Raises:
         InputError: where it cannot be read.
     """
-    try:
-        return json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
-    except ValueError as error:
-        raise InputError(f"{path} is damaged ({error}); delete it and run again.") from error
+    return json_file.read_json(path, "delete it and run again")
 
 
 def _make_folder(folder: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.io.image import image_size
+from gscompleter.io.json_file import read_json
 from gscompleter.io.lens import Distortion, Pinhole
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -166,7 +166,7 @@ def read_frames(scene: Path | str) -> list[Frame]:
             or the intrinsics of one are missing or impossible.
     """
     path = _json_path(Path(scene))
-    content = _read_json(path)
+    content = _read_transforms(path)
     entries = content.get("frames")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} lists no frames; its `frames` has to be a list with cameras.")
@@ -192,13 +192,8 @@ def _json_path(scene: Path) -> Path:
     return scene
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not JSON ({error}); export the scene again.") from error
+def _read_transforms(path: Path) -> dict[str, Any]:
+    content = read_json(path, "export the scene again")
     if not isinstance(content, dict):
         raise InputError(f"{path} is no transforms.json: it has to be an object with `frames`.")
     return content
