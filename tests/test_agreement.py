@@ -4,6 +4,7 @@ an image of something else is told of."""
 import pytest
 import torch
 
+from gscompleter import InputError
 from gscompleter.generators import NotingGenerator
 from gscompleter.generators.agreement import AgreementConfig, checked, compare
 from gscompleter.generators.warp_inpaint import WarpInpaint
@@ -63,16 +64,45 @@ def test_an_image_in_negative_is_no_colour_shift():
     assert "a channel matches only as -1.00 of itself +1.00" in note
 
 
-@pytest.mark.parametrize("contrast", [0.2, 1.0])
+@pytest.mark.parametrize("contrast", [0.5, 1.0])
 def test_the_limit_follows_the_contrast_of_the_scene(contrast):
-    """Half of what a single colour would leave, so that noise never passes for a dull scene."""
+    """It is a share of what a single colour would leave, so that plain grey passes for nothing."""
     dull = 0.5 + contrast * (TRUTH - 0.5)
     found = compare(dull, dull, SEEN)
     assert found.agrees
-    config = AgreementConfig(least=0.0)
-    grey = compare(torch.full_like(TRUTH, 0.5) + 0.01 * NOISE, dull, SEEN, config)
+    assert found.limit == pytest.approx(contrast * compare(TRUTH, TRUTH, SEEN).limit)
+    grey = compare(torch.full_like(TRUTH, 0.5) + 0.01 * NOISE, dull, SEEN)
     assert grey.residual > grey.limit
-    assert grey.limit == pytest.approx(contrast * compare(TRUTH, TRUTH, SEEN, config).limit)
+    assert not grey.agrees
+
+
+def test_a_blank_wall_over_most_of_the_scene_hides_nothing():
+    walled = TRUTH.clone()
+    walled[:57] = 0.7
+    assert compare(walled, walled, SEEN).agrees
+    grey = torch.full_like(TRUTH, 0.7) + 0.001 * NOISE
+    assert not compare(grey, walled, SEEN).agrees
+    assert not compare(torch.cat([grey[:57], NOISE[57:]]), walled, SEEN).agrees
+
+
+def test_of_images_that_all_disagree_the_nearest_is_kept():
+    images = {7: NOISE, 8: 0.5 * NOISE + 0.5 * TRUTH.flip(1), 9: TRUTH.flip(0)}
+    found = {seed: compare(image, observed().image, SEEN) for seed, image in images.items()}
+    assert not any(one.agrees for one in found.values())
+    best = min(found, key=lambda seed: found[seed].residual)
+    assert len({one.residual for one in found.values()}) == 3
+    image, _ = checked(lambda seed: images[seed], 7, observed(), AgreementConfig(retries=2))
+    assert torch.equal(image, images[best])
+
+
+def test_a_seed_that_gives_nan_is_passed_over_and_nothing_but_nan_is_refused():
+    broken = torch.full_like(TRUTH, float("nan"))
+    image, _ = checked(
+        lambda seed: broken if seed == 0 else TRUTH, 0, observed(), AgreementConfig(retries=1)
+    )
+    assert (image - TRUTH).abs().max() < 1e-3
+    with pytest.raises(InputError, match=r"no finite image \(2 seed"):
+        checked(lambda seed: broken, 0, observed(), AgreementConfig(retries=1))
 
 
 def test_in_fog_anything_agrees():

@@ -73,10 +73,10 @@ class KnowingTogether(KnowingGenerator):
 
     def __init__(self) -> None:
         super().__init__()
-        self.asked: list[int] = []
+        self.calls: list[list] = []
 
     def batch(self, calls):
-        self.asked.append(len(calls))
+        self.calls.append(list(calls))
         return [(self(*call), (f"One of {len(calls)}.",)) for call in calls]
 
 
@@ -169,13 +169,22 @@ def test_targets_are_synthesized_together_where_the_generator_can():
     targets = [target, views[0].camera, *others]
     generator = KnowingTogether()
     together = GSCompleter(KnowingReconstructor(), generator)(views, targets)
-    assert generator.asked == [1, 2, 1]
-    assert [result.notes[0] for result in together.targets] == [
-        "One of 1.",
-        "The target is a context view: nothing to complete.",
-        "One of 2.",
-        "One of 2.",
-        "One of 1.",
+    assert [len(calls) for calls in generator.calls] == [1, 2]
+    renderer, added_to = load_renderer("cpu"), [together.context]
+    added_to.append(merge([together.context, together.targets[0].added]))
+    for calls, scene in zip(generator.calls, added_to, strict=True):
+        for nearest, wide, context in calls:
+            assert wide.width > SIZE  # with its margin
+            assert nearest is context.views[1]
+            assert torch.equal(context.at_target.alpha, renderer.render(scene, wide).alpha)
+            for view, seen in zip(context.views, context.at_views, strict=True):
+                assert torch.equal(seen.alpha, renderer.render(scene, view.camera).alpha)
+    assert [result.notes[:1] for result in together.targets] == [
+        ("One of 1.",),
+        ("The target is a context view: nothing to complete.",),
+        ("One of 2.",),
+        ("One of 2.",),
+        (),
     ]
     one_by_one = knowing()(views, targets)
     assert torch.equal(together.scene.means, one_by_one.scene.means)

@@ -10,7 +10,6 @@ import json
 import shutil
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -22,6 +21,7 @@ pytest.importorskip("accelerate", reason="needs gscompleter[diffusion]")
 from safetensors.torch import load_file, save_file
 
 import tiny_diffusion
+from command import run
 from gscompleter import InputError, load_generator, load_renderer
 from gscompleter.cli import main
 from gscompleter.generators import DiffusionSettings
@@ -34,12 +34,13 @@ from gscompleter.generators.diffusion.inpaint import (
 from gscompleter.generators.diffusion.kontext import SIZES, nearest_size
 from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
 from gscompleter.generators.diffusion.pe_field import PEField, grouped
-from gscompleter.generators.diffusion.source_depth import context_depth
+from gscompleter.generators.diffusion.source_depth import MonocularDepth, context_depth
 from gscompleter.io.image import write_image
 from gscompleter.io.scene import write_cameras
 from gscompleter.types import Gaussians, SceneContext, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 from test_generators import TARGET, known_room
+from test_source_depth import tiny_model
 
 SIZE = 64
 
@@ -162,16 +163,16 @@ def test_further_seeds_are_tried_and_the_best_is_kept(kontext_folder):
     assert sum(bool(torch.equal(image, one)) for one in seeds) == 1
 
 
-def test_settings_reach_the_generators(kontext_folder, inpaint_folder, monkeypatch):
-    asked = DiffusionSettings(str(kontext_folder), steps=3, retries=2)
+def test_settings_reach_the_generators(kontext_folder, inpaint_folder, tmp_path):
+    asked = DiffusionSettings(str(kontext_folder), steps=3, retries=2, at_once=1)
     generator = load_generator("pe-field", 5, settings=asked)
     assert (generator.seed, generator.steps, generator.agreement.retries) == (5, 3, 2)
+    assert generator.at_once == 1
     assert generator.depth is context_depth
     assert load_generator("pe-field", settings=DiffusionSettings(asked.path)).steps == 4
-    with pytest.raises(InputError, match=r"Could not load .*/nowhere"):
-        depth = str(kontext_folder / ".." / "nowhere")
-        Path(depth).mkdir()
-        load_generator("pe-field", settings=replace(asked, depth=depth))
+    network = tiny_model(tmp_path)
+    with_depth = load_generator("pe-field", settings=replace(asked, depth=str(network)))
+    assert isinstance(with_depth.depth, MonocularDepth)
     asked = DiffusionSettings(str(inpaint_folder), steps=3, retries=1, prompt="a quiet street")
     painter = load_generator("diffusers-inpaint", settings=asked)
     assert (painter.prompt, painter.steps, painter.agreement.retries) == ("a quiet street", 3, 1)
@@ -243,6 +244,24 @@ def test_a_pipeline_of_another_kind_is_refused(tmp_path, kontext_folder):
         load_generator("diffusers-inpaint", settings=empty)
 
 
+def test_a_checker_of_images_is_no_exception(tmp_path):
+    """And older names of classes are left to diffusers, which knows what became of them."""
+    folder = tiny_diffusion.saved(tiny_diffusion.checked_stable_diffusion(), tmp_path / "whole")
+    index = json.loads((folder / "model_index.json").read_text())
+    index["feature_extractor"] = ["transformers", "CLIPFeatureExtractor"]
+    (folder / "model_index.json").write_text(json.dumps(index))
+    generator = load_generator("diffusers-inpaint", settings=DiffusionSettings(str(folder)))
+    assert generator.painter.pipeline.safety_checker is not None
+    broken = tmp_path / "broken"
+    shutil.copytree(folder, broken)
+    (file,) = (broken / "safety_checker").glob("*.safetensors")
+    weights = load_file(file)
+    weights.pop(next(name for name in sorted(weights) if "mlp.fc2.weight" in name))
+    save_file(weights, file, metadata={"format": "pt"})
+    with pytest.raises(InputError, match="its safety_checker lacks the tensor"):
+        load_generator("diffusers-inpaint", settings=DiffusionSettings(str(broken)))
+
+
 @pytest.mark.parametrize(
     ("name", "part"),
     [
@@ -299,6 +318,26 @@ def test_a_smoke_test_of_a_whole_completion_with_random_weights(
         notes = " ".join(summary["targets"][0]["notes"])
         assert "disagrees with the photographs" in notes
         assert "best of 2 seeds" in notes
+
+
+def test_a_smoke_test_of_an_evaluation_with_random_weights(inpaint_folder, tmp_path, monkeypatch):
+    cameras = [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)]
+    names = [f"{number}.png" for number in range(3)]
+    (tmp_path / "room").mkdir()
+    for name, camera in zip(names, cameras, strict=True):
+        write_image(tmp_path / "room" / name, view_of(Room(), camera).image)
+    write_cameras(tmp_path / "room" / "transforms.json", cameras, names)
+    case = {"scene": "room", "context": [0, 1], "target": 2, "near": 0.5, "far": 20.0}
+    content = {"resolution": [SIZE, SIZE], "cases": [case]}
+    (tmp_path / "cases.json").write_text(json.dumps(content))
+    words = ["evaluate", tmp_path / "cases.json", "--methods", "full", "--out", tmp_path / "out"]
+    words += ["--generator", "diffusers-inpaint", "--generator-path", inpaint_folder, "--quiet"]
+    assert run(monkeypatch, *words, "--generator-steps", 2, "--device", "cpu") == 0
+    remembered = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert remembered["generator_steps"] == 2
+    assert remembered["generator_path"] == str(inpaint_folder)
+    (row,) = (tmp_path / "out" / "cases").glob("*/full.json")
+    assert json.loads(row.read_text())["error"] is None
 
 
 @pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])

@@ -10,8 +10,10 @@ from gscompleter.generators.diffusion.loading import sources
 from gscompleter.generators.diffusion.published import (
     KONTEXT,
     PE_FIELD,
+    IncompleteWeightsError,
     Source,
     announce,
+    cannot_load,
     source_of,
 )
 from gscompleter.io.image import write_image
@@ -47,9 +49,20 @@ def test_a_setting_that_a_generator_does_not_know_is_refused(name, setting, way_
     assert way_out in str(told.value)
 
 
-@pytest.mark.parametrize(("key", "value"), [("steps", 0), ("steps", -1), ("retries", -1)])
-def test_numbers_that_mean_nothing_are_refused(key, value):
-    with pytest.raises(InputError, match=f"--generator-{key} is {value}"):
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("steps", 0, "--generator-steps is 0; at least 1"),
+        ("steps", -1, "--generator-steps is -1"),
+        ("retries", -1, "--generator-retries is -1; at least 0"),
+        ("at_once", 0, "--generator-at-once is 0; at least 1"),
+        ("path", "", "--generator-path is empty"),
+        ("depth", "", "--generator-depth is empty"),
+        ("offload", True, "--generator-offload keeps parts .* and it runs on the CPU"),
+    ],
+)
+def test_values_that_mean_nothing_are_refused(key, value, message):
+    with pytest.raises(InputError, match=message):
         load_generator("pe-field", settings=DiffusionSettings(**{key: value}))
 
 
@@ -97,6 +110,28 @@ def test_gate_licence_and_missing_pin_are_named_before_a_download_and_a_folder_n
     assert "https://huggingface.co/yunpeng1998/PE-Field" in said
     assert said.count("pins nothing") == 2
     assert said.count("Non-Commercial") + said.count("non-commercial") == 2
+
+
+def test_what_is_read_twice_is_announced_once(capsys):
+    base, transformer = sources("somebody/something@abc")
+    announce([base, transformer])
+    assert capsys.readouterr().err.count("somebody/something") == 1
+
+
+def test_the_sentence_names_what_did_not_load_and_how_to_mend_it(tmp_path):
+    def said(source: Source, error: Exception, option: str = "--generator-path") -> str:
+        return str(cannot_load(source, error, option))
+
+    lost = IncompleteWeightsError("vae", ["a", "b", "c"])
+    assert "its vae lacks the tensor a and 2 more" in said(PE_FIELD, lost)
+    assert "accepted its terms" not in said(PE_FIELD, lost)
+    assert "yunpeng1998/PE-Field" in said(PE_FIELD, lost)
+    assert "accepted its terms at https://huggingface.co/black" in said(KONTEXT, OSError("gated"))
+    depth = source_of("somebody/depth", "transformers")
+    assert "give a folder by --generator-depth" in said(depth, OSError("?"), "--generator-depth")
+    assert "see that it is complete" in said(source_of(str(tmp_path)), OSError("no config.json"))
+    with pytest.raises(InputError, match="a folder that transformers saved"):
+        source_of("nothing", "transformers")
 
 
 def test_a_pipeline_brings_its_own_transformer_and_a_transformer_joins_the_published_base(tmp_path):

@@ -29,9 +29,10 @@ from gscompleter.evaluation.methods import (
 from gscompleter.evaluation.metrics import psnr
 from gscompleter.evaluation.plots import plots
 from gscompleter.evaluation.protocols import read_evaluation_index
-from gscompleter.evaluation.runs import RunConfig, Tally, evaluate
+from gscompleter.evaluation.runs import RunConfig, Tally, claim, evaluate
 from gscompleter.evaluation.store import read_json
 from gscompleter.evaluation.tables import gap_of, summarize, tables
+from gscompleter.generators import DiffusionSettings
 from gscompleter.io.image import read_image, write_image
 from gscompleter.io.scene import write_cameras
 from scenes import Room, camera_at, view_of
@@ -162,6 +163,19 @@ def test_a_run_killed_five_times_ends_as_one_that_was_not(scenes, tmp_path):
     assert live(out, "never") == live(whole, "never") == 0
     tables(whole)
     same_tables(out, whole)
+
+
+def test_a_folder_remembers_what_its_generator_was_told(tmp_path):
+    def config(**settings) -> RunConfig:
+        return RunConfig(generator="pe-field", generator_settings=DiffusionSettings(**settings))
+
+    claim(tmp_path, config(steps=4))
+    claim(tmp_path, config(steps=4, offload=True))  # which changes no number
+    with pytest.raises(InputError, match="holds a run with generator_steps 4, and 8 is asked for"):
+        claim(tmp_path, config(steps=8))
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(InputError, match=r"run.json is not JSON .* name another folder"):
+        claim(tmp_path, config(steps=4))
 
 
 def test_failures_and_scores_can_be_done_again(cases, tmp_path, monkeypatch):

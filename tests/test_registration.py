@@ -151,7 +151,7 @@ def test_the_unit_of_the_scene_scales_the_result_and_changes_nothing_else(unit):
     # Adam divides by the size of the gradient, so that rounding shows where it is tiny.
     assert ((theirs.gaussians.means - same.means) / unit).abs().median() < 5e-3
     assert theirs.affine.scale == pytest.approx(ours.affine.scale, rel=1e-3)
-    assert theirs.losses[-1] == pytest.approx(ours.losses[-1], rel=0.02)
+    assert theirs.losses[-1] == pytest.approx(ours.losses[-1], rel=0.03)
 
 
 def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():

@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from gscompleter import InputError
+from gscompleter.generators.diffusion import source_depth
 from gscompleter.generators.diffusion.source_depth import (
     MonocularDepth,
     context_depth,
     from_disparity,
     load_monocular,
     rescaled,
+    source_depth_named,
 )
 from gscompleter.types import Render
 from test_generators import known_room
@@ -89,6 +91,91 @@ def tiny_model(folder: Path) -> Path:
     processor = transformers.DPTImageProcessorPil(size=size, ensure_multiple_of=14, do_pad=False)
     processor.save_pretrained(folder)
     return folder
+
+
+def tiny_dpt(folder: Path) -> Path:
+    """DPT with random weights, without the layer that it never uses, as in published files."""
+    transformers = pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
+    torch.manual_seed(0)
+    config = transformers.DPTConfig(
+        hidden_size=32,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        intermediate_size=32,
+        image_size=32,
+        patch_size=16,
+        backbone_out_indices=[0, 1, 2, 3],
+        neck_hidden_sizes=[8, 8, 8, 8],
+        fusion_hidden_size=8,
+        is_hybrid=False,
+    )
+    model = transformers.DPTForDepthEstimation(config)
+    weights = model.state_dict()
+    unused = [name for name in weights if "fusion_stage.layers.0.residual_layer1." in name]
+    assert unused
+    model.save_pretrained(
+        folder, state_dict={name: v for name, v in weights.items() if name not in unused}
+    )
+    size = {"height": 32, "width": 32}
+    transformers.DPTImageProcessorPil(size=size, do_pad=False).save_pretrained(folder)
+    return folder
+
+
+def tiny_glpn(folder: Path) -> Path:
+    """GLPN, which gives depth in metres, with random weights."""
+    transformers = pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
+    torch.manual_seed(0)
+    config = transformers.GLPNConfig(
+        depths=[1, 1, 1, 1],
+        hidden_sizes=[8, 16, 16, 32],
+        num_attention_heads=[1, 1, 2, 2],
+        decoder_hidden_size=8,
+    )
+    transformers.GLPNForDepthEstimation(config).save_pretrained(folder)
+    transformers.GLPNImageProcessorPil().save_pretrained(folder)
+    return folder
+
+
+@pytest.mark.parametrize("tiny", [tiny_dpt, tiny_glpn])
+def test_other_networks_of_transformers_are_read_as_what_they_give(tiny, tmp_path, monkeypatch):
+    pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
+    asked = []
+    for name in ("rescaled", "from_disparity"):
+        fit = getattr(source_depth, name)
+        monkeypatch.setattr(
+            source_depth, name, lambda *a, name=name, fit=fit: asked.append(name) or fit(*a)
+        )
+    depth = source_depth_named(str(tiny(tmp_path)))(VIEW, holed())
+    assert asked == ["from_disparity" if tiny is tiny_dpt else "rescaled"]
+    assert depth.shape == (96, 96)
+    assert (depth > 0).all()
+
+
+def test_a_network_of_which_it_is_not_known_what_it_gives_is_refused(tmp_path, monkeypatch):
+    folder = str(tiny_model(tmp_path))
+    monkeypatch.setattr(source_depth, "METRIC", {"dpt": False})
+    with pytest.raises(InputError, match=r"is a depth_anything, of which .* choose one of dpt"):
+        source_depth_named(folder)
+
+
+def test_a_network_that_lacks_a_tensor_is_refused(tmp_path):
+    safetensors = pytest.importorskip("safetensors.torch")
+    (file,) = tiny_model(tmp_path).glob("*.safetensors")
+    weights = safetensors.load_file(file)
+    weights.pop(sorted(weights)[0])
+    safetensors.save_file(weights, file, metadata={"format": "pt"})
+    with pytest.raises(InputError, match=r"its network lacks the tensor .*save_pretrained"):
+        source_depth_named(str(tmp_path))
+
+
+def test_the_depth_of_the_scene_and_the_published_network_have_names(monkeypatch):
+    assert source_depth_named("context") is context_depth
+    asked = []
+    monkeypatch.setattr(
+        source_depth, "load_monocular", lambda *names: asked.append(names) or context_depth
+    )
+    source_depth_named("monocular", "cuda")
+    assert asked == [(source_depth.MONOCULAR, "cuda")]
 
 
 def test_a_model_of_transformers_gives_a_depth_in_the_scenes_unit(tmp_path):

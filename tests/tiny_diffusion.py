@@ -138,6 +138,25 @@ def stable_diffusion(inpainting: bool = True) -> Any:
     )
 
 
+def checked_stable_diffusion() -> Any:
+    """Stable Diffusion's inpainting with its checker of images."""
+    from diffusers.pipelines.stable_diffusion import StableDiffusionSafetyChecker
+    from transformers import CLIPConfig, CLIPImageProcessorPil
+
+    pipeline = stable_diffusion()
+    layers = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1}
+    config = CLIPConfig(
+        vision_config={**layers, "num_attention_heads": 2, "image_size": 32, "patch_size": 16},
+        text_config={**layers, "num_attention_heads": 2, "vocab_size": 54},
+        projection_dim=16,
+    )
+    pipeline.register_modules(
+        safety_checker=StableDiffusionSafetyChecker(config),
+        feature_extractor=CLIPImageProcessorPil(size=32, crop_size=32),
+    )
+    return pipeline
+
+
 def sdxl() -> Any:
     """SDXL's inpainting at 64 pixels."""
     from diffusers import EulerDiscreteScheduler, StableDiffusionXLInpaintPipeline

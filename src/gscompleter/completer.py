@@ -81,7 +81,8 @@ class GSCompleter:
 
         Args:
             views: Photographs with their cameras: at least two, or one with `scene`.
-            target: The camera (or cameras, completed one after the other into one scene).
+            target: The camera (or cameras, completed one after the other into one scene; a
+                generator that takes several at once is asked for their images before that).
             scene: Gaussians that are the context already, in the frame and unit of the cameras;
                 they are kept as they are. Without it Ψ reconstructs the context from `views`.
 
@@ -136,7 +137,7 @@ class GSCompleter:
         takes one at a time: it then sees what was completed for the targets before.
         """
         images: list[Synthesized | None] = [None] * len(targets)
-        if not isinstance(self.generator, BatchGenerator):
+        if len(targets) < 2 or not isinstance(self.generator, BatchGenerator):
             return images
         asked: dict[int, tuple[Camera, SceneContext]] = {}
         with clock("context"):

@@ -50,7 +50,11 @@ class CompleterConfig:
         return CompleterConfig(
             margin=0.0,
             registration=RegistrationConfig(
+                iterations=50,
                 learning_rate=0.01,
+                schedule="constant",
+                beta1=0.9,
+                beta2=0.999,
                 step="literal",
                 rgb_weight=0.1,
                 depth_of="composite",
@@ -60,6 +64,7 @@ class CompleterConfig:
                 affine=AffineConfig(min_agreement=None),
             ),
             free_space=FreeSpaceConfig(num_steps=0),
+            refine=RefineConfig(iterations=30, learning_rate=0.08),
             holes=HoleConfig(neighbourhood=None),
             harm=HarmConfig(tolerance=None),
         )

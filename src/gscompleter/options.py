@@ -34,6 +34,9 @@ class GeneratorOptions:
     generator_depth: str | None = None
     """Where pe-field takes the depth of the photograph from: context, the scene itself (if not
     given); monocular, a published network; or the folder or hub id of another one."""
+    generator_at_once: int | None = None
+    """How many targets pe-field denoises together, at most. Fewer need less memory. If not given,
+    4."""
     generator_offload: bool = False
     """Keep on the GPU only the part of the generator that is at work, the rest in main memory."""
 

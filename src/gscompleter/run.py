@@ -95,6 +95,7 @@ def generator_settings(options: GeneratorOptions) -> DiffusionSettings:
         retries=options.generator_retries,
         prompt=options.generator_prompt,
         depth=options.generator_depth,
+        at_once=options.generator_at_once,
         offload=options.generator_offload,
     )
 

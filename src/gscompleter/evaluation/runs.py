@@ -389,13 +389,24 @@ def check_cases(cases: Sequence[Named]) -> None:
         names[folder] = case.name
 
 
+def deciding(config: RunConfig) -> dict[str, Any]:
+    """All that decides the numbers, by the names of the command line.
+
+    Where the parts of a generator wait is not among it.
+    """
+    values = asdict(config)
+    settings = values.pop("generator_settings")
+    del settings["offload"]
+    return {**values, **{f"generator_{name}": value for name, value in settings.items()}}
+
+
 def claim(out: Path, config: RunConfig) -> None:
     """Make `out` the folder of this run, or see that it is.
 
     Raises:
         InputError: where it holds something else, or a run with other settings.
     """
-    wanted = json.loads(json.dumps({"version": VERSION, **asdict(config)}))
+    wanted = json.loads(json.dumps({"version": VERSION, **deciding(config)}))
     path = out / RUN
     if path.exists():
         found = read_json(path)

@@ -199,7 +199,8 @@ def read_json(path: Path) -> Any:
     Raises:
         InputError: where it cannot be read.
     """
-    return json_file.read_json(path, "delete it and run again")
+    advice = "name another folder" if path.name == RUN else "delete it and run again"
+    return json_file.read_json(path, advice)
 
 
 def _make_folder(folder: Path) -> None:

@@ -75,12 +75,14 @@ class DiffusionSettings:
     depth: str | None = None
     """Where the depth of the photograph comes from: `context`, `monocular`, or the folder or hub id
     of a depth estimation model of transformers."""
+    at_once: int | None = None
+    """How many targets are denoised together, at most."""
     offload: bool = False
     """Keep on the GPU only the part of the network that is at work: slower, and less memory."""
 
 
 TAKES: dict[str, tuple[str, ...]] = {
-    "pe-field": ("path", "steps", "retries", "depth", "offload"),
+    "pe-field": ("path", "steps", "retries", "depth", "at_once", "offload"),
     "diffusers-inpaint": ("path", "steps", "retries", "prompt", "offload"),
 }
 """The settings that each generator with weights knows; the others know none."""
@@ -150,25 +152,35 @@ def load_generator(
     """
     if name not in GENERATORS:
         raise InputError(f"There is no generator {name!r}; choose one of {', '.join(GENERATORS)}.")
-    check_settings(name, settings)
+    check_settings(name, settings, device)
     return GENERATORS[name](GeneratorRequest(seed, photographs, device, settings))
 
 
-def check_settings(name: str, settings: DiffusionSettings) -> None:
-    """Refuse settings that the generator called `name` does not know, and senseless numbers.
+def check_settings(name: str, settings: DiffusionSettings, device: str) -> None:
+    """Refuse settings that the generator called `name` does not know, and senseless values.
 
     Raises:
         InputError: where there is one.
     """
     for field in fields(settings):
-        value = getattr(settings, field.name)
+        value, option = getattr(settings, field.name), f"--generator-{field.name.replace('_', '-')}"
+        if value == "":
+            raise InputError(f"{option} is empty; leave it out, or say what it shall be.")
         if value != field.default and field.name not in TAKES.get(name, ()):
             others = [other for other, known in TAKES.items() if field.name in known]
             raise InputError(
-                f"The generator {name!r} knows no --generator-{field.name} ({value}); leave that "
-                f"out, or choose {' or '.join(others)}."
+                f"The generator {name!r} knows no {option} ({value}); leave that out, or choose "
+                f"{' or '.join(others)}."
             )
-    if settings.steps is not None and settings.steps < 1:
-        raise InputError(f"--generator-steps is {settings.steps}; at least 1 is needed.")
-    if settings.retries < 0:
-        raise InputError(f"--generator-retries is {settings.retries}; 0 or more are possible.")
+    for option, number, least in (
+        ("steps", settings.steps, 1),
+        ("retries", settings.retries, 0),
+        ("at-once", settings.at_once, 1),
+    ):
+        if number is not None and number < least:
+            raise InputError(f"--generator-{option} is {number}; at least {least} is needed.")
+    if settings.offload and device == "cpu":
+        raise InputError(
+            "--generator-offload keeps parts of the generator off the GPU, and it runs on the CPU; "
+            "leave it out, or choose --device cuda."
+        )

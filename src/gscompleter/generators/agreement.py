@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.errors import InputError
 from gscompleter.generators.robust import robust_affine
 from gscompleter.generators.warp_inpaint.warp import Warped
 from gscompleter.interpolation import smoothed
@@ -23,9 +24,12 @@ class AgreementConfig:
     blur: int = 2
     """Radius, in pixels, over which colours are averaged before they are compared: a painted edge
     may lie a pixel beside the photographed one."""
-    max_share: float = 0.5
-    """Median difference of colours, once the shift is taken back, from which an image counts as
-    another scene: as a share of what a single colour would leave."""
+    max_share: float = 0.6
+    """Difference of colours, once the shift is taken back, from which an image counts as another
+    scene: as a share of what a single colour would leave."""
+    quantile: float = 0.7
+    """Which pixel's difference counts, from the least to the largest. The median would be that of a
+    blank wall where this fills half of what is seen."""
     least: float = 0.03
     """A difference that counts as none, however dull the scene. Colours are in [0, 1]."""
     max_gain: float = 1.6
@@ -47,7 +51,7 @@ class Agreement:
     gain: Float[Tensor, "3"]
     offset: Float[Tensor, "3"]
     residual: float
-    """Median difference of colours after the shift was taken back, over the observed pixels."""
+    """Difference of colours after the shift was taken back, a quantile over the observed pixels."""
     limit: float
     """The largest one at which the image counts as one of the same scene."""
     share: float
@@ -76,6 +80,9 @@ def checked(
         seed: The first to try; `config.retries` more follow while the image disagrees.
         observed: What the photographs show of the target.
         config: What counts as agreement.
+
+    Raises:
+        InputError: where no seed gives finite colours.
     """
     found: list[Agreement] = []
     for attempt in range(config.retries + 1):
@@ -84,6 +91,11 @@ def checked(
         if found[-1].agrees:
             break
     best = min(found, key=lambda one: (not one.agrees, one.residual))
+    if best.residual == float("inf"):
+        raise InputError(
+            f"The generator painted no finite image ({len(found)} seed(s) tried); see that its "
+            "weights are sound, or choose another generator."
+        )
     return best.image, notes_on(best, len(found))
 
 
@@ -96,13 +108,17 @@ def compare(
     """Measure the colour shift of `image` against `observed` where that is `known`."""
     ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
     share = known.float().mean().item()
+    if not image.isfinite().all():
+        inf = float("inf")
+        return Agreement(ones, zeros, inf, config.least, share, False, image)
     if int(known.sum()) < config.min_pixels:
         return Agreement(ones, zeros, 0.0, config.least, share, True, image)
     ours = smoothed(image, known, config.blur)[known]
     theirs = smoothed(observed, known, config.blur)[known]
     gain, offset = robust_affine(ours, theirs, config.rounds)
-    residual = (gain * ours + offset - theirs).abs().mean(dim=-1).median().item()
-    contrast = (theirs - theirs.median(dim=0).values).abs().mean(dim=-1).median().item()
+    residual = quantile((gain * ours + offset - theirs).abs().mean(dim=-1), config.quantile)
+    plain = theirs - theirs.median(dim=0).values
+    contrast = quantile(plain.abs().mean(dim=-1), config.quantile)
     limit = max(config.least, config.max_share * contrast)
     plausible = bool(
         ((gain >= 1 / config.max_gain) & (gain <= config.max_gain)).all()
@@ -113,12 +129,17 @@ def compare(
     return Agreement(gain, offset, residual, limit, share, agrees, corrected)
 
 
+def quantile(values: Float[Tensor, "n"], share: float) -> float:
+    """The value below which `share` of all lie."""
+    return values.sort().values[int(share * (len(values) - 1))].item()
+
+
 def notes_on(found: Agreement, tried: int) -> tuple[str, ...]:
     """What a reader of the results should know of it."""
     if not found.agrees:
         seeds = "" if tried == 1 else f" (best of {tried} seeds)"
         if found.residual > found.limit:
-            reason = f"colours differ by {found.residual:.3f} in the median"
+            reason = f"colours differ by {found.residual:.3f}"
             limit = f"{found.limit:.3f} is the limit"
         else:
             worst = int(((found.gain - 1).abs() + found.offset.abs()).argmax())

@@ -66,9 +66,9 @@ def keep_near_holes(lift: Lift, near_holes: Bool[Tensor, "h w"]) -> Lift:
 
 @dataclass(frozen=True)
 class RefineConfig:
-    iterations: int = 30
+    iterations: int = 10
     """Steps of Adam; 0 leaves the opacities as they were lifted (the paper's ablation w/o MV)."""
-    learning_rate: float = 0.08
+    learning_rate: float = 0.24
     """Step of Adam, on what `parametrization` names."""
     parametrization: Literal["logit", "linear"] = "logit"
     """What Adam moves: the logit, as 3DGS stores it, or the opacity itself, clamped to [0, 1]."""

@@ -21,10 +21,17 @@ from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Re
 class RegistrationConfig:
     affine: AffineConfig = AffineConfig()
     """Settings of the coarse fit."""
-    iterations: int = 50
+    iterations: int = 20
     """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
-    learning_rate: float = 0.002
+    learning_rate: float = 0.008
     """Step of Adam, in the unit that `step` names."""
+    schedule: Literal["falling", "constant"] = "falling"
+    """Whether the step falls linearly to nothing, so that few iterations reach far and still end
+    close."""
+    beta1: float = 0.5
+    """Adam's memory of gradients. Its usual 0.9 remembers half of so short a run and overshoots."""
+    beta2: float = 0.9
+    """Adam's memory of their squares; usually 0.999."""
     step: Literal["relative", "literal"] = "relative"
     """`relative`: of each primitive's own distance, so that the unit of the scene does not
     matter; depth losses are then relative to the median context depth. `literal`: in scene units,
@@ -179,9 +186,14 @@ def register_along_rays(
     parameters = torch.zeros(
         (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )
-    optimizer = torch.optim.Adam([parameters], lr=config.learning_rate)
+    optimizer = torch.optim.Adam(
+        [parameters], lr=config.learning_rate, betas=(config.beta1, config.beta2)
+    )
     losses = []
-    for _ in track(range(config.iterations), "Registering"):
+    for iteration in track(range(config.iterations), "Registering"):
+        if config.schedule == "falling":
+            left = 1 - iteration / config.iterations
+            optimizer.param_groups[0]["lr"] = left * config.learning_rate
         moved = displace(coarse, parameters, reference.camera, config)
         loss = objective(moved, at_target, reference.camera, anchor, renderer)
         optimizer.zero_grad()

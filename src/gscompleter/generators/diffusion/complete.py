@@ -2,43 +2,45 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import torch
 
-from gscompleter.generators.diffusion.published import Source
+from gscompleter.generators.diffusion.published import IncompleteWeightsError, Source
 
 
-class IncompleteWeightsError(ValueError):
-    """Tensors are missing from the files of a model."""
-
-    def __init__(self, part: str, names: list[str]) -> None:
-        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-        super().__init__(f"its {part} lacks the tensor {names[0]}{more}")
-
-
-def text_encoders(source: Source, dtype: torch.dtype) -> dict[str, Any]:
-    """The parts of a pipeline that are models of transformers, by name.
+def language_models(source: Source, dtype: torch.dtype) -> dict[str, Any]:
+    """The parts of a pipeline that are models of transformers (encoders, checkers), by name.
 
     Raises:
         IncompleteWeightsError: where one lacks a tensor.
     """
     import transformers
-    from diffusers import DiffusionPipeline
+    from diffusers import DiffusionPipeline, pipelines
 
     parts = DiffusionPipeline.load_config(source.place, **source.arguments)
     models = {}
     for name, kind in parts.items():
-        if not isinstance(kind, (list, tuple)) or kind[0] != "transformers":
+        if not isinstance(kind, (list, tuple)) or kind[0] is None:
             continue
-        model = getattr(transformers, kind[1])
-        if issubclass(model, transformers.PreTrainedModel):
+        # Names that neither library knows any more are for diffusers to translate.
+        library = transformers if kind[0] == "transformers" else getattr(pipelines, kind[0], None)
+        model = getattr(library, kind[1], None)
+        if isinstance(model, type) and issubclass(model, transformers.PreTrainedModel):
             models[name] = loaded(model, source, name, dtype=dtype, subfolder=name)
     return models
 
 
-def loaded(kind: Any, source: Source, part: str, **arguments: Any) -> Any:
+def loaded(kind: Any, source: Source, part: str, unused: str = "^$", **arguments: Any) -> Any:
     """A model of transformers of the class `kind`.
+
+    Args:
+        kind: The class.
+        source: Where its files are.
+        part: What to call it in a sentence.
+        unused: Pattern of tensors that it has but never uses, and that may be missing.
+        arguments: For its `from_pretrained`.
 
     Raises:
         IncompleteWeightsError: where it lacks a tensor.
@@ -46,20 +48,30 @@ def loaded(kind: Any, source: Source, part: str, **arguments: Any) -> Any:
     model, told = kind.from_pretrained(
         source.place, output_loading_info=True, **{**source.arguments, **arguments}
     )
-    if told["missing_keys"]:
-        raise IncompleteWeightsError(part, sorted(told["missing_keys"]))
+    missing = sorted(name for name in told["missing_keys"] if not re.search(unused, name))
+    if missing:
+        raise IncompleteWeightsError(part, missing)
     return model
 
 
-def check_complete(pipeline: Any) -> None:
-    """See that the parts of `pipeline` that are models of diffusers lack no tensor.
+def check_complete(model: torch.nn.Module, part: str) -> None:
+    """See that a model of diffusers lacks no tensor.
+
+    Raises:
+        IncompleteWeightsError: where it does.
+    """
+    # diffusers gives no memory to what it did not find
+    missing = sorted(name for name, value in model.named_parameters() if value.is_meta)
+    if missing:
+        raise IncompleteWeightsError(part, missing)
+
+
+def check_parts(pipeline: Any) -> None:
+    """See that no model among the parts of a pipeline lacks a tensor.
 
     Raises:
         IncompleteWeightsError: where one does.
     """
     for part, model in pipeline.components.items():
         if isinstance(model, torch.nn.Module):
-            # diffusers gives no memory to what it did not find
-            missing = sorted(name for name, value in model.named_parameters() if value.is_meta)
-            if missing:
-                raise IncompleteWeightsError(part, missing)
+            check_complete(model, part)

@@ -18,14 +18,13 @@ from torch import Tensor
 from gscompleter.errors import InputError
 from gscompleter.generators import DiffusionSettings
 from gscompleter.generators.agreement import AgreementConfig, checked
-from gscompleter.generators.diffusion.complete import check_complete, text_encoders
+from gscompleter.generators.diffusion.complete import check_parts, language_models
 from gscompleter.generators.diffusion.kontext import resized
 from gscompleter.generators.diffusion.published import (
     Source,
     announce,
-    cannot_load,
     needs_diffusers,
-    silent,
+    reading,
     source_of,
 )
 from gscompleter.generators.warp_inpaint import background_first
@@ -181,11 +180,8 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
     source = source_of(path)
     announce([source])
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
-    try:
-        with silent([source]):
-            pipeline = inpainting(source, dtype)
-    except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
-        raise cannot_load(source, error) from error
+    with reading(source):
+        pipeline = inpainting(source, dtype)
     pipeline.set_progress_bar_config(disable=True)
     if offload and device != "cpu":
         pipeline.enable_model_cpu_offload(device=device)
@@ -199,9 +195,9 @@ def inpainting(source: Source, dtype: torch.dtype) -> Any:
     from diffusers import AutoPipelineForInpainting, DiffusionPipeline
 
     pipeline = DiffusionPipeline.from_pretrained(
-        source.place, dtype=dtype, **text_encoders(source, dtype), **source.arguments
+        source.place, dtype=dtype, **language_models(source, dtype), **source.arguments
     )
-    check_complete(pipeline)
+    check_parts(pipeline)
     if {"image", "mask_image"} <= set(inspect.signature(pipeline.__call__).parameters):
         return pipeline
     return AutoPipelineForInpainting.from_pipe(pipeline)

@@ -9,16 +9,15 @@ from typing import Any
 import torch
 
 from gscompleter.errors import InputError
-from gscompleter.generators.diffusion.complete import check_complete, text_encoders
+from gscompleter.generators.diffusion.complete import check_complete, check_parts, language_models
 from gscompleter.generators.diffusion.kontext import Kontext, Prompt
 from gscompleter.generators.diffusion.published import (
     KONTEXT,
     PE_FIELD,
     Source,
     announce,
-    cannot_load,
     needs_diffusers,
-    silent,
+    reading,
     source_of,
 )
 from gscompleter.generators.diffusion.rotary import HEADS, with_per_head_positions
@@ -48,12 +47,12 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
     base, transformer = sources(path)
     announce([base, transformer])
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
-    try:
-        with silent([base, transformer]):
-            prompt = encode_prompt(base, device, dtype)
-            pipeline = load_pipeline(base, transformer, dtype)
-    except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
-        raise cannot_load(base if path is None else transformer, error) from error
+    with reading(base):
+        prompt = encode_prompt(base, device, dtype)
+    with reading(transformer):
+        network = load_transformer(transformer, dtype)
+    with reading(base):
+        pipeline = load_pipeline(base, network, dtype)
     heads = pipeline.transformer.config.num_attention_heads
     if heads != HEADS:
         raise InputError(
@@ -99,7 +98,7 @@ def encode_prompt(base: Source, device: str, dtype: torch.dtype) -> Prompt:
         transformer=None,
         vae=None,
         dtype=dtype,
-        **text_encoders(base, dtype),
+        **language_models(base, dtype),
         **base.arguments,
     ).to(device)
     with torch.inference_mode():
@@ -107,16 +106,22 @@ def encode_prompt(base: Source, device: str, dtype: torch.dtype) -> Prompt:
     return Prompt(tokens.to(dtype), pooled.to(dtype))
 
 
-def load_pipeline(base: Source, transformer: Source, dtype: torch.dtype) -> Any:
-    """What denoises: transformer, VAE and scheduler."""
-    from diffusers import FluxKontextPipeline, FluxTransformer2DModel
+def load_transformer(source: Source, dtype: torch.dtype) -> Any:
+    """What denoises."""
+    from diffusers import FluxTransformer2DModel
 
-    network = FluxTransformer2DModel.from_pretrained(
-        transformer.place, dtype=dtype, **transformer.arguments
-    )
+    network = FluxTransformer2DModel.from_pretrained(source.place, dtype=dtype, **source.arguments)
+    check_complete(network, "transformer")
+    return network
+
+
+def load_pipeline(base: Source, network: Any, dtype: torch.dtype) -> Any:
+    """`network` with the VAE and the scheduler, and without what encodes prompts."""
+    from diffusers import FluxKontextPipeline
+
     unused = dict.fromkeys(("text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2"))
     pipeline = FluxKontextPipeline.from_pretrained(
         base.place, transformer=network, dtype=dtype, **unused, **base.arguments
     )
-    check_complete(pipeline)
+    check_parts(pipeline)
     return pipeline

@@ -32,6 +32,9 @@ from gscompleter.types import Camera, Render, SceneContext, View
 STEPS = 4
 """Evaluations of the transformer in the paper. The authors' own demonstration takes 28."""
 
+AT_ONCE = 4
+"""Images that are denoised together."""
+
 
 @dataclass(frozen=True)
 class Condition:
@@ -63,7 +66,7 @@ class PEField:
     """What positions of the target are rounded to: bfloat16 as in the authors' run."""
     agreement: AgreementConfig = AgreementConfig()
     """How the image is compared with what the photographs show."""
-    at_once: int = 4
+    at_once: int = AT_ONCE
     """Most images that are denoised together."""
 
     def __call__(
@@ -140,8 +143,10 @@ def preview(
 ) -> Float[Tensor, "h w 3"]:
     """What the positions say: the pixels of the photograph where `target` sees them, over black.
 
-    The model is not shown this picture. It is to be looked at: where it is torn or displaced, the
-    depth or the cameras are wrong, and the model is misled.
+    The model is not shown this picture. It is to be looked at: where it is displaced, or torn
+    within a surface, the depth or the cameras are wrong, and the model is misled. Gaps beside what
+    stands in front are right, and so is the smear at the border: there lies all that the target
+    does not see.
 
     Raises:
         InputError: where the scene has no depth at the nearest photograph.
@@ -178,11 +183,12 @@ def load_pe_field(
     Raises:
         InputError: where packages or weights are missing.
     """
-    depth = source_depth_named(settings.depth or "context", device)
+    depth = source_depth_named("context" if settings.depth is None else settings.depth, device)
     return PEField(
         load_kontext(settings.path, device, settings.offload),
         seed,
-        settings.steps or STEPS,
+        STEPS if settings.steps is None else settings.steps,
         depth=depth,
         agreement=AgreementConfig(retries=settings.retries),
+        at_once=AT_ONCE if settings.at_once is None else settings.at_once,
     )

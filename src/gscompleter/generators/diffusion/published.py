@@ -83,8 +83,18 @@ LICENCES = {
 """What weights of a family are usually under, by a part of their id."""
 
 
-def source_of(path: str) -> Source:
+class IncompleteWeightsError(ValueError):
+    """Tensors are missing from the files of a model."""
+
+    def __init__(self, part: str, names: list[str]) -> None:
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        super().__init__(f"its {part} lacks the tensor {names[0]}{more}")
+
+
+def source_of(path: str, library: str = "diffusers") -> Source:
     """The folder or repository that a user names: PATH, USER/NAME, or USER/NAME@COMMIT.
+
+    `library` is what saved it, for the sentence.
 
     Raises:
         InputError: where it is neither a folder nor the id of a repository.
@@ -95,7 +105,7 @@ def source_of(path: str) -> Source:
     if name.count("/") != 1 or name.startswith((".", "/", "~")) or name.endswith("/"):
         raise InputError(
             f"There is no folder {path}, and it is no repository of the Hugging Face hub either; "
-            "give a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT."
+            f"give a folder that {library} saved, or USER/NAME or USER/NAME@COMMIT."
         )
     usual = next((terms for part, terms in LICENCES.items() if part in name.lower()), None)
     terms = "the licence that its page states" + (f" (usually {usual})" if usual else "")
@@ -104,9 +114,11 @@ def source_of(path: str) -> Source:
 
 def announce(sources: list[Source]) -> None:
     """Say on stderr, before anything is downloaded, what is fetched and under which terms."""
+    seen = set()
     for source in sources:
-        if source.is_local:
+        if source.is_local or (source.place, source.revision) in seen:
             continue
+        seen.add((source.place, source.revision))
         page = f"https://huggingface.co/{source.place}"
         pinned = (
             f"at commit {source.revision}"
@@ -131,7 +143,25 @@ def needs_diffusers(name: str) -> None:
 
 
 @contextmanager
-def silent(sources: list[Source]) -> Iterator[None]:
+def reading(source: Source, option: str = "--generator-path") -> Iterator[None]:
+    """While the files of `source` are read: nothing is said, and what fails becomes a sentence.
+
+    `option` is what on the command line names a folder in its place.
+
+    Raises:
+        InputError: where the files cannot be had, or are not what they should be.
+    """
+    try:
+        with silent(source.is_local):
+            yield
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, ImportError, AttributeError, RuntimeError) as error:
+        raise cannot_load(source, error, option) from error
+
+
+@contextmanager
+def silent(local: bool) -> Iterator[None]:
     """Nothing of diffusers and transformers but errors, and bars where something is downloaded.
 
     What they would warn of is seen to (`complete.py`), or asks for torchvision without need.
@@ -139,7 +169,6 @@ def silent(sources: list[Source]) -> Iterator[None]:
     from diffusers.utils import logging as of_diffusers
     from transformers.utils import logging as of_transformers
 
-    local = all(one.is_local for one in sources)
     logs = (of_diffusers, of_transformers)
     levels = [log.get_verbosity() for log in logs]
     bars = [log for log in logs if local and log.is_progress_bar_enabled()]
@@ -156,15 +185,19 @@ def silent(sources: list[Source]) -> Iterator[None]:
             log.enable_progress_bar()
 
 
-def cannot_load(source: Source, error: Exception) -> InputError:
+def cannot_load(source: Source, error: Exception, option: str) -> InputError:
     """The sentence for a folder or repository that did not load."""
     reason = " ".join(str(error).split())[:400]
-    way_out = (
-        "see that it is complete, as `save_pretrained` of diffusers writes it"
-        if source.is_local
-        else f"see that you accepted its terms at https://huggingface.co/{source.place} and are "
-        "logged in, or give a folder by --generator-path"
-    )
+    page = f"https://huggingface.co/{source.place}"
+    if source.is_local:
+        way_out = "see that it is complete, as `save_pretrained` writes it"
+    elif isinstance(error, IncompleteWeightsError):
+        way_out = f"see {page} for how it is loaded, or give a complete folder by {option}"
+    else:
+        way_out = (
+            f"see that you accepted its terms at {page} and are logged in, or give a folder by "
+            f"{option}"
+        )
     return InputError(
         f"Could not load {source.place} ({type(error).__name__}: {reason.rstrip('.')}); {way_out}."
     )

@@ -14,9 +14,8 @@ from gscompleter.errors import InputError
 from gscompleter.generators.diffusion.complete import loaded
 from gscompleter.generators.diffusion.published import (
     announce,
-    cannot_load,
     needs_diffusers,
-    silent,
+    reading,
     source_of,
 )
 from gscompleter.generators.robust import robust_affine
@@ -25,6 +24,11 @@ from gscompleter.types import Render, View
 
 MONOCULAR = "depth-anything/Depth-Anything-V2-Small-hf"
 """A published model. The authors of PE-Field took MoGe-2, which transformers does not have."""
+METRIC = {"depth_anything": False, "dpt": False, "glpn": True}
+"""Kinds of networks, and whether they give depth rather than its inverse up to scale and shift. The
+configuration of a network may say otherwise."""
+NEVER_USED = r"fusion_stage\.layers\.0\.residual_layer1\."
+"""Of DPT's first fusion layer, which has nothing to fuse. Some published files lack them."""
 MIN_ALPHA = 0.5
 """Opacity of the scene from which a pixel has a depth."""
 
@@ -93,9 +97,9 @@ class MonocularDepth:
             answer = self.network(**inputs)
         found = self.processor.post_process_depth_estimation(answer, target_sizes=[size])
         guess = found[0]["predicted_depth"].float().clone().to(render.depth.device)
-        if getattr(self.network.config, "depth_estimation_type", "relative") == "metric":
-            return rescaled(guess, render)
-        return from_disparity(guess, render)
+        told = getattr(self.network.config, "depth_estimation_type", None)
+        metric = METRIC[self.network.config.model_type] if told is None else told == "metric"
+        return rescaled(guess, render) if metric else from_disparity(guess, render)
 
 
 def rescaled(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
@@ -148,14 +152,17 @@ def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth
         InputError: where packages are missing or the model cannot be had.
     """
     needs_diffusers("pe-field")
-    source = source_of(path)
+    source = source_of(path, "transformers")
     announce([source])
-    try:
+    with reading(source, "--generator-depth"):
         from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
-        with silent([source]):
-            network = loaded(AutoModelForDepthEstimation, source, "network")
-            processor = AutoImageProcessor.from_pretrained(source.place, **source.arguments)
-    except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
-        raise cannot_load(source, error) from error
+        network = loaded(AutoModelForDepthEstimation, source, "network", unused=NEVER_USED)
+        processor = AutoImageProcessor.from_pretrained(source.place, **source.arguments)
+    kind = network.config.model_type
+    if kind not in METRIC:
+        raise InputError(
+            f"The depth network of {path} is a {kind}, of which it is not known whether it gives "
+            f"depth or its inverse; choose one of {', '.join(METRIC)}."
+        )
     return MonocularDepth(network.eval().to(device), processor, device)
