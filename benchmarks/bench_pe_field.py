@@ -22,10 +22,12 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.generators.diffusion.kontext import nearest_size
+from gscompleter.generators.diffusion.placing import precision_on
 from gscompleter.generators.diffusion.position_ids import target_ids
+from gscompleter.generators.diffusion.published import PE_FIELD_TRANSFORMER
 from gscompleter.generators.diffusion.rotary import with_per_head_positions
 
-BLOCKS = (19, 38)
+BLOCKS = (PE_FIELD_TRANSFORMER["num_layers"], PE_FIELD_TRANSFORMER["num_single_layers"])
 """Double and single blocks of the published transformer."""
 TOKEN, TEXT = 16, 512
 """Pixels along a side of a token; tokens of the prompt."""
@@ -67,17 +69,9 @@ def transformer(blocks: tuple[int, int], device: str) -> Any:
 
     with torch.device("meta"):
         model = FluxTransformer2DModel(
-            in_channels=64,
-            num_layers=blocks[0],
-            num_single_layers=blocks[1],
-            attention_head_dim=128,
-            num_attention_heads=24,
-            joint_attention_dim=4096,
-            pooled_projection_dim=768,
-            guidance_embeds=True,
-            axes_dims_rope=(16, 56, 56),
+            **{**PE_FIELD_TRANSFORMER, "num_layers": blocks[0], "num_single_layers": blocks[1]}
         )
-    model = model.to(torch.float32 if device == "cpu" else torch.bfloat16).to_empty(device=device)
+    model = model.to(precision_on(device)).to_empty(device=device)
     torch.manual_seed(0)
     with torch.no_grad():
         for parameter in model.parameters():

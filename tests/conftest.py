@@ -12,7 +12,7 @@ from jaxtyping import install_import_hook
 # All of the package but `gscompleter.kernels`, whose functions numba compiles.
 CHECKED = ["types", "geometry", "io", "completer", "stages", "render", "reconstructors"]
 CHECKED += ["generators", "evaluation", "config", "interpolation", "report", "run", "demo"]
-CHECKED += ["weights"]
+CHECKED += ["weights", "masks"]
 install_import_hook([f"gscompleter.{name}" for name in CHECKED], "beartype.beartype")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"

@@ -6,12 +6,16 @@ texture that is a fixed function of the world point, so that all views agree on 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.io.image import write_image
+from gscompleter.io.scene import write_cameras
 from gscompleter.types import Camera, Gaussians, View, observed, sh_from_rgb
 
 
@@ -84,6 +88,16 @@ def view_of(room: Room, camera: Camera, frame: int | None = None) -> View:
     """The photograph `camera` takes of the room, with its true depth."""
     image, depth = cast(room, camera)
     return View(image, camera, frame, depth)
+
+
+def photographed(folder: Path, cameras: Sequence[Camera], room: Room = Room()) -> Path:
+    """`folder` as a scene: a photograph of the room by each camera, and a transforms.json."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"{number}.png" for number in range(len(cameras))]
+    for name, camera in zip(names, cameras, strict=True):
+        write_image(folder / name, view_of(room, camera).image)
+    write_cameras(folder / "transforms.json", cameras, names)
+    return folder
 
 
 def gaussians_of(view: View, depth: Float[Tensor, "h w"] | None = None) -> Gaussians:

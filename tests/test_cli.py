@@ -16,9 +16,8 @@ import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.io.image import write_image
 from gscompleter.io.scene import write_cameras
-from scenes import Room, camera_at, view_of
+from scenes import camera_at, photographed
 
 SIZE = 64
 
@@ -28,11 +27,7 @@ def scene(tmp_path_factory) -> Path:
     """A synthetic room photographed from three places; frame 2 sees what 0 and 1 do not."""
     folder = tmp_path_factory.mktemp("room")
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
-    names = [f"{i}.png" for i in range(3)]
-    for name, camera in zip(names, cameras, strict=True):
-        write_image(folder / name, view_of(Room(), camera).image)
-    write_cameras(folder / "transforms.json", cameras, names)
-    return folder
+    return photographed(folder, cameras)
 
 
 def complete(scene, out, *more, context=(0, 1), target=(2,)) -> list:

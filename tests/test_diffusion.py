@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from dataclasses import replace
 
 import pytest
@@ -23,7 +22,6 @@ from safetensors.torch import load_file, save_file
 import tiny_diffusion
 from command import run
 from gscompleter import InputError, load_generator, load_renderer
-from gscompleter.cli import main
 from gscompleter.generators import DiffusionSettings
 from gscompleter.generators.agreement import AgreementConfig
 from gscompleter.generators.diffusion.inpaint import (
@@ -35,10 +33,8 @@ from gscompleter.generators.diffusion.kontext import SIZES, nearest_size
 from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
 from gscompleter.generators.diffusion.pe_field import PEField, grouped
 from gscompleter.generators.diffusion.source_depth import MonocularDepth, context_depth
-from gscompleter.io.image import write_image
-from gscompleter.io.scene import write_cameras
 from gscompleter.types import Gaussians, SceneContext, merge
-from scenes import Room, camera_at, gaussians_of, view_of
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
 from test_generators import TARGET, known_room
 from test_source_depth import tiny_model
 
@@ -288,15 +284,10 @@ def test_weights_that_lack_a_tensor_are_refused_and_never_made_up(
 def completed(tmp_path, monkeypatch, *model) -> dict:
     """The summary of a completion of the room by the command line."""
     scene, out = tmp_path / "scene", tmp_path / "out"
-    scene.mkdir()
-    cameras = [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)]
-    for number, camera in enumerate(cameras):
-        write_image(scene / f"{number}.png", view_of(Room(), camera).image)
-    write_cameras(scene / "transforms.json", cameras, ["0.png", "1.png", "2.png"])
-    command = ["gscompleter", "complete", scene, "--context", 0, 1, "--target", 2]
+    photographed(scene, [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)])
+    command = ["complete", scene, "--context", 0, 1, "--target", 2]
     command += ["--near", 0.5, "--far", 20, "--device", "cpu", "--out", out, "--quiet", *model]
-    monkeypatch.setattr(sys, "argv", [str(word) for word in command])
-    main()
+    assert run(monkeypatch, *command) == 0
     assert (out / "completed.ply").is_file()
     assert (out / "images" / "target1_reference.png").is_file()
     return json.loads((out / "summary.json").read_text())
@@ -321,12 +312,7 @@ def test_a_smoke_test_of_a_whole_completion_with_random_weights(
 
 
 def test_a_smoke_test_of_an_evaluation_with_random_weights(inpaint_folder, tmp_path, monkeypatch):
-    cameras = [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)]
-    names = [f"{number}.png" for number in range(3)]
-    (tmp_path / "room").mkdir()
-    for name, camera in zip(names, cameras, strict=True):
-        write_image(tmp_path / "room" / name, view_of(Room(), camera).image)
-    write_cameras(tmp_path / "room" / "transforms.json", cameras, names)
+    photographed(tmp_path / "room", [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)])
     case = {"scene": "room", "context": [0, 1], "target": 2, "near": 0.5, "far": 20.0}
     content = {"resolution": [SIZE, SIZE], "cases": [case]}
     (tmp_path / "cases.json").write_text(json.dumps(content))
@@ -348,11 +334,10 @@ def test_a_smoke_test_on_photographs_with_random_weights(
     if not scene.is_dir():
         pytest.skip(f"needs the photographs in {scene}")
     folder = kontext_folder if name == "pe-field" else inpaint_folder
-    command = ["gscompleter", "complete", scene, "--context", 0, 4, "--target", 12]
+    command = ["complete", scene, "--context", 0, 4, "--target", 12]
     command += ["--resolution", 96, 128, "--near", 1, "--far", 100, "--device", "cpu"]
     command += ["--generator", name, "--generator-path", folder, "--out", out, "--quiet"]
-    monkeypatch.setattr(sys, "argv", [str(word) for word in command])
-    main()
+    assert run(monkeypatch, *command) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["targets"][0]["hole_fraction"] > 0
     assert (out / "images" / "target1_reference.png").is_file()

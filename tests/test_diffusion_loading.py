@@ -16,9 +16,7 @@ from gscompleter.generators.diffusion.published import (
     cannot_load,
     source_of,
 )
-from gscompleter.io.image import write_image
-from gscompleter.io.scene import write_cameras
-from scenes import Room, camera_at, view_of
+from scenes import camera_at, photographed
 
 
 @pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
@@ -68,10 +66,7 @@ def test_values_that_mean_nothing_are_refused(key, value, message):
 
 def test_the_command_refuses_them_too_and_writes_nothing(tmp_path, capsys, monkeypatch):
     cameras = [camera_at(x, size=32) for x in (-0.3, 0.1, 0.6)]
-    names = [f"{number}.png" for number in range(3)]
-    for name, camera in zip(names, cameras, strict=True):
-        write_image(tmp_path / name, view_of(Room(), camera).image)
-    write_cameras(tmp_path / "transforms.json", cameras, names)
+    photographed(tmp_path, cameras)
     words = ["complete", tmp_path, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]
     assert run(monkeypatch, *words, "--generator-steps", 8) == 2
     assert "'warp-inpaint' knows no --generator-steps (8)" in capsys.readouterr().err

@@ -22,8 +22,9 @@ from gscompleter.evaluation.geometry_metrics import (
     f_score,
 )
 from gscompleter.evaluation.metrics import MAX_PSNR, masked_psnr, psnr, ssim
+from gscompleter.masks import dilate
 from gscompleter.render import load_renderer
-from gscompleter.stages.integration import dilate, hole_mask, keep_in_holes
+from gscompleter.stages.integration import hole_mask, keep_in_holes
 from gscompleter.types import Camera, DepthAffine, Gaussians, TargetCompletion
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 

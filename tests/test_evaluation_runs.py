@@ -33,9 +33,8 @@ from gscompleter.evaluation.runs import RunConfig, Tally, claim, evaluate
 from gscompleter.evaluation.store import read_json
 from gscompleter.evaluation.tables import gap_of, summarize, tables
 from gscompleter.generators import DiffusionSettings
-from gscompleter.io.image import read_image, write_image
-from gscompleter.io.scene import write_cameras
-from scenes import Room, camera_at, view_of
+from gscompleter.io.image import read_image
+from scenes import Room, camera_at, photographed
 
 SIZE = 32
 METHOD_NAMES = ("context", "full", "no-rc", "densify-100")
@@ -50,12 +49,8 @@ def scenes(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("rooms")
     places = ((-0.3, 0), (0.1, 0), (0.7, 12), (0.8, 14))
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in places]
-    names = [f"{i}.png" for i in range(len(cameras))]
     for scene, room in ROOMS.items():
-        (root / scene).mkdir()
-        for name, camera in zip(names, cameras, strict=True):
-            write_image(root / scene / name, view_of(room, camera).image)
-        write_cameras(root / scene / "transforms.json", cameras, names)
+        photographed(root / scene, cameras, room)
     rows = [
         {
             "scene": scene,

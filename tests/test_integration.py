@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gscompleter.masks import dilate
 from gscompleter.render import load_renderer
 from gscompleter.stages.integration import (
     HarmConfig,
     HoleConfig,
     RefineConfig,
-    dilate,
     do_no_harm,
     error_with_loss,
     hole_mask,

@@ -23,6 +23,7 @@ from gscompleter.generators.diffusion.position_ids import (
     source_ids,
     target_ids,
 )
+from gscompleter.generators.diffusion.published import PE_FIELD_TRANSFORMER
 from gscompleter.generators.diffusion.rotary import (
     TRIPLE_OF_HEAD,
     PerHeadRotary,
@@ -260,18 +261,7 @@ def test_every_published_tensor_fits_the_transformer_of_diffusers():
     diffusers = pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
     published = json.loads((STORED / "keys.json").read_text())
     with torch.device("meta"):
-        transformer = diffusers.FluxTransformer2DModel(
-            patch_size=1,
-            in_channels=64,
-            num_layers=19,
-            num_single_layers=38,
-            attention_head_dim=128,
-            num_attention_heads=24,
-            joint_attention_dim=4096,
-            pooled_projection_dim=768,
-            guidance_embeds=True,
-            axes_dims_rope=(16, 56, 56),
-        )
+        transformer = diffusers.FluxTransformer2DModel(**PE_FIELD_TRANSFORMER)
     with_per_head_positions(transformer)
     shapes = {key: list(value.shape) for key, value in transformer.state_dict().items()}
     assert len(shapes) == 1160

@@ -9,13 +9,11 @@ import torch
 
 from command import run
 from gscompleter import InputError, load_reconstructor
-from gscompleter.io.image import write_image
-from gscompleter.io.scene import write_cameras
 from gscompleter.reconstructors import RECONSTRUCTORS
 from gscompleter.reconstructors.feed_forward import FeedForward, MVSplat
 from gscompleter.reconstructors.feed_forward.build import build, network_of
 from gscompleter.weights import PUBLISHED
-from scenes import Room, camera_at, view_of
+from scenes import Room, camera_at, photographed, view_of
 
 SIZE = 64
 VIEWS = [view_of(Room(), camera_at(x, size=SIZE)) for x in (-0.3, 0.1)]
@@ -82,12 +80,8 @@ def test_without_a_file_it_is_said_where_to_get_it(monkeypatch, tmp_path):
 
 def test_a_completion_with_random_weights_runs_end_to_end(mvsplat_file, tmp_path, monkeypatch):
     """A smoke test of frames, shapes and stages: random weights reconstruct nothing."""
-    scene = tmp_path / "scene"
-    scene.mkdir()
     cameras = [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)]
-    for number, camera in enumerate(cameras):
-        write_image(scene / f"{number}.png", view_of(Room(), camera).image)
-    write_cameras(scene / "transforms.json", cameras, ["0.png", "1.png", "2.png"])
+    scene = photographed(tmp_path / "scene", cameras)
     arguments = ["complete", scene, "--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20]
     model = ["--reconstructor", "mvsplat-re10k", "--weights", mvsplat_file, "--device", "cpu"]
     out = tmp_path / "out"

@@ -35,11 +35,10 @@ from gscompleter.evaluation.sequences import (
     start_here,
 )
 from gscompleter.evaluation.store import read_json
-from gscompleter.io.image import read_pixels, write_image
-from gscompleter.io.scene import write_cameras
+from gscompleter.io.image import read_pixels
 from gscompleter.stages.registration import slide
 from gscompleter.types import View
-from scenes import Room, camera_at, gaussians_of, view_of
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 SIZE = 32
 ROOM = Room(boxes=(((-8.0, -1.5, -1.0), (8.0, 1.5, 5.0)),))
@@ -391,11 +390,7 @@ def test_without_sequences_there_are_no_tables(tmp_path):
 
 def test_the_command_runs_end_to_end(tmp_path, monkeypatch, capsys):
     for scene, count in (("long", 4), ("short", 2)):
-        names = [f"{i}.png" for i in range(count)]
-        (tmp_path / scene).mkdir()
-        for name, camera in zip(names, CAMERAS, strict=False):
-            write_image(tmp_path / scene / name, view_of(ROOM, camera).image)
-        write_cameras(tmp_path / scene / "transforms.json", CAMERAS[:count], names)
+        photographed(tmp_path / scene, CAMERAS[:count], ROOM)
     out = tmp_path / "out"
     by_steps = ["--protocol", "sequence-1", "--generator", "oracle", "--device", "cpu"]
     arguments = ["evaluate", tmp_path, "--out", out, *by_steps, "--methods"]

@@ -15,6 +15,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.generators import BatchGenerator, Generator, load_generator
 from gscompleter.geometry import same_camera, widened
+from gscompleter.masks import dilate
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_range
 from gscompleter.render import FrozenView, Renderer, load_renderer
@@ -28,7 +29,6 @@ from gscompleter.stages.anchor import (
 from gscompleter.stages.context import depth_range_of_scene, init_context
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
-    dilate,
     do_no_harm,
     error_with_loss,
     hole_mask,
@@ -136,9 +136,8 @@ class GSCompleter:
         None for a target at which there is nothing to complete, and for all where the generator
         takes one at a time: it then sees what was completed for the targets before.
         """
-        images: list[Synthesized | None] = [None] * len(targets)
         if len(targets) < 2 or not isinstance(self.generator, BatchGenerator):
-            return images
+            return [None] * len(targets)
         asked: dict[int, tuple[Camera, SceneContext]] = {}
         with clock("context"):
             renders = tuple(self.renderer.render(scene, view.camera) for view in views)
@@ -149,10 +148,9 @@ class GSCompleter:
                 if nothing_to_do(target, views, hole_mask(inner, self.config.holes)) is None:
                     asked[i] = (wide, SceneContext(tuple(views), renders, at_target))
         with clock("generate"):
-            found = synthesize_all(self.generator, list(asked.values()))
-        for i, image in zip(asked, found, strict=True):
-            images[i] = image
-        return images
+            found = synthesize_all(self.generator, list(asked.values())) if asked else []
+        images = dict(zip(asked, found, strict=True))
+        return [images.get(i) for i in range(len(targets))]
 
     def complete_target(
         self,

@@ -31,10 +31,10 @@ from gscompleter.evaluation.store import (
     OutputError,
     Saved,
     case_folder,
+    keep_outcome,
     load_outcome,
     load_start,
     read_json,
-    save_outcome,
     save_start,
     slug,
     write_json,
@@ -253,8 +253,7 @@ class Bench:
             made = attempt(lambda: measured(method, start, parts))
             if isinstance(made, str):
                 return self._row_of(method, error=made)
-            save_outcome(path, made)
-            saved = load_outcome(path, start) or made
+            saved = keep_outcome(path, made, start)
         row = attempt(lambda: self._scored(method, saved, start, parts, truth))
         return self._row_of(method, error=row) if isinstance(row, str) else row
 
@@ -409,7 +408,7 @@ def claim(out: Path, config: RunConfig) -> None:
     wanted = json.loads(json.dumps({"version": VERSION, **deciding(config)}))
     path = out / RUN
     if path.exists():
-        found = read_json(path)
+        found = read_json(path, "name another folder")
         keys = (
             key for key in wanted if not isinstance(found, dict) or found.get(key) != wanted[key]
         )

@@ -39,8 +39,8 @@ from gscompleter.evaluation.runs import (
 from gscompleter.evaluation.scores import Outcome, ranged_truth
 from gscompleter.evaluation.store import (
     Saved,
+    keep_outcome,
     load_outcome,
-    save_outcome,
     sequence_folder,
     slug,
 )
@@ -158,8 +158,7 @@ def outcome_of(method: str, start: Start, number: int, parts: Parts, path: Path 
     if saved is None:
         saved = Saved(numbered(METHODS[method](start, parts), number), None)
         if path is not None:
-            save_outcome(path, saved)
-            saved = load_outcome(path, start) or saved  # as a sequence that was stopped reads it
+            saved = keep_outcome(path, saved, start)
     return saved.outcome
 
 

@@ -128,6 +128,16 @@ def save_outcome(path: Path, saved: Saved) -> None:
     )
 
 
+def keep_outcome(path: Path, saved: Saved, start: Start) -> Saved:
+    """Save it and read it back, so that a run that was stopped goes on with the very same tensors.
+
+    Raises:
+        OutputError: where it cannot be written.
+    """
+    save_outcome(path, saved)
+    return load_outcome(path, start) or saved
+
+
 def load_outcome(path: Path, start: Start) -> Saved | None:
     """What `save_outcome` wrote; None where there is nothing whole."""
     arrays = load_arrays(path)
@@ -193,13 +203,12 @@ def write_json(path: Path, content: Any) -> None:
         raise OutputError(str(error)) from error
 
 
-def read_json(path: Path) -> Any:
-    """The content of a file of results.
+def read_json(path: Path, advice: str = "delete it and run again") -> Any:
+    """The content of a file of results; `advice` is what to do where it is no JSON.
 
     Raises:
         InputError: where it cannot be read.
     """
-    advice = "name another folder" if path.name == RUN else "delete it and run again"
     return json_file.read_json(path, advice)
 
 

@@ -131,7 +131,7 @@ def compare(
 
 def quantile(values: Float[Tensor, "n"], share: float) -> float:
     """The value below which `share` of all lie."""
-    return values.sort().values[int(share * (len(values) - 1))].item()
+    return values.kthvalue(1 + int(share * (len(values) - 1))).values.item()
 
 
 def notes_on(found: Agreement, tried: int) -> tuple[str, ...]:

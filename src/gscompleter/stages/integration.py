@@ -33,14 +33,6 @@ def hole_mask(render: Render, config: HoleConfig = HoleConfig()) -> Bool[Tensor,
     return render.alpha < config.max_alpha
 
 
-def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
-    """`mask` grown by `radius` pixels on every side (max-pool of 2 radius + 1)."""
-    pooled = torch.nn.functional.max_pool2d(
-        mask[None, None].float(), 2 * radius + 1, stride=1, padding=radius
-    )
-    return pooled[0, 0] > 0
-
-
 def keep_in_holes(
     registered: Gaussians,
     pixel_index: Int[Tensor, "n"] | None,

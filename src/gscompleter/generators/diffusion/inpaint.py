@@ -20,6 +20,7 @@ from gscompleter.generators import DiffusionSettings
 from gscompleter.generators.agreement import AgreementConfig, checked
 from gscompleter.generators.diffusion.complete import check_parts, language_models
 from gscompleter.generators.diffusion.kontext import resized
+from gscompleter.generators.diffusion.placing import place, precision_on
 from gscompleter.generators.diffusion.published import (
     Source,
     announce,
@@ -29,6 +30,7 @@ from gscompleter.generators.diffusion.published import (
 )
 from gscompleter.generators.warp_inpaint import background_first
 from gscompleter.generators.warp_inpaint.warp import Warped, warp_photographs, with_unexplained
+from gscompleter.masks import dilate
 from gscompleter.types import Camera, SceneContext, View
 
 PROMPT = "a photograph"
@@ -111,7 +113,7 @@ class DiffusersInpaint:
     ) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]:
         """The image, and what to know of it."""
         observed = completed_warp(nearest, target, context)
-        hole = widened_mask(~observed.known, self.margin)
+        hole = dilate(~observed.known, self.margin)
 
         def paint(seed: int) -> Float[Tensor, "h w 3"]:
             return self.painter.paint(observed.image, hole, self.prompt, seed, self.steps)
@@ -134,12 +136,6 @@ def completed_warp(nearest: View, target: Camera, context: SceneContext) -> Warp
     tone = tone.to(warped.image.device)
     image = torch.where(warped.known[..., None], warped.image, tone)
     return replace(warped, image=image.clamp(0, 1))
-
-
-def widened_mask(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
-    """`mask` and all within a square of `radius` pixels around it."""
-    size = 2 * radius + 1
-    return torch.nn.functional.max_pool2d(mask[None].float(), size, 1, radius)[0] > 0
 
 
 def load_diffusers_inpaint(
@@ -179,14 +175,9 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
         )
     source = source_of(path)
     announce([source])
-    dtype = torch.float32 if device == "cpu" else torch.bfloat16
     with reading(source):
-        pipeline = inpainting(source, dtype)
-    pipeline.set_progress_bar_config(disable=True)
-    if offload and device != "cpu":
-        pipeline.enable_model_cpu_offload(device=device)
-    else:
-        pipeline.to(device)
+        pipeline = inpainting(source, precision_on(device))
+    place(pipeline, device, offload)
     return Painter(pipeline, *size_rules(pipeline))
 
 

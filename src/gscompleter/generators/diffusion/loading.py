@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from gscompleter.errors import InputError
 from gscompleter.generators.diffusion.complete import check_complete, check_parts, language_models
 from gscompleter.generators.diffusion.kontext import Kontext, Prompt
+from gscompleter.generators.diffusion.placing import place, precision_on
 from gscompleter.generators.diffusion.published import (
     KONTEXT,
     PE_FIELD,
@@ -46,7 +48,7 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
     needs_diffusers("pe-field")
     base, transformer = sources(path)
     announce([base, transformer])
-    dtype = torch.float32 if device == "cpu" else torch.bfloat16
+    dtype = precision_on(device)
     with reading(base):
         prompt = encode_prompt(base, device, dtype)
     with reading(transformer):
@@ -60,11 +62,7 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
             f"{HEADS}; give that of PE-Field."
         )
     with_per_head_positions(pipeline.transformer)
-    pipeline.set_progress_bar_config(disable=True)
-    if offload and device != "cpu":
-        pipeline.enable_model_cpu_offload(device=device)
-    else:
-        pipeline.to(device)
+    place(pipeline, device, offload)
     return Kontext(pipeline, prompt, device, dtype)
 
 
@@ -74,13 +72,7 @@ def sources(path: str | None) -> tuple[Source, Source]:
         return KONTEXT, PE_FIELD
     given = source_of(path)
     if not given.is_local or (Path(given.place) / "model_index.json").is_file():
-        inside = Source(
-            place=given.place,
-            revision=given.revision,
-            subfolder="transformer",
-            terms=given.terms,
-        )
-        return given, inside
+        return given, replace(given, subfolder="transformer")
     if (Path(given.place) / "config.json").is_file():
         return KONTEXT, given
     raise InputError(

@@ -74,6 +74,20 @@ PE_FIELD = Source(
 )
 """The authors' transformer: 1160 tensors, 23.8 GB in bfloat16."""
 
+PE_FIELD_TRANSFORMER = {
+    "patch_size": 1,
+    "in_channels": 64,
+    "num_layers": 19,
+    "num_single_layers": 38,
+    "attention_head_dim": 128,
+    "num_attention_heads": 24,
+    "joint_attention_dim": 4096,
+    "pooled_projection_dim": 768,
+    "guidance_embeds": True,
+    "axes_dims_rope": (16, 56, 56),
+}
+"""Its configuration, in the words of diffusers."""
+
 LICENCES = {
     "flux": "the FLUX.1 [dev] Non-Commercial License for the [dev] models, and a gated page",
     "stable-diffusion-xl": "CreativeML Open RAIL++-M for Stability's own",
