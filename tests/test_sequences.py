@@ -13,7 +13,7 @@ import torch
 from command import run
 from gscompleter import InputError
 from gscompleter.baselines.reggs import RegGSConfig
-from gscompleter.evaluation import methods, sequences
+from gscompleter.evaluation import methods, sequences, store
 from gscompleter.evaluation.clips import Skipped
 from gscompleter.evaluation.methods import Parts, Start, start_of
 from gscompleter.evaluation.protocols import (
@@ -262,7 +262,7 @@ def test_the_drift_is_that_between_the_largest_and_the_smallest_scale():
 
 def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    original = sequences.save_outcome
+    original = store.save_outcome
 
     def stopped(path, saved):
         original(path, saved)
@@ -270,7 +270,7 @@ def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path
             path.write_bytes(path.read_bytes()[:100])
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(sequences, "save_outcome", stopped)
+    monkeypatch.setattr(store, "save_outcome", stopped)
     method = "full"
     with pytest.raises(KeyboardInterrupt):
         evaluate_sequences([SHORT], METHOD_NAMES, out, CONFIG)
@@ -284,7 +284,7 @@ def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path
         saved.append(f"{path.parent.name} {path.stem}")
         original(path, outcome)
 
-    monkeypatch.setattr(sequences, "save_outcome", recorded)
+    monkeypatch.setattr(store, "save_outcome", recorded)
     assert evaluate_sequences([SHORT], METHOD_NAMES, out, CONFIG) == Tally(1, 0, 2)
     assert saved == ["reggs step-002"]
     same_results(out, finished)
