@@ -24,14 +24,14 @@ from jaxtyping import Float
 from skimage.restoration import inpaint_biharmonic
 from torch import Tensor
 
-from gscompleter.evaluation.cases import Case, read_cases
+from gscompleter.data.cases import Case, read_cases
+from gscompleter.generators.warp import Warped, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint
-from gscompleter.generators.warp_inpaint.warp import Warped, warp_photographs
 from gscompleter.interpolation import push_pull
 from gscompleter.io.image import write_image
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.report import strip
+from gscompleter.reports.completion import strip
 from gscompleter.stages.anchor import nearest_view
 from gscompleter.types import SceneContext, View
 

@@ -21,10 +21,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.demo import write_motorcycle_scene
-from gscompleter.evaluation.memory import peak_memory
-from gscompleter.io.scene import load_views
+from gscompleter.commands.demo import write_motorcycle_scene
+from gscompleter.data.scene import load_views
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.runs.memory import peak_memory
 from gscompleter.types import View
 from gscompleter.weights.published import PUBLISHED
 

@@ -17,7 +17,7 @@ import torch
 import tyro
 
 from gscompleter import Gaussians, View, load_renderer, merge
-from gscompleter.demo import motorcycle_cameras, moved
+from gscompleter.commands.demo import motorcycle_cameras, moved
 from gscompleter.geometry import widened
 from gscompleter.types import observed, sh_from_rgb
 

@@ -19,7 +19,12 @@ from skimage.data import stereo_motorcycle
 from skimage.restoration import denoise_tv_chambolle
 
 from gscompleter import View
-from gscompleter.demo import BASELINE_M, FOCAL_PX, PRINCIPAL_POINT_DX_PX, motorcycle_cameras
+from gscompleter.commands.demo import (
+    BASELINE_M,
+    FOCAL_PX,
+    PRINCIPAL_POINT_DX_PX,
+    motorcycle_cameras,
+)
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.surfaces import SurfaceConfig, fit_surfaces
 

@@ -13,7 +13,7 @@ import torch
 
 import gscompleter as gsc
 from gscompleter.generators.agreement import checked
-from gscompleter.generators.warp_inpaint.warp import warp_photographs
+from gscompleter.generators.warp import warp_photographs
 from gscompleter.types import SceneContext
 
 

@@ -10,9 +10,13 @@ import pytest
 from jaxtyping import install_import_hook
 
 # All of the package but `gscompleter.kernels`, whose functions numba compiles.
-CHECKED = ["types", "geometry", "io", "completer", "stages", "render", "reconstructors"]
-CHECKED += ["generators", "evaluation", "config", "interpolation", "report", "run", "demo"]
-CHECKED += ["weights", "masks"]
+PACKAGE = Path(__file__).resolve().parents[1] / "src" / "gscompleter"
+CHECKED = sorted(
+    path.stem
+    for path in PACKAGE.iterdir()
+    if (path.suffix == ".py" or (path / "__init__.py").exists())
+    and path.stem not in ("__init__", "kernels")
+)
 install_import_hook([f"gscompleter.{name}" for name in CHECKED], "beartype.beartype")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"

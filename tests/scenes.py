@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.data.scene import write_cameras
 from gscompleter.io.image import write_image
-from gscompleter.io.scene import write_cameras
 from gscompleter.types import Camera, Gaussians, View, observed, sh_from_rgb
 
 

@@ -7,8 +7,8 @@ import torch
 from gscompleter import InputError
 from gscompleter.generators import NotingGenerator
 from gscompleter.generators.agreement import AgreementConfig, checked, compare
+from gscompleter.generators.warp import Warped
 from gscompleter.generators.warp_inpaint import WarpInpaint
-from gscompleter.generators.warp_inpaint.warp import Warped
 from gscompleter.stages.anchor import synthesize
 from scenes import Room, camera_at, view_of
 from test_generators import TARGET, known_room

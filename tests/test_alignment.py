@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from gscompleter.config import CompleterConfig
-from gscompleter.stages.alignment import AffineConfig, fit_affine, unless_contradicted
+from gscompleter.config import AffineConfig, CompleterConfig
+from gscompleter.stages.alignment import fit_affine, unless_contradicted
 from gscompleter.types import DepthAffine, DepthMap
 
 

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from gscompleter.stages.anchor import AnchorConfig, lift, nearest_view, select_anchor, synthesize
+from gscompleter.config import AnchorConfig
+from gscompleter.stages.anchor import lift, nearest_view, select_anchor, synthesize
 from gscompleter.types import Camera, DepthMap, Reconstruction, Render, SceneContext, View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 

@@ -32,7 +32,7 @@ from gscompleter.baselines.reggs import (
     register_by_similarity,
     turned,
 )
-from gscompleter.evaluation.metrics import psnr
+from gscompleter.metrics.image import psnr
 from gscompleter.types import Gaussians, View, merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 

@@ -16,7 +16,7 @@ import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.io.scene import write_cameras
+from gscompleter.data.scene import write_cameras
 from scenes import camera_at, photographed
 
 SIZE = 64

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gscompleter import CompleterConfig, GSCompleter, InputError, load_renderer
-from gscompleter.evaluation.metrics import psnr
 from gscompleter.geometry import project
+from gscompleter.metrics.image import psnr
 from gscompleter.stages.anchor import lift
 from gscompleter.stages.integration import hole_mask
 from gscompleter.stages.registration import apply_affine

@@ -13,10 +13,12 @@ from PIL import Image
 
 from chunk_files import SIZE, VIEWS, as_tensor, example, file_bytes, pixels_of, row_of, save_chunk
 from gscompleter import InputError
-from gscompleter.evaluation.chunks import open_chunks
-from gscompleter.evaluation.clips import Clip, Skipped, usable
-from gscompleter.evaluation.folders import open_clips, real_estate_clip, scene_clip
-from gscompleter.evaluation.protocols import (
+from gscompleter.data.chunks import open_chunks
+from gscompleter.data.clips import Clip, Skipped, usable
+from gscompleter.data.folders import open_clips, real_estate_clip, scene_clip
+from gscompleter.data.scene import write_cameras
+from gscompleter.geometry import project
+from gscompleter.runs.protocols import (
     EvaluationIndex,
     Extrapolation,
     Split,
@@ -29,8 +31,6 @@ from gscompleter.evaluation.protocols import (
     read_evaluation_index,
     write_evaluation_index,
 )
-from gscompleter.geometry import project
-from gscompleter.io.scene import write_cameras
 from gscompleter.types import View
 
 

@@ -12,8 +12,9 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.evaluation.fid import fid
-from gscompleter.evaluation.geometry_metrics import (
+from gscompleter.masks import dilate
+from gscompleter.metrics.fid import fid
+from gscompleter.metrics.geometry import (
     Alignment,
     abs_rel,
     alignment,
@@ -21,8 +22,7 @@ from gscompleter.evaluation.geometry_metrics import (
     cloud_distances,
     f_score,
 )
-from gscompleter.evaluation.metrics import MAX_PSNR, masked_psnr, psnr, ssim
-from gscompleter.masks import dilate
+from gscompleter.metrics.image import MAX_PSNR, masked_psnr, psnr, ssim
 from gscompleter.render import load_renderer
 from gscompleter.stages.integration import hole_mask, keep_in_holes
 from gscompleter.types import Camera, DepthAffine, Gaussians, TargetCompletion

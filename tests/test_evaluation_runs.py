@@ -15,10 +15,15 @@ from chunk_files import as_tensor, example, save_chunk
 from command import run
 from gscompleter import GSCompleter, InputError
 from gscompleter.completer import STAGES
-from gscompleter.evaluation import runs
-from gscompleter.evaluation.cases import Case
-from gscompleter.evaluation.memory import peak_memory
-from gscompleter.evaluation.methods import (
+from gscompleter.data.cases import Case
+from gscompleter.generators import DiffusionSettings
+from gscompleter.io.image import read_image
+from gscompleter.metrics.image import psnr
+from gscompleter.reports.plots import plots
+from gscompleter.reports.tables import gap_of, summarize, tables
+from gscompleter.runs import runner as runs
+from gscompleter.runs.memory import peak_memory
+from gscompleter.runs.methods import (
     BASELINES,
     METHODS,
     check_methods,
@@ -26,14 +31,9 @@ from gscompleter.evaluation.methods import (
     start_of,
     synthesized,
 )
-from gscompleter.evaluation.metrics import psnr
-from gscompleter.evaluation.plots import plots
-from gscompleter.evaluation.protocols import read_evaluation_index
-from gscompleter.evaluation.runs import RunConfig, Tally, claim, evaluate
-from gscompleter.evaluation.store import read_json
-from gscompleter.evaluation.tables import gap_of, summarize, tables
-from gscompleter.generators import DiffusionSettings
-from gscompleter.io.image import read_image
+from gscompleter.runs.protocols import read_evaluation_index
+from gscompleter.runs.runner import RunConfig, Tally, claim, evaluate
+from gscompleter.runs.store import read_json
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -121,8 +121,8 @@ def test_rows_that_are_lost_are_made_again_from_what_is_saved(finished, cases, t
 LIFE = """
 import os, signal, sys, threading, time
 from pathlib import Path
-from gscompleter.evaluation.cases import read_cases
-from gscompleter.evaluation.runs import RunConfig, evaluate
+from gscompleter.data.cases import read_cases
+from gscompleter.runs.runner import RunConfig, evaluate
 
 cases, out, methods, iterations, delay = sys.argv[1:]
 
@@ -242,7 +242,7 @@ def test_fid_is_a_number_or_a_reason(finished, monkeypatch):
         calls.append([image.shape for image in images])
         return float(len(calls))
 
-    monkeypatch.setattr("gscompleter.evaluation.tables.fid", stand_in)
+    monkeypatch.setattr("gscompleter.reports.tables.fid", stand_in)
     tables(finished, with_fid=True)
     assert calls == [[(SIZE, SIZE, 3)] * 2] * len(METHOD_NAMES)
     assert "| full | 2.00 |" in (finished / "tables.md").read_text()

@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gscompleter.config import FreeSpaceConfig
 from gscompleter.geometry import project
-from gscompleter.stages.free_space import FreeSpaceConfig, respect_free_space, seen_through
+from gscompleter.stages.free_space import respect_free_space, seen_through
 from gscompleter.types import Gaussians, Render, observed
 from scenes import camera_at
 

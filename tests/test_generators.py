@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from gscompleter import InputError, load_generator, load_renderer
-from gscompleter.evaluation.metrics import psnr
+from gscompleter.generators.harmonize import gains
 from gscompleter.generators.oracle import Oracle
+from gscompleter.generators.warp import Warped, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint, background_first, without_cracks
 from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patches
-from gscompleter.generators.warp_inpaint.harmonize import gains
 from gscompleter.generators.warp_inpaint.smooth import continued, distance_to_known
-from gscompleter.generators.warp_inpaint.warp import Warped, warp_photographs
+from gscompleter.metrics.image import psnr
 from gscompleter.types import Camera, Render, SceneContext, View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 

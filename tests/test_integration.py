@@ -5,12 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gscompleter.config import HarmConfig, HoleConfig, RefineConfig
 from gscompleter.masks import dilate
 from gscompleter.render import load_renderer
 from gscompleter.stages.integration import (
-    HarmConfig,
-    HoleConfig,
-    RefineConfig,
     do_no_harm,
     error_with_loss,
     hole_mask,

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gscompleter.io.lens import Distortion, Pinhole, distort, undistorted, undistortion_map
+from gscompleter.data.lens import Distortion, Pinhole, distort, undistorted, undistortion_map
 
 PINHOLE = Pinhole(fl_x=130.0, fl_y=127.5, cx=81.5, cy=59.0, width=160, height=120)
 

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.evaluation import lpips as module
-from gscompleter.evaluation.lpips import (
+from gscompleter.metrics import lpips as module
+from gscompleter.metrics.lpips import (
     NETWORKS,
     LpipsScore,
     WeightsNotAvailable,

@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from feed_forward_fixtures import rule_v1
-from gscompleter.evaluation.metrics import psnr
 from gscompleter.generators.diffusion.pe_field import preview
 from gscompleter.generators.diffusion.position_ids import (
     LEVELS,
@@ -30,6 +29,7 @@ from gscompleter.generators.diffusion.rotary import (
     with_per_head_positions,
 )
 from gscompleter.generators.diffusion.splat import forward_splat
+from gscompleter.metrics.image import psnr
 from gscompleter.types import Camera
 from scenes import Room, view_of
 from test_generators import TARGET, known_room

@@ -8,14 +8,15 @@ import torch
 from skimage.data import stereo_motorcycle
 
 from gscompleter import InputError, View
-from gscompleter.demo import (
+from gscompleter.commands.demo import (
     BASELINE_M,
     FOCAL_PX,
     PRINCIPAL_POINT_DX_PX,
     motorcycle_cameras,
 )
 from gscompleter.geometry import project
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, estimate_depth_range
+from gscompleter.matching.depth_range import estimate_depth_range
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from scenes import Room, camera_at, view_of
 
 SIZE = 96

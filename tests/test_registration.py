@@ -5,15 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.config import CompleterConfig
+from gscompleter.config import CompleterConfig, RegistrationConfig
 from gscompleter.geometry import project
 from gscompleter.render import load_renderer
-from gscompleter.stages.registration import (
-    RegistrationConfig,
-    apply_affine,
-    register,
-    slide,
-)
+from gscompleter.stages.registration import apply_affine, register, slide
 from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 

@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 
 from gscompleter import InputError, load_camera, load_cameras, load_views
+from gscompleter.data.scene import read_index, write_cameras
 from gscompleter.geometry import inside, project, sample, unproject
 from gscompleter.io.files import output_folder
-from gscompleter.io.scene import read_index, write_cameras
 from scenes import camera_at
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

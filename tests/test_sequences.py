@@ -13,18 +13,19 @@ import torch
 from command import run
 from gscompleter import InputError
 from gscompleter.baselines.reggs import RegGSConfig
-from gscompleter.evaluation import methods, sequences, store
-from gscompleter.evaluation.clips import Skipped
-from gscompleter.evaluation.methods import Parts, Start, start_of
-from gscompleter.evaluation.protocols import (
+from gscompleter.data.clips import Skipped
+from gscompleter.io.image import read_pixels
+from gscompleter.reports.sequence_tables import sequence_tables
+from gscompleter.runs import methods, sequences, store
+from gscompleter.runs.methods import Parts, Start, start_of
+from gscompleter.runs.protocols import (
     SequenceCase,
     ViewByView,
     parse_protocol,
     sequences_of,
 )
-from gscompleter.evaluation.runs import RunConfig, Tally
-from gscompleter.evaluation.sequence_tables import sequence_tables
-from gscompleter.evaluation.sequences import (
+from gscompleter.runs.runner import RunConfig, Tally
+from gscompleter.runs.sequences import (
     Course,
     anchor_of,
     complete_in_sequence,
@@ -34,8 +35,7 @@ from gscompleter.evaluation.sequences import (
     scale_drift,
     start_here,
 )
-from gscompleter.evaluation.store import read_json
-from gscompleter.io.image import read_pixels
+from gscompleter.runs.store import read_json
 from gscompleter.stages.registration import slide
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, photographed, view_of

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from gscompleter.evaluation.metrics import psnr
 from gscompleter.kernels import stereo
+from gscompleter.matching.features import features_of, matches
+from gscompleter.matching.frames import Frame, frames_of, transform_between
+from gscompleter.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.appearance import AppearanceConfig, fit_appearance
 from gscompleter.reconstructors.plane_sweep.confidence import (
@@ -18,8 +20,6 @@ from gscompleter.reconstructors.plane_sweep.confidence import (
     without_specks,
 )
 from gscompleter.reconstructors.plane_sweep.epipolar import distances, turned_to_matches
-from gscompleter.reconstructors.plane_sweep.features import features_of, matches
-from gscompleter.reconstructors.plane_sweep.frames import Frame, frames_of, transform_between
 from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.render import load_renderer

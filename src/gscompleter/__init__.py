@@ -10,10 +10,10 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from gscompleter.completer import GSCompleter
     from gscompleter.config import CompleterConfig, load_config
+    from gscompleter.data.scene import load_camera, load_cameras, load_views
     from gscompleter.errors import InputError
     from gscompleter.generators import load_generator
     from gscompleter.io.ply import load_ply, save_ply
-    from gscompleter.io.scene import load_camera, load_cameras, load_views
     from gscompleter.reconstructors import load_reconstructor
     from gscompleter.render import load_renderer
     from gscompleter.types import Camera, Completion, Gaussians, Render, View, merge
@@ -28,9 +28,9 @@ _HOMES = {
     "load_generator": "generators",
     "load_ply": "io.ply",
     "save_ply": "io.ply",
-    "load_camera": "io.scene",
-    "load_cameras": "io.scene",
-    "load_views": "io.scene",
+    "load_camera": "data.scene",
+    "load_cameras": "data.scene",
+    "load_views": "data.scene",
     "load_reconstructor": "reconstructors",
     "load_renderer": "render",
     "Camera": "types",

@@ -10,8 +10,7 @@ from typing import Annotated
 import tyro
 
 from gscompleter import __version__
-from gscompleter.errors import InputError
-from gscompleter.options import (
+from gscompleter.commands.options import (
     CompleteOptions,
     DemoOptions,
     EvaluateOptions,
@@ -19,6 +18,7 @@ from gscompleter.options import (
     ModelsOptions,
     TablesOptions,
 )
+from gscompleter.errors import InputError
 
 Command = (
     Annotated[CompleteOptions, tyro.conf.subcommand("complete")]
@@ -32,12 +32,12 @@ Command = (
 # Where each command lives. Its module is imported once the arguments are known to be right, so
 # that `--help` does not wait for torch.
 COMMANDS = {
-    CompleteOptions: ("gscompleter.run", "run_completion"),
-    DemoOptions: ("gscompleter.demo", "run_demo"),
-    EvaluateOptions: ("gscompleter.evaluation.commands", "run_evaluation"),
-    TablesOptions: ("gscompleter.evaluation.commands", "run_tables"),
-    IndexOptions: ("gscompleter.evaluation.commands", "run_index"),
-    ModelsOptions: ("gscompleter.weights.commands", "run_models"),
+    CompleteOptions: ("gscompleter.commands.complete", "run_completion"),
+    DemoOptions: ("gscompleter.commands.demo", "run_demo"),
+    EvaluateOptions: ("gscompleter.commands.evaluate", "run_evaluation"),
+    TablesOptions: ("gscompleter.commands.evaluate", "run_tables"),
+    IndexOptions: ("gscompleter.commands.evaluate", "run_index"),
+    ModelsOptions: ("gscompleter.commands.models", "run_models"),
 }
 
 

@@ -16,8 +16,8 @@ from gscompleter.errors import InputError
 from gscompleter.generators import BatchGenerator, Generator, load_generator
 from gscompleter.geometry import same_camera, widened
 from gscompleter.masks import dilate
+from gscompleter.matching.depth_range import estimate_depth_range
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_range
 from gscompleter.render import FrozenView, Renderer, load_renderer
 from gscompleter.stages.anchor import (
     Synthesized,

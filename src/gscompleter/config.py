@@ -7,18 +7,140 @@ import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import yaml
 
 from gscompleter.errors import InputError
-from gscompleter.stages.alignment import AffineConfig
-from gscompleter.stages.anchor import AnchorConfig
-from gscompleter.stages.free_space import FreeSpaceConfig
-from gscompleter.stages.integration import HarmConfig, HoleConfig, RefineConfig
-from gscompleter.stages.registration import RegistrationConfig
 
 C = TypeVar("C")
+
+
+@dataclass(frozen=True)
+class AnchorConfig:
+    max_rotation: float = 45.0
+    """Largest turn away from the target, in degrees, that still leaves overlap."""
+    selection: Literal["widest", "nearest"] = "widest"
+    """`widest` baseline is the paper's rule; `nearest` view is its ablation without it."""
+
+
+@dataclass(frozen=True)
+class AffineConfig:
+    bridge: Literal["anchor", "target", "none"] = "anchor"
+    """View through which depths are compared. `target` and `none` are ablations of the paper."""
+    max_trials: int = 512
+    """Two-point hypotheses, all scored at once."""
+    max_pixels: int = 8192
+    """Pixels the hypotheses are scored on, drawn at random where there are more."""
+    residual_threshold: float = 0.05
+    """Largest residual of an inlier, relative to the context depth."""
+    min_inliers: float = 0.3
+    """Smallest share of inliers that makes a fit trustworthy."""
+    min_pixels: int = 64
+    """Fewest comparable pixels; under it there is nothing to fit."""
+    min_agreement: float | None = 0.3
+    """Smallest share of what the target sees of the scene that must agree with an affine fitted
+    through the anchor, before one that is fitted at the target may take its place. None trusts the
+    anchor always, as the paper does."""
+    min_depth_spread: float = 0.05
+    """Smallest spread of the predicted depths ((p95 - p5) / median) that tells scale and shift
+    apart; under it only a scale is fitted."""
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    affine: AffineConfig = AffineConfig()
+    """Settings of the coarse fit."""
+    iterations: int = 20
+    """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
+    learning_rate: float = 0.008
+    """Step of Adam, in the unit that `step` names."""
+    schedule: Literal["falling", "constant"] = "falling"
+    """Whether the step falls linearly to nothing, so that few iterations reach far and still end
+    close."""
+    beta1: float = 0.5
+    """Adam's memory of gradients. Its usual 0.9 remembers half of so short a run and overshoots."""
+    beta2: float = 0.9
+    """Adam's memory of their squares; usually 0.999."""
+    step: Literal["relative", "literal"] = "relative"
+    """`relative`: of each primitive's own distance, so that the unit of the scene does not
+    matter; depth losses are then relative to the median context depth. `literal`: in scene units,
+    as in the paper."""
+    degrees_of_freedom: Literal[1, 3] = 1
+    """1 slides along the camera ray; 3 moves freely (ablation of the paper)."""
+    depth_weight: float = 1.0
+    """λ_d of Eq. 9."""
+    stereo_weight: float = 1.0
+    """λ_s of Eq. 9."""
+    rgb_weight: float = 0.0
+    """λ_c of Eq. 9; 0.1 in the paper. With a constant footprint a primitive looks the same at the
+    target wherever it stands on its ray, and the term tells it nothing."""
+    depth_of: Literal["candidates", "composite"] = "candidates"
+    """What L_depth renders: the candidates alone, each of which then feels its own error; or, as
+    in the paper, the scene with them, where those behind the context are hidden and stay wrong."""
+    footprint: Literal["constant", "fixed"] = "constant"
+    """`constant`: sizes scale with distance, so that the image at the target stays as it is.
+    `fixed`: sizes stay what they were, as in the paper."""
+    mask_occluded: bool = True
+    """Leave out of the stereo loss what the anchor cannot see: a new surface that lies behind the
+    context there. The paper's literal loss pulls it forward onto the context."""
+    occlusion_tolerance: float = 0.05
+    """How far behind the context, relative to depth, still counts as the same surface."""
+    carry_tolerance: float = 0.02
+    """Largest error of depth, relative to the scene's, of an observed pixel that is taken for an
+    example by the holes."""
+    carry_into_holes: bool = True
+    """Let pixels in a hole, where the scene has no depth to agree with, move like the observed
+    ones around them, so that no step remains at the border. The paper leaves them to the affine."""
+
+
+@dataclass(frozen=True)
+class FreeSpaceConfig:
+    num_steps: int = 48
+    """How often a candidate slides back before it is given up; 0 checks nothing, as in the
+    paper."""
+    step: float = 0.04
+    """By how much it slides each time, relative to its distance."""
+    clearance: float = 0.01
+    """How far behind the scene's surface, relative to depth, a camera that sees this surface must
+    find the candidate. What lies a little behind is hidden there, and still closes the hole."""
+    border: int = 3
+    """Pixels beyond the border of an image at which a Gaussian still shows within it."""
+
+
+@dataclass(frozen=True)
+class HoleConfig:
+    max_alpha: float = 0.5
+    """τ of Eq. 10: a pixel that the scene covers by less is a hole."""
+    dilation: int = 3
+    """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
+    neighbourhood: int | None = 16
+    """Pixels around a hole within which candidates are registered. Those farther away neither
+    join the scene nor inform those that do. None registers all of them, as the paper does."""
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    iterations: int = 10
+    """Steps of Adam; 0 leaves the opacities as they were lifted (the paper's ablation w/o MV)."""
+    learning_rate: float = 0.24
+    """Step of Adam, on what `parametrization` names."""
+    parametrization: Literal["logit", "linear"] = "logit"
+    """What Adam moves: the logit, as 3DGS stores it, or the opacity itself, clamped to [0, 1]."""
+    target_weight: float = 0.1
+    """λ of Eq. 11, on the synthesized image."""
+    num_views: int = 2
+    """How many of the nearest context views take part."""
+
+
+@dataclass(frozen=True)
+class HarmConfig:
+    tolerance: float | None = 0.045
+    """Largest loss of PSNR, in dB, that any context view may suffer; None checks nothing, as in
+    the paper."""
+    max_trials: int = 16
+    """How often harmful Gaussians lose half of their opacity before a view that still does not
+    hold loses all it sees of them."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.generators.robust import robust_affine
-from gscompleter.generators.warp_inpaint.warp import Warped
+from gscompleter.generators.warp import Warped
 from gscompleter.interpolation import smoothed
 
 

@@ -2,37 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.config import AffineConfig
 from gscompleter.types import DepthAffine, DepthMap, Lift, Render
-
-
-@dataclass(frozen=True)
-class AffineConfig:
-    bridge: Literal["anchor", "target", "none"] = "anchor"
-    """View through which depths are compared. `target` and `none` are ablations of the paper."""
-    max_trials: int = 512
-    """Two-point hypotheses, all scored at once."""
-    max_pixels: int = 8192
-    """Pixels the hypotheses are scored on, drawn at random where there are more."""
-    residual_threshold: float = 0.05
-    """Largest residual of an inlier, relative to the context depth."""
-    min_inliers: float = 0.3
-    """Smallest share of inliers that makes a fit trustworthy."""
-    min_pixels: int = 64
-    """Fewest comparable pixels; under it there is nothing to fit."""
-    min_agreement: float | None = 0.3
-    """Smallest share of what the target sees of the scene that must agree with an affine fitted
-    through the anchor, before one that is fitted at the target may take its place. None trusts the
-    anchor always, as the paper does."""
-    min_depth_spread: float = 0.05
-    """Smallest spread of the predicted depths ((p95 - p5) / median) that tells scale and shift
-    apart; under it only a scale is fitted."""
 
 
 def fit_affine(

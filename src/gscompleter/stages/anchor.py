@@ -5,23 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from gscompleter.config import AnchorConfig
 from gscompleter.generators import BatchGenerator, Generator, NotingGenerator
 from gscompleter.geometry import baseline_between, inside, project, rotation_between
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.types import Camera, Lift, SceneContext, View
-
-
-@dataclass(frozen=True)
-class AnchorConfig:
-    max_rotation: float = 45.0
-    """Largest turn away from the target, in degrees, that still leaves overlap."""
-    selection: Literal["widest", "nearest"] = "widest"
-    """`widest` baseline is the paper's rule; `nearest` view is its ablation without it."""
 
 
 @dataclass(frozen=True)

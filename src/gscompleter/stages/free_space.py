@@ -8,30 +8,16 @@ back along its own ray until no camera contradicts it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.config import FreeSpaceConfig
 from gscompleter.geometry import project
 from gscompleter.stages.registration import slide
 from gscompleter.types import Camera, Gaussians, Render
-
-
-@dataclass(frozen=True)
-class FreeSpaceConfig:
-    num_steps: int = 48
-    """How often a candidate slides back before it is given up; 0 checks nothing, as in the
-    paper."""
-    step: float = 0.04
-    """By how much it slides each time, relative to its distance."""
-    clearance: float = 0.01
-    """How far behind the scene's surface, relative to depth, a camera that sees this surface must
-    find the candidate. What lies a little behind is hidden there, and still closes the hole."""
-    border: int = 3
-    """Pixels beyond the border of an image at which a Gaussian still shows within it."""
 
 
 def respect_free_space(

@@ -4,28 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from gscompleter.config import HarmConfig, HoleConfig, RefineConfig
 from gscompleter.geometry import inside, project
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, OpacityRender
 from gscompleter.types import Camera, Gaussians, Lift, Render, View
-
-
-@dataclass(frozen=True)
-class HoleConfig:
-    max_alpha: float = 0.5
-    """τ of Eq. 10: a pixel that the scene covers by less is a hole."""
-    dilation: int = 3
-    """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
-    neighbourhood: int | None = 16
-    """Pixels around a hole within which candidates are registered. Those farther away neither
-    join the scene nor inform those that do. None registers all of them, as the paper does."""
 
 
 def hole_mask(render: Render, config: HoleConfig = HoleConfig()) -> Bool[Tensor, "h w"]:
@@ -54,20 +43,6 @@ def keep_near_holes(lift: Lift, near_holes: Bool[Tensor, "h w"]) -> Lift:
         return lift
     kept = near_holes.flatten()[lift.pixel_index]
     return replace(lift, gaussians=lift.gaussians[kept], pixel_index=lift.pixel_index[kept])
-
-
-@dataclass(frozen=True)
-class RefineConfig:
-    iterations: int = 10
-    """Steps of Adam; 0 leaves the opacities as they were lifted (the paper's ablation w/o MV)."""
-    learning_rate: float = 0.24
-    """Step of Adam, on what `parametrization` names."""
-    parametrization: Literal["logit", "linear"] = "logit"
-    """What Adam moves: the logit, as 3DGS stores it, or the opacity itself, clamped to [0, 1]."""
-    target_weight: float = 0.1
-    """λ of Eq. 11, on the synthesized image."""
-    num_views: int = 2
-    """How many of the nearest context views take part."""
 
 
 def refine_opacities(
@@ -110,16 +85,6 @@ def refine_opacities(
         optimizer.step()
         losses.append(loss.item())
     return replace(added, opacities=opacities().detach(), encoded=None), tuple(losses)
-
-
-@dataclass(frozen=True)
-class HarmConfig:
-    tolerance: float | None = 0.045
-    """Largest loss of PSNR, in dB, that any context view may suffer; None checks nothing, as in
-    the paper."""
-    max_trials: int = 16
-    """How often harmful Gaussians lose half of their opacity before a view that still does not
-    hold loses all it sees of them."""
 
 
 def do_no_harm(

@@ -10,58 +10,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gscompleter.config import RegistrationConfig
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, Renderer
-from gscompleter.stages.alignment import AffineConfig, fit_bridge
+from gscompleter.stages.alignment import fit_bridge
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
-
-
-@dataclass(frozen=True)
-class RegistrationConfig:
-    affine: AffineConfig = AffineConfig()
-    """Settings of the coarse fit."""
-    iterations: int = 20
-    """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
-    learning_rate: float = 0.008
-    """Step of Adam, in the unit that `step` names."""
-    schedule: Literal["falling", "constant"] = "falling"
-    """Whether the step falls linearly to nothing, so that few iterations reach far and still end
-    close."""
-    beta1: float = 0.5
-    """Adam's memory of gradients. Its usual 0.9 remembers half of so short a run and overshoots."""
-    beta2: float = 0.9
-    """Adam's memory of their squares; usually 0.999."""
-    step: Literal["relative", "literal"] = "relative"
-    """`relative`: of each primitive's own distance, so that the unit of the scene does not
-    matter; depth losses are then relative to the median context depth. `literal`: in scene units,
-    as in the paper."""
-    degrees_of_freedom: Literal[1, 3] = 1
-    """1 slides along the camera ray; 3 moves freely (ablation of the paper)."""
-    depth_weight: float = 1.0
-    """λ_d of Eq. 9."""
-    stereo_weight: float = 1.0
-    """λ_s of Eq. 9."""
-    rgb_weight: float = 0.0
-    """λ_c of Eq. 9; 0.1 in the paper. With a constant footprint a primitive looks the same at the
-    target wherever it stands on its ray, and the term tells it nothing."""
-    depth_of: Literal["candidates", "composite"] = "candidates"
-    """What L_depth renders: the candidates alone, each of which then feels its own error; or, as
-    in the paper, the scene with them, where those behind the context are hidden and stay wrong."""
-    footprint: Literal["constant", "fixed"] = "constant"
-    """`constant`: sizes scale with distance, so that the image at the target stays as it is.
-    `fixed`: sizes stay what they were, as in the paper."""
-    mask_occluded: bool = True
-    """Leave out of the stereo loss what the anchor cannot see: a new surface that lies behind the
-    context there. The paper's literal loss pulls it forward onto the context."""
-    occlusion_tolerance: float = 0.05
-    """How far behind the context, relative to depth, still counts as the same surface."""
-    carry_tolerance: float = 0.02
-    """Largest error of depth, relative to the scene's, of an observed pixel that is taken for an
-    example by the holes."""
-    carry_into_holes: bool = True
-    """Let pixels in a hole, where the scene has no depth to agree with, move like the observed
-    ones around them, so that no step remains at the border. The paper leaves them to the affine."""
 
 
 @dataclass(frozen=True)

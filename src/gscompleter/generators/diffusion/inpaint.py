@@ -28,8 +28,8 @@ from gscompleter.generators.diffusion.published import (
     reading,
     source_of,
 )
+from gscompleter.generators.warp import Warped, warp_photographs, with_unexplained
 from gscompleter.generators.warp_inpaint import background_first
-from gscompleter.generators.warp_inpaint.warp import Warped, warp_photographs, with_unexplained
 from gscompleter.masks import dilate
 from gscompleter.types import Camera, SceneContext, View
 

@@ -25,7 +25,7 @@ from gscompleter.generators.diffusion.source_depth import (
     source_depth_named,
 )
 from gscompleter.generators.diffusion.splat import forward_splat
-from gscompleter.generators.warp_inpaint.warp import warp_photographs
+from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import same_camera
 from gscompleter.types import Camera, Render, SceneContext, View
 

@@ -16,14 +16,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.generators.warp_inpaint.exemplar import ExemplarConfig, Sources, fill_by_patches
-from gscompleter.generators.warp_inpaint.smooth import continued, distance_to_known
-from gscompleter.generators.warp_inpaint.warp import (
+from gscompleter.generators.warp import (
     WarpConfig,
     Warped,
     warp_photographs,
     with_unexplained,
 )
+from gscompleter.generators.warp_inpaint.exemplar import ExemplarConfig, Sources, fill_by_patches
+from gscompleter.generators.warp_inpaint.smooth import continued, distance_to_known
 from gscompleter.interpolation import smoothed
 from gscompleter.types import Camera, SceneContext, View
 

@@ -1,6 +1,5 @@
 """Ψ without weights: plane-sweep stereo, from posed photographs to pixel-sized Gaussians."""
 
-from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_range
 from gscompleter.reconstructors.plane_sweep.reconstructor import PlaneSweep
 
-__all__ = ["PlaneSweep", "estimate_depth_range"]
+__all__ = ["PlaneSweep"]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from gscompleter.kernels import stereo
-from gscompleter.reconstructors.plane_sweep.frames import Frame
+from gscompleter.matching.frames import Frame
 
 
 @dataclass(frozen=True)

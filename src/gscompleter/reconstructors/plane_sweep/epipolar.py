@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.reconstructors.plane_sweep.features import Pixels
-from gscompleter.reconstructors.plane_sweep.frames import Frame, transform_between
+from gscompleter.matching.features import Pixels
+from gscompleter.matching.frames import Frame, transform_between
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from gscompleter.kernels import stereo
-from gscompleter.reconstructors.plane_sweep.frames import Frame
+from gscompleter.matching.frames import Frame
 
 Source = tuple[Frame, Float[np.ndarray, "3 4"]]
 """Another view, and the transform to its pixels from those of the reference."""

@@ -12,6 +12,9 @@ from jaxtyping import Float32
 
 from gscompleter.errors import InputError
 from gscompleter.kernels import stereo
+from gscompleter.matching.depth_range import estimate_depth_range
+from gscompleter.matching.features import features_of, matches
+from gscompleter.matching.frames import Frame, frames_of, transform_between
 from gscompleter.reconstructors.plane_sweep.aggregation import AggregationConfig, aggregate
 from gscompleter.reconstructors.plane_sweep.appearance import AppearanceConfig, fit_appearance
 from gscompleter.reconstructors.plane_sweep.confidence import (
@@ -19,10 +22,7 @@ from gscompleter.reconstructors.plane_sweep.confidence import (
     agreement,
     confidence_of,
 )
-from gscompleter.reconstructors.plane_sweep.depth_range import estimate_depth_range
 from gscompleter.reconstructors.plane_sweep.epipolar import EpipolarConfig, turned_to_matches
-from gscompleter.reconstructors.plane_sweep.features import features_of, matches
-from gscompleter.reconstructors.plane_sweep.frames import Frame, frames_of, transform_between
 from gscompleter.reconstructors.plane_sweep.gaussians import DiscConfig, discs, normals_of
 from gscompleter.reconstructors.plane_sweep.matching import (
     MatchingConfig,

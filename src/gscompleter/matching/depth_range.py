@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.reconstructors.plane_sweep.features import features_of, matches
-from gscompleter.reconstructors.plane_sweep.frames import Frame, frames_of, transform_between
+from gscompleter.matching.features import features_of, matches
+from gscompleter.matching.frames import Frame, frames_of, transform_between
 from gscompleter.types import View
 
 MIN_MATCHES = 12

@@ -15,11 +15,11 @@ from typing import Any, Literal
 
 from gscompleter.completer import STAGES
 from gscompleter.errors import InputError
-from gscompleter.evaluation.fid import fid
-from gscompleter.evaluation.methods import METHODS
-from gscompleter.evaluation.store import CASES, RUN, case_folder, read_json, slug
 from gscompleter.io.files import replacing
 from gscompleter.io.image import read_image
+from gscompleter.metrics.fid import fid
+from gscompleter.runs.methods import METHODS
+from gscompleter.runs.store import CASES, RUN, case_folder, read_json, slug
 
 Row = dict[str, Any]
 """What `evaluate` writes for a case and a method."""
@@ -103,7 +103,7 @@ shares of the depth."""
 COLUMNS = IMAGES + GEOMETRY
 
 LPIPS_MISSING = (
-    "LPIPS: weights not available. `gscompleter.evaluation.lpips.load_lpips()` fetches them; then "
+    "LPIPS: weights not available. `gscompleter.metrics.lpips.load_lpips()` fetches them; then "
     "`gscompleter evaluate` with `--again scores` adds the column.\n"
 )
 

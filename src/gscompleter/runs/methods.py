@@ -14,16 +14,16 @@ from torch import Tensor
 from gscompleter.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.completer import Clock, GSCompleter, ranged
-from gscompleter.config import ABLATIONS, CompleterConfig, named_config
+from gscompleter.config import ABLATIONS, CompleterConfig, HoleConfig, named_config
 from gscompleter.errors import InputError
-from gscompleter.evaluation.scores import Outcome
 from gscompleter.generators import Generator
 from gscompleter.geometry import widened
+from gscompleter.metrics.scores import Outcome
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render import Renderer
 from gscompleter.stages.anchor import lift, select_anchor, synthesize
 from gscompleter.stages.context import init_context
-from gscompleter.stages.integration import HoleConfig, hole_mask
+from gscompleter.stages.integration import hole_mask
 from gscompleter.types import Camera, Gaussians, SceneContext, View, merge
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.options import ModelsOptions
+from gscompleter.commands.options import ModelsOptions
 from gscompleter.weights.fetching import INSTALL, cached, hub_is_installed, place_of
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from gscompleter.completer import MAX_TARGETS
+from gscompleter.data.clips import Clip, Skipped
 from gscompleter.errors import InputError
-from gscompleter.evaluation.clips import Clip, Skipped
 from gscompleter.io.files import replacing
 from gscompleter.io.json_file import read_json
 from gscompleter.types import View

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError
-from gscompleter.evaluation.methods import METHODS
-from gscompleter.evaluation.sequences import scale_drift
-from gscompleter.evaluation.store import SEQUENCES, read_json
-from gscompleter.evaluation.tables import markdown, place_of
 from gscompleter.io.files import replacing
+from gscompleter.reports.tables import markdown, place_of
+from gscompleter.runs.methods import METHODS
+from gscompleter.runs.sequences import scale_drift
+from gscompleter.runs.store import SEQUENCES, read_json
 
 Row = dict[str, Any]
 """What `evaluate_sequences` writes for a sequence and a method."""

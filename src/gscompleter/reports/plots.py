@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from gscompleter.config import ABLATIONS
 from gscompleter.errors import InputError
-from gscompleter.evaluation.sequence_tables import SequenceSummary
-from gscompleter.evaluation.store import slug
-from gscompleter.evaluation.tables import Row, Summary, seconds_of, stage_place
 from gscompleter.io.files import replacing
+from gscompleter.reports.sequence_tables import SequenceSummary
+from gscompleter.reports.tables import Row, Summary, seconds_of, stage_place
+from gscompleter.runs.store import slug
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

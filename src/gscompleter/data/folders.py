@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.errors import InputError
-from gscompleter.evaluation.cases import Case, read_cases
-from gscompleter.evaluation.chunks import STAGES, open_chunks
-from gscompleter.evaluation.clips import (
+from gscompleter.data.cases import Case, read_cases
+from gscompleter.data.chunks import STAGES, open_chunks
+from gscompleter.data.clips import (
     Clip,
     StoredCamera,
     cameras_to_skip,
@@ -23,11 +22,12 @@ from gscompleter.evaluation.clips import (
     size_to_skip,
     view_of,
 )
-from gscompleter.io.framing import check_resolution
+from gscompleter.data.framing import check_resolution
+from gscompleter.data.scene import load_cameras, load_views
+from gscompleter.data.transforms import read_index
+from gscompleter.errors import InputError
 from gscompleter.io.image import image_size, read_pixels
 from gscompleter.io.json_file import read_json
-from gscompleter.io.scene import load_cameras, load_views
-from gscompleter.io.transforms import read_index
 from gscompleter.types import View
 
 ACCEPTED = (

@@ -10,18 +10,18 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from gscompleter.commands.options import CompleteOptions, GeneratorOptions
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig, load_config
+from gscompleter.data.scene import load_camera, load_cameras, load_views, read_index
 from gscompleter.errors import InputError
 from gscompleter.generators import DiffusionSettings, load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.ply import load_ply
-from gscompleter.io.scene import load_camera, load_cameras, load_views, read_index
-from gscompleter.options import CompleteOptions, GeneratorOptions
 from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
-from gscompleter.report import Target, write_report
+from gscompleter.reports.completion import Target, write_report
 from gscompleter.types import Completion, View
 
 MIN_SIZE = 16

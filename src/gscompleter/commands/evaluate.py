@@ -12,13 +12,27 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from gscompleter.commands.complete import generator_settings
+from gscompleter.commands.options import EvaluateOptions, IndexOptions, TablesOptions
+from gscompleter.data.cases import read_cases
+from gscompleter.data.clips import Skipped, usable
+from gscompleter.data.folders import open_clips
+from gscompleter.data.framing import check_resolution
 from gscompleter.errors import InputError
-from gscompleter.evaluation.cases import read_cases
-from gscompleter.evaluation.clips import Skipped, usable
-from gscompleter.evaluation.folders import open_clips
-from gscompleter.evaluation.methods import methods_named
-from gscompleter.evaluation.plots import PlotsNotAvailable, plot_sequences, plots
-from gscompleter.evaluation.protocols import (
+from gscompleter.progress import shown_on
+from gscompleter.render import choose_device
+from gscompleter.reports.plots import PlotsNotAvailable, plot_sequences, plots
+from gscompleter.reports.sequence_tables import overview, sequence_tables
+from gscompleter.reports.tables import (
+    COLUMNS,
+    Summary,
+    present,
+    score_cells,
+    seconds_of,
+    tables,
+)
+from gscompleter.runs.methods import methods_named
+from gscompleter.runs.protocols import (
     SequenceCase,
     ViewByView,
     cases_of,
@@ -27,23 +41,9 @@ from gscompleter.evaluation.protocols import (
     sequences_of,
     write_evaluation_index,
 )
-from gscompleter.evaluation.runs import EvaluationCase, RunConfig, evaluate
-from gscompleter.evaluation.sequence_tables import overview, sequence_tables
-from gscompleter.evaluation.sequences import evaluate_sequences
-from gscompleter.evaluation.store import CASES, SEQUENCES
-from gscompleter.evaluation.tables import (
-    COLUMNS,
-    Summary,
-    present,
-    score_cells,
-    seconds_of,
-    tables,
-)
-from gscompleter.io.framing import check_resolution
-from gscompleter.options import EvaluateOptions, IndexOptions, TablesOptions
-from gscompleter.progress import shown_on
-from gscompleter.render import choose_device
-from gscompleter.run import generator_settings
+from gscompleter.runs.runner import EvaluationCase, RunConfig, evaluate
+from gscompleter.runs.sequences import evaluate_sequences
+from gscompleter.runs.store import CASES, SEQUENCES
 
 
 def run_evaluation(options: EvaluateOptions) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Shaped
 from PIL import Image
 
+from gscompleter.data.lens import Pinhole
 from gscompleter.errors import InputError
-from gscompleter.io.lens import Pinhole
 
 
 @dataclass(frozen=True)

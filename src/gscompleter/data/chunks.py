@@ -20,15 +20,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
-from gscompleter.evaluation.clips import (
+from gscompleter.data.clips import (
     StoredCamera,
     cameras_to_skip,
     check_frame,
     size_to_skip,
     view_of,
 )
-from gscompleter.io.framing import check_resolution
+from gscompleter.data.framing import check_resolution
+from gscompleter.errors import InputError
 from gscompleter.io.image import decode_pixels, decoded_size
 from gscompleter.io.json_file import read_json
 from gscompleter.types import View

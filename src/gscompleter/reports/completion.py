@@ -13,9 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter import __version__
-from gscompleter.evaluation.metrics import psnr, ssim
 from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
+from gscompleter.metrics.image import psnr, ssim
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Completion, TargetCompletion, View
 

@@ -28,10 +28,10 @@ import numpy as np
 import torch
 
 from gscompleter.errors import InputError
-from gscompleter.evaluation.methods import Start
-from gscompleter.evaluation.scores import Outcome, ranged_truth
 from gscompleter.io import json_file
 from gscompleter.io.files import replacing
+from gscompleter.metrics.scores import Outcome, ranged_truth
+from gscompleter.runs.methods import Start
 from gscompleter.types import Gaussians, View, merge
 
 RUN = "run.json"

@@ -16,8 +16,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.evaluation.memory import peak_memory
-from gscompleter.evaluation.methods import (
+from gscompleter.generators import DiffusionSettings, Generator, load_generator
+from gscompleter.io.image import write_image
+from gscompleter.metrics.scores import Truth, ranged_truth, score
+from gscompleter.progress import shown_on, track
+from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.render import load_renderer
+from gscompleter.runs.memory import peak_memory
+from gscompleter.runs.methods import (
     BASELINES,
     METHODS,
     Parts,
@@ -25,8 +31,7 @@ from gscompleter.evaluation.methods import (
     check_methods,
     start_of,
 )
-from gscompleter.evaluation.scores import Truth, ranged_truth, score
-from gscompleter.evaluation.store import (
+from gscompleter.runs.store import (
     RUN,
     OutputError,
     Saved,
@@ -39,11 +44,6 @@ from gscompleter.evaluation.store import (
     slug,
     write_json,
 )
-from gscompleter.generators import DiffusionSettings, Generator, load_generator
-from gscompleter.io.image import write_image
-from gscompleter.progress import shown_on, track
-from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.render import load_renderer
 from gscompleter.types import View
 
 T = TypeVar("T")

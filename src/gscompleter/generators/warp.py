@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.generators.warp_inpaint.harmonize import HarmonizeConfig, gains
+from gscompleter.generators.harmonize import HarmonizeConfig, gains
 from gscompleter.geometry import baseline_between, inside, project, sample, unproject
 from gscompleter.types import Camera, Render, SceneContext, View
 

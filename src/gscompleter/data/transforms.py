@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.data.lens import Distortion, Pinhole
 from gscompleter.errors import InputError
 from gscompleter.io.image import image_size
 from gscompleter.io.json_file import read_json
-from gscompleter.io.lens import Distortion, Pinhole
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """nerfstudio's cameras look along -z with y up, ours along z with y down."""

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.evaluation.geometry_metrics import abs_rel, alignment
-from gscompleter.evaluation.lpips import try_lpips
-from gscompleter.evaluation.metrics import masked_psnr, psnr, ssim
+from gscompleter.metrics.geometry import abs_rel, alignment
+from gscompleter.metrics.image import masked_psnr, psnr, ssim
+from gscompleter.metrics.lpips import try_lpips
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, Render, View
 

@@ -13,12 +13,9 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from gscompleter.errors import InputError
-from gscompleter.io.files import replacing
-from gscompleter.io.framing import check_resolution, covering, resize
-from gscompleter.io.image import as_image, read_depth, read_pixels
-from gscompleter.io.lens import Distortion, Pinhole, remap, undistorted, undistortion_map
-from gscompleter.io.transforms import (
+from gscompleter.data.framing import check_resolution, covering, resize
+from gscompleter.data.lens import Distortion, Pinhole, remap, undistorted, undistortion_map
+from gscompleter.data.transforms import (
     OPENCV_FROM_OPENGL,
     Frame,
     SceneIndex,
@@ -26,6 +23,9 @@ from gscompleter.io.transforms import (
     read_frames,
     read_index,
 )
+from gscompleter.errors import InputError
+from gscompleter.io.files import replacing
+from gscompleter.io.image import as_image, read_depth, read_pixels
 from gscompleter.types import Camera, View
 
 __all__ = [

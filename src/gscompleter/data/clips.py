@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
+from gscompleter.data.framing import covering
+from gscompleter.data.lens import Pinhole
+from gscompleter.data.transforms import MAX_RIGID_ERROR, as_tensor
 from gscompleter.errors import InputError
-from gscompleter.io.framing import covering
 from gscompleter.io.image import as_image
-from gscompleter.io.lens import Pinhole
-from gscompleter.io.transforms import MAX_RIGID_ERROR, as_tensor
 from gscompleter.types import Camera, View
 
 MAX_FOV = 100.0

@@ -21,11 +21,14 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from gscompleter.config import AnchorConfig, HoleConfig
 from gscompleter.errors import InputError
-from gscompleter.evaluation.methods import METHODS, SETTINGS, Parts, Start, check_methods
-from gscompleter.evaluation.metrics import psnr
-from gscompleter.evaluation.protocols import SequenceCase
-from gscompleter.evaluation.runs import (
+from gscompleter.metrics.image import psnr
+from gscompleter.metrics.scores import Outcome, ranged_truth
+from gscompleter.render import Renderer
+from gscompleter.runs.methods import METHODS, SETTINGS, Parts, Start, check_methods
+from gscompleter.runs.protocols import SequenceCase
+from gscompleter.runs.runner import (
     VERSION,
     Again,
     RunConfig,
@@ -36,17 +39,15 @@ from gscompleter.evaluation.runs import (
     save_image,
     start_at,
 )
-from gscompleter.evaluation.scores import Outcome, ranged_truth
-from gscompleter.evaluation.store import (
+from gscompleter.runs.store import (
     Saved,
     keep_outcome,
     load_outcome,
     sequence_folder,
     slug,
 )
-from gscompleter.render import Renderer
-from gscompleter.stages.anchor import AnchorChoice, AnchorConfig, lift, select_anchor
-from gscompleter.stages.integration import HoleConfig, hole_mask
+from gscompleter.stages.anchor import AnchorChoice, lift, select_anchor
+from gscompleter.stages.integration import hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View, merge
 
 SUPPORTED = ("context", *SETTINGS, "reggs")

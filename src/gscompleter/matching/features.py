@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.reconstructors.plane_sweep.frames import Frame
+from gscompleter.matching.frames import Frame
 
 Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
 """Pixels (the top-left pixel's centre is (0.5, 0.5)) and descriptors."""

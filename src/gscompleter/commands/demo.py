@@ -14,12 +14,12 @@ import torch
 from rich.console import Console
 from skimage.data import stereo_motorcycle
 
+from gscompleter.commands.complete import complete_folder, tell
+from gscompleter.commands.options import CompleteOptions, DemoOptions
+from gscompleter.data.scene import write_cameras
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.image import read_image, write_image
-from gscompleter.io.scene import write_cameras
-from gscompleter.options import CompleteOptions, DemoOptions
-from gscompleter.report import strip
-from gscompleter.run import complete_folder, tell
+from gscompleter.reports.completion import strip
 from gscompleter.types import Camera
 
 FOCAL_PX = 994.978

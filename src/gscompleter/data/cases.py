@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from gscompleter.data.scene import load_views
 from gscompleter.errors import InputError
 from gscompleter.io.json_file import read_json
-from gscompleter.io.scene import load_views
 from gscompleter.types import View
 
 

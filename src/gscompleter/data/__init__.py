@@ -1,0 +1,1 @@
+"""The door: posed photographs in whatever format a user holds them."""

@@ -1,0 +1,1 @@
+"""What a reader is shown: the files of a completion, tables and plots of a run."""

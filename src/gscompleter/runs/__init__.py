@@ -1,0 +1,1 @@
+"""Cases times methods: what is run, resumed and kept."""
