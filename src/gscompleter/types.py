@@ -270,7 +270,7 @@ class Lift:
 
 @dataclass(frozen=True)
 class DepthAffine:
-    """`context depth = scale * predicted depth + shift`, on z-depth (paper, Eq. 6)."""
+    """`context depth = scale * predicted depth + shift`, on z-depth (paper, Eq. 8)."""
 
     scale: float = 1.0
     shift: float = 0.0

@@ -114,7 +114,7 @@ def nearest(points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]) -> Float
 @dataclass(frozen=True)
 class AlignmentConfig:
     min_alpha: float = 0.5
-    """A pixel is covered where alpha is at least this, as for the holes (paper, Eq. 10)."""
+    """A pixel is covered where alpha is at least this, as for the holes (paper, Eq. 12)."""
     threshold: float = 0.05
     """Distance that counts as matched, as a share of the median context depth at the target.
     Relative, so that scenes of any unit and size can be averaged; 5 % is wider than the spacing

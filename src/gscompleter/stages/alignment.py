@@ -18,7 +18,7 @@ def fit_affine(
     generator: torch.Generator,
     config: AffineConfig = AffineConfig(),
 ) -> DepthAffine:
-    """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 7).
+    """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 8).
 
     Where RANSAC cannot be trusted (few pixels, hardly any range of depth, few inliers) the median
     ratio with shift 0 takes its place, and the identity where there is nothing to compare; which

@@ -68,7 +68,7 @@ class Synthesized(View):
 
 
 def synthesize(generator: Generator, target: Camera, context: SceneContext) -> Synthesized:
-    """`Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 5)."""
+    """`Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 6)."""
     nearest = context.views[nearest_view(target, context.views)]
     notes: tuple[str, ...] = ()
     if isinstance(generator, NotingGenerator):
@@ -105,7 +105,7 @@ def as_view(image: Tensor, target: Camera, notes: tuple[str, ...]) -> Synthesize
 
 
 def lift(reconstructor: Reconstructor, reference: View, anchor: View) -> Lift:
-    """`Ψ((Ĩ_t, P_t), (I_s, P_s))`, of which the target's Gaussians are kept (paper, Eq. 6).
+    """`Ψ((Ĩ_t, P_t), (I_s, P_s))`, of which the target's Gaussians are kept (paper, Eq. 7).
 
     A pixel-aligned Ψ says which Gaussians are the reference's. Of another Ψ all those are taken
     that the target camera sees.

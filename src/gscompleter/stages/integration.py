@@ -18,7 +18,7 @@ from gscompleter.types import Camera, Gaussians, Lift, Render, View
 
 
 def hole_mask(render: Render, config: HoleConfig = HoleConfig()) -> Bool[Tensor, "h w"]:
-    """Where the scene has a hole, before dilation (paper, Eq. 10)."""
+    """Where the scene has a hole, before dilation (paper, Eq. 12)."""
     return render.alpha < config.max_alpha
 
 
@@ -53,7 +53,7 @@ def refine_opacities(
     views: Sequence[View],
     config: RefineConfig = RefineConfig(),
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """`added` with opacities that minimise Eq. 11, and the loss of each iteration.
+    """`added` with opacities that minimise Eq. 13, and the loss of each iteration.
 
     Everything else of them, and all of the scene, stays as it is: what was good cannot be
     forgotten.

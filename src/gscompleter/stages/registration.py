@@ -25,7 +25,7 @@ class Registration:
     gaussians: Gaussians
     affine: DepthAffine
     losses: tuple[float, ...]
-    """Value of Eq. 9 at each iteration."""
+    """Value of Eq. 11 at each iteration."""
 
 
 def register(
@@ -102,7 +102,7 @@ def apply_affine(
     """`gaussians` at corrected z-depth `scale * z + shift`, each on its own ray of `camera`.
 
     The distance along the ray follows from the means themselves, d' = d z'/z, which is the
-    paper's Eq. 8 for z-depth models and holds for models of ray distance too. A shift must not
+    paper's Eq. 9 for z-depth models and holds for models of ray distance too. A shift must not
     push anything through the camera: a tenth of its depth is the least that remains.
     """
     z = (gaussians.means - camera.center) @ camera.forward
@@ -135,7 +135,7 @@ def register_along_rays(
     renderer: Renderer,
     config: RegistrationConfig,
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """Minimise Eq. 9 over one distance per Gaussian; also returns the loss of each iteration."""
+    """Minimise Eq. 11 over one distance per Gaussian; also returns the loss of each iteration."""
     objective = Objective.of(at_target.context, at_anchor, reference, config)
     parameters = torch.zeros(
         (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
@@ -164,7 +164,7 @@ def displace(
     camera: Camera,
     config: RegistrationConfig,
 ) -> Gaussians:
-    """`coarse` moved by the optimised parameters: along the rays (Eq. 8), or freely in 3-DoF."""
+    """`coarse` moved by the optimised parameters: along the rays (Eq. 10), or freely in 3-DoF."""
     offsets = coarse.means - camera.center
     distances = offsets.norm(dim=1, keepdim=True)
     unit = distances if config.step == "relative" else torch.ones_like(distances)
@@ -176,7 +176,7 @@ def displace(
 
 @dataclass(frozen=True)
 class Objective:
-    """Eq. 9: `λ_d L_depth + λ_s L_stereo + λ_c L_rgb`, each a mean over the image."""
+    """Eq. 11: `λ_d L_depth + λ_s L_stereo + λ_c L_rgb`, each a mean over the image."""
 
     target_depth: DepthMap
     anchor_depth: DepthMap
