@@ -146,7 +146,10 @@ class GSCompleter:
                 at_target = self.renderer.render(scene, wide)
                 inner = at_target.cropped(left, top, target.width, target.height)
                 if nothing_to_do(target, views, hole_mask(inner, self.config.holes)) is None:
-                    asked[i] = (wide, SceneContext(tuple(views), renders, at_target))
+                    asked[i] = (
+                        wide,
+                        SceneContext(tuple(views), renders, at_target, self.config.holes.max_alpha),
+                    )
         with clock("generate"):
             found = synthesize_all(self.generator, list(asked.values())) if asked else []
         images = dict(zip(asked, found, strict=True))
@@ -191,7 +194,9 @@ class GSCompleter:
         with clock("generate"):
             at_views = [self.renderer.freeze(scene, view.camera) for view in views]
             renders = tuple(frozen.context for frozen in at_views)
-            known = SceneContext(tuple(views), renders, at_target.context)
+            known = SceneContext(
+                tuple(views), renders, at_target.context, self.config.holes.max_alpha
+            )
             if reference is None:
                 reference = synthesize(self.generator, wide, known)
 
@@ -212,6 +217,7 @@ class GSCompleter:
                 self.renderer,
                 random,
                 self.config.registration,
+                self.config.holes.max_alpha,
             )
 
         with clock("integrate"):

@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
+from gscompleter.coverage import COVERED
 from gscompleter.errors import InputError
 
 C = TypeVar("C")
@@ -110,8 +111,10 @@ class FreeSpaceConfig:
 
 @dataclass(frozen=True)
 class HoleConfig:
-    max_alpha: float = 0.5
-    """τ of Eq. 12: a pixel that the scene covers by less is a hole."""
+    max_alpha: float = COVERED
+    """τ of Eq. 12: a pixel of the target that the scene covers by less is a hole. It is painted by
+    Φ, what is lifted there joins the scene, and its depth continues that of its surroundings. Where
+    the scene's depth is compared, a pixel stays covered from one half on."""
     dilation: int = 3
     """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
     neighbourhood: int | None = 16

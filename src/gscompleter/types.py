@@ -19,6 +19,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from gscompleter.coverage import COVERED
+
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
 
@@ -216,7 +218,7 @@ class Render:
             self.image[rows, columns], self.depth[rows, columns], self.alpha[rows, columns]
         )
 
-    def depth_map(self, min_alpha: float = 0.5) -> DepthMap:
+    def depth_map(self, min_alpha: float = COVERED) -> DepthMap:
         """The depth, valid where the Gaussians cover at least `min_alpha` of the pixel."""
         return DepthMap(self.depth, self.alpha >= min_alpha)
 
@@ -253,7 +255,14 @@ class SceneContext:
     at_views: tuple[Render, ...]
     """The context scene rendered at the cameras of `views`, in their order."""
     at_target: Render
-    """The context scene rendered at the target camera: alpha tells where its holes are."""
+    """The context scene rendered at the target camera."""
+    max_alpha: float = COVERED
+    """A pixel of the target that the scene covers by less is a hole."""
+
+    @property
+    def holes(self) -> Bool[Tensor, "h w"]:
+        """Where the scene has a hole at the target, which is for Φ to fill."""
+        return self.at_target.alpha < self.max_alpha
 
 
 @dataclass(frozen=True)
