@@ -17,6 +17,7 @@ from gscompleter.commands.demo import (
 from gscompleter.geometry import project
 from gscompleter.matching.depth_range import depth_range_of, estimate_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.types import DepthMap
 from scenes import Room, camera_at, view_of
 
 SIZE = 96
@@ -54,6 +55,15 @@ def test_every_pixel_has_one_gaussian_that_projects_to_its_centre():
         expected_y = found.pixel_index[own] // SIZE + 0.5
         assert (pixels[:, 0] - expected_x).abs().max() < 0.01
         assert (pixels[:, 1] - expected_y).abs().max() < 0.01
+
+
+def test_gaussians_are_as_large_as_asked_for_in_pixels():
+    view = side_by_side()[0]
+    depth = DepthMap(view.depth, torch.ones_like(view.depth, dtype=torch.bool))
+    small, large = (PlaneSweep(disc_sigma=s).splat(view, depth) for s in (0.5, 1.0))
+    assert torch.allclose(large.scales, 2 * small.scales)
+    pixel = view.depth.flatten() / view.camera.K[0, 0]
+    assert torch.allclose(large.scales[:, 0], pixel)
 
 
 def test_moving_forward_gives_depth_too():
