@@ -250,7 +250,7 @@ class GSCompleter:
             )
             for sight in sights
         ]
-        return synthesize_all(as_generator(self.generator), asked) if asked else []
+        return synthesize_all(self.generator, asked) if asked else []
 
     def lift(self, sight: Sight, reference: Synthesized) -> Lift:
         """Stage 2: the image as Gaussians, those that lie near a hole."""
