@@ -1,10 +1,12 @@
 """The renderers agree with each other and with what can be worked out by hand."""
 
+import sys
 from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
+import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
@@ -305,6 +307,23 @@ def test_a_frozen_view_of_nothing_draws_what_is_new():
     new = SCENES["random"]
     view = CudaView(SlowDrawing(), new[:0], CAMERA)
     assert torch.equal(view.composite(new).image, REFERENCE.render(new, CAMERA).image)
+
+
+@pytest.mark.parametrize("name", ["harmonics", "strange"])
+def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", stand_in_gsplat.module())
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    cuda = load_renderer("cuda")
+    beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
+    context, new = merge([SCENES[name], beside]), random_gaussians(40, seed=5, sh_degree=1)
+    ours, truth = cuda.render(context, CAMERA), REFERENCE.render(context, CAMERA)
+    assert outliers(ours.depth, truth.depth, 1e-5) == 0
+    assert outliers(ours.image, truth.image, 1e-5) == 0
+    view = cuda.freeze(context, CAMERA)
+    assert 0 < len(view.seen) < len(context)
+    check_frozen(view, REFERENCE.freeze(context, CAMERA), new, 1e-4)
+    assert not cuda.render(new[:0], CAMERA).image.any()
+    assert len(cuda.freeze(new[:0], CAMERA).seen) == 0
 
 
 on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU")
