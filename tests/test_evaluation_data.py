@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gscompleter.data.clips import Clip, Skipped, usable
+from gscompleter.data.folders import open_clips, real_estate_clip, scene_clip
 from PIL import Image
 
 from chunk_files import SIZE, VIEWS, as_tensor, example, file_bytes, pixels_of, row_of, save_chunk
 from gscompleter import InputError
 from gscompleter.data.chunks import open_chunks
-from gscompleter.data.clips import Clip, Skipped, usable
-from gscompleter.data.folders import open_clips, real_estate_clip, scene_clip
 from gscompleter.data.scene import write_cameras
 from gscompleter.geometry import project
 from gscompleter.runs.protocols import (

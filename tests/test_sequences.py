@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from gscompleter.data.clips import Skipped
 
 from command import run
 from gscompleter import InputError
 from gscompleter.baselines.reggs import RegGSConfig
-from gscompleter.data.clips import Skipped
 from gscompleter.io.image import read_pixels
 from gscompleter.reports.sequence_tables import sequence_tables
 from gscompleter.runs import methods, sequences, store
