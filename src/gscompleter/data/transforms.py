@@ -148,7 +148,7 @@ def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
         raise InputError(
             f"The focal length of {title} is missing; add `fl_x` and `fl_y`, or `camera_angle_x`."
         )
-    size = _size(pair("w", "h", low=1, high=MAX_SIDE), title)
+    size = _size(pair("w", "h", low=1.0, high=float(MAX_SIDE)), title)
     return Intrinsics(size, focal, pair("cx", "cy"), angle, _distortion(entry, title))
 
 
