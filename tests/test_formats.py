@@ -113,9 +113,7 @@ def test_a_missing_photograph_is_named_when_asked_for(tmp_path):
     clip = read_camera_file(save_camera_file(tmp_path / "room.txt", "room"))
     (tmp_path / "room" / "66732.png").unlink()
     assert len(clip.views([0, 1, 3])) == 3
-    with pytest.raises(
-        InputError, match=r"image of frame 2 of .*room.txt is missing; put .*66732"
-    ):
+    with pytest.raises(InputError, match=r"image of frame 2 of .*room.txt is missing; put .*66732"):
         clip.views([2])
     assert clip.reason_to_skip((SIZE, SIZE)) == "frame 2: its image is missing"
     with pytest.raises(InputError, match="no frame 5 in .*room.txt"):

@@ -14,7 +14,7 @@ from gscompleter.data.intrinsics import FRACTIONS, Intrinsics, pinhole_defect
 from gscompleter.data.lens import Pinhole, undistorted
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.poses import pose_defect
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.image import decode_pixels, decoded_size, image_size, read_pixels
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
@@ -85,7 +85,7 @@ class Frame:
         """
         stored = self.stored()
         if stored is None:
-            place = "restore it" if self.image is None else f"put it at {self.image}"
+            place = "restore it" if self.image is None else f"put it at {quoted(str(self.image))}"
             raise InputError(
                 f"The image of {self.title} is missing; {place}, or choose another frame."
             )
@@ -140,8 +140,8 @@ class Frame:
     def unusable(self, defect: str) -> InputError:
         """What is said of a frame with such a defect."""
         return InputError(
-            f"{capital(self.title)} cannot be used, because {defect}; correct it, or choose "
-            "another frame."
+            f"{capital(self.title)} cannot be used, because {defect}; correct it, or leave "
+            "the frame out."
         )
 
 

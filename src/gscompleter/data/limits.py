@@ -19,7 +19,7 @@ MAX_CENTER = 100.0
 """Farthest the principal point may lie from the top-left pixel, in widths (or heights)."""
 MAX_COEFFICIENT = 1e4
 """Of the coefficients of a lens."""
-DEPTH_RANGE = (1e-6, 1e9)
+DEPTH_RANGE = (1e-9, 1e9)
 """Of near and far planes, and of the units of depth maps, in scene units."""
 
 
