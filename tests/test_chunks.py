@@ -216,10 +216,10 @@ def without(key):
     ("bad", "sentence"),
     [
         (without("key"), "Scene 0 of .*000000.torch has no `key`"),
-        (without("cameras"), "scene room of .*000000.torch has no `cameras`"),
-        (without("images"), "scene room of .*000000.torch has no `images`"),
+        (without("cameras"), "`cameras` of the scene room of .*000000.torch are of type NoneType"),
+        (without("images"), "`images` of the scene room of .*000000.torch are no list"),
         ({**example(), "key": 3}, "Scene 0 of .* has no `key`"),
-        ([1, 2], "Scene 0 of .* is no dict but list"),
+        ([1, 2], "Scene 0 of .* has no `key`"),
         ({**example(), "cameras": torch.zeros(5, 12)}, r"room of .* float32 of shape \[5, 12\]"),
         ({**example(), "cameras": torch.zeros(90)}, r"room of .* float32 of shape \[90\]"),
         ({**example(), "cameras": torch.zeros(5, 18).long()}, "room of .* are int64 of shape"),

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gscompleter.data.frame import Frame
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.real_estate import intrinsics_and_pose
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.json_file import read_json
@@ -27,8 +27,6 @@ from gscompleter.io.json_file import read_json
 TEST = "test"
 """The half of a data set that is evaluated on, in a folder of its own."""
 INDEX = "index.json"
-
-_KEYS = ("key", "cameras", "images")
 
 
 def holds_chunks(path: Path) -> bool:
@@ -107,9 +105,9 @@ def _checked(path: Path, content: Mapping[str, str], index: Path) -> list[Photog
 
 def _scenes_of(path: Path) -> Iterator[Photographs]:
     """The scenes of one chunk."""
-    for position, example in enumerate(_load_chunk(path)):
-        name = _key_of(example, position, path)
-        yield _photographs(example, name, path, position)
+    return (
+        _photographs(example, path, position) for position, example in enumerate(_load_chunk(path))
+    )
 
 
 def _load_chunk(path: Path) -> list[Any]:
@@ -161,25 +159,13 @@ def _cannot_load(path: Path, error: Exception) -> str:
     return f"{path} is truncated or no file of torch.save; download it again."
 
 
-def _key_of(example: Any, position: int, path: Path) -> str:
-    if not isinstance(example, dict):
-        raise InputError(
-            f"Scene {position} of {path} is no dict but {type(example).__name__}; write the chunk "
-            f"again with {', '.join(_KEYS)}."
-        )
-    name = example.get("key")
+def _photographs(example: Any, path: Path, position: int) -> Photographs:
+    """A scene, checked as far as that goes without decoding its images."""
+    entries = example if isinstance(example, dict) else {}
+    name, cameras, images = (entries.get(key) for key in ("key", "cameras", "images"))
     if not isinstance(name, str) or not name:
         raise InputError(f"Scene {position} of {path} has no `key`; write the chunk again with it.")
-    return name
-
-
-def _photographs(example: dict[str, Any], name: str, path: Path, position: int) -> Photographs:
-    """A scene, checked as far as that goes without decoding its images."""
     called = f"scene {quoted(name)} of {path}"
-    for key in _KEYS:
-        if key not in example:
-            raise InputError(f"The {called} has no `{key}`; write the chunk again with it.")
-    cameras, images = example["cameras"], example["images"]
     if (
         not isinstance(cameras, Tensor)
         or not cameras.is_floating_point()
@@ -209,7 +195,7 @@ def _photographs(example: dict[str, Any], name: str, path: Path, position: int) 
         image = partial(_image_bytes, path, position, number)
         title = f"frame {number} of the {called}"
         frames.append(Frame(str(number), title, c2w, intrinsics, image))
-    return Photographs(name, f"the {called}", tuple(frames))
+    return photographs_of(name, f"the {called}", frames)
 
 
 def _image_bytes(path: Path, position: int, number: int) -> bytes:

@@ -93,16 +93,6 @@ class Frame:
             return decode_pixels(stored, capital(self.title))
         return read_pixels(stored)
 
-    def ignored(self) -> UInt8[np.ndarray, "h w"] | None:
-        """255 where the photograph is to be ignored, else 0; None where nothing is.
-
-        Raises:
-            InputError: where the mask is missing or not an image.
-        """
-        if self.mask is None:
-            return None
-        return np.where(read_pixels(self.mask).any(-1), 0, 255).astype(np.uint8)
-
     def defect(self, width: int, height: int) -> str | None:
         """What makes the camera of a photograph of that size impossible; None if nothing does."""
         if max(width, height) > MAX_SIDE:
@@ -110,10 +100,14 @@ class Frame:
         if self.intrinsics.transposed(width, height):
             w, h = self.intrinsics.size or (width, height)
             return f"its image is {width} × {height} pixels and its `w` and `h` say {w} × {h}"
-        return pinhole_defect(self.intrinsics.at(width, height)) or pose_defect(self.c2w)
+        pinhole = self.intrinsics.at(width, height)
+        defect = pose_defect(self.c2w) or pinhole_defect(pinhole)
+        if defect is None and undistorted(pinhole, self.intrinsics.distortion) is None:
+            return "its distortion coefficients fold the image over itself"
+        return defect
 
-    def pinhole(self, width: int, height: int) -> Pinhole:
-        """The intrinsics of a photograph of that size, before its distortion is removed.
+    def pinholes(self, width: int, height: int) -> tuple[Pinhole, Pinhole]:
+        """The intrinsics of a photograph of that size, with its distortion and without.
 
         Raises:
             InputError: where they or the pose are impossible.
@@ -121,21 +115,10 @@ class Frame:
         defect = self.defect(width, height)
         if defect is not None:
             raise self.unusable(defect)
-        return self.intrinsics.at(width, height)
-
-    def undistorted(self, width: int, height: int) -> Pinhole:
-        """The intrinsics of a photograph of that size without its distortion.
-
-        Raises:
-            InputError: where they or the pose are impossible.
-        """
-        new = undistorted(self.pinhole(width, height), self.intrinsics.distortion)
-        if new is None:
-            raise InputError(
-                f"The distortion coefficients of {self.title} fold the image over itself; correct "
-                "them, or undistort the images first."
-            )
-        return new
+        pinhole = self.intrinsics.at(width, height)
+        new = undistorted(pinhole, self.intrinsics.distortion)
+        assert new is not None
+        return pinhole, new
 
     def unusable(self, defect: str) -> InputError:
         """What is said of a frame with such a defect."""

@@ -39,8 +39,9 @@ def covering(width: int, height: int, resolution: tuple[int, int] | None) -> Fra
     """How an image is resized to cover `resolution` (height, width) and cropped in its centre.
 
     Raises:
-        InputError: where an image much longer than wide would become too long.
+        InputError: where the resolution is impossible, or a strip would become too long.
     """
+    check_resolution(resolution)
     if resolution is None:
         return Framing((width, height), (0, 0), (width, height))
     scale = max(resolution[0] / height, resolution[1] / width)

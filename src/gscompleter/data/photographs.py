@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -20,13 +19,13 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.frame import Frame
-from gscompleter.data.framing import check_resolution, covering, resize
+from gscompleter.data.framing import covering, resize
 from gscompleter.data.intrinsics import opening_angle
 from gscompleter.data.lens import remap, undistortion_map
 from gscompleter.data.origin import local_origin
 from gscompleter.data.poses import pose_defect
 from gscompleter.errors import InputError
-from gscompleter.io.image import as_image, read_depth
+from gscompleter.io.image import as_image, read_depth, read_pixels
 from gscompleter.types import Camera, View
 
 MAX_FOV = 100.0
@@ -105,6 +104,7 @@ class Photographs:
     title: str
     """What error messages call it."""
     frames: tuple[Frame, ...]
+    origin: Float[np.ndarray, "3"]
     near: float | None = None
     """Smallest z-depth of the scene, in scene units, where known."""
     far: float | None = None
@@ -114,11 +114,6 @@ class Photographs:
     def names(self) -> tuple[str, ...]:
         return tuple(frame.name for frame in self.frames)
 
-    @cached_property
-    def origin(self) -> Float[np.ndarray, "3"]:
-        """Zero, unless `local_origin` finds that too far away."""
-        return local_origin([f.c2w for f in self.frames if pose_defect(f.c2w) is None])
-
     def __len__(self) -> int:
         return len(self.frames)
 
@@ -127,12 +122,10 @@ class Photographs:
 
     def camera(self, frame: int, resolution: tuple[int, int] | None = None) -> Camera:
         """Its photograph need not exist where the file says how large it is."""
-        check_resolution(resolution)
         found = self.frame(frame)
-        return camera_of(found, found.size(), resolution, self.origin, self.near, self.far)
+        return self._camera(found, found.size(), resolution)
 
     def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
-        check_resolution(resolution)
         chosen = [self.frame(number) for number in frames]
         return [
             self._view(frame, number, resolution)
@@ -142,12 +135,11 @@ class Photographs:
     def mask(
         self, frame: int, resolution: tuple[int, int] | None = None
     ) -> Bool[Tensor, "h w"] | None:
-        check_resolution(resolution)
         found = self.frame(frame)
-        ignored = found.ignored()
-        if ignored is None:
+        if found.mask is None:
             return None
-        return torch.from_numpy(fitted(found, ignored, found.size(), resolution)) > 0
+        shown = read_pixels(found.mask).max(axis=-1)
+        return torch.from_numpy(fitted(found, shown, found.size(), resolution)) == 0
 
     def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
         for number, frame in enumerate(self.frames):
@@ -169,41 +161,30 @@ class Photographs:
             )
         return self.frames[number]
 
+    def _camera(
+        self, frame: Frame, size: tuple[int, int], resolution: tuple[int, int] | None
+    ) -> Camera:
+        _, pinhole = frame.pinholes(*size)
+        final = covering(*size, resolution).camera(pinhole)
+        c2w = frame.c2w.copy()
+        c2w[:3, 3] -= self.origin  # in float64 still
+        pose = torch.from_numpy(c2w).float()
+        return Camera(pose, final.K, final.width, final.height, self.near, self.far)
+
     def _view(self, frame: Frame, number: int, resolution: tuple[int, int] | None) -> View:
         pixels = frame.pixels()
         size = pixels.shape[1], pixels.shape[0]
-        camera = camera_of(frame, size, resolution, self.origin, self.near, self.far)
+        camera = self._camera(frame, size, resolution)
         depth = None
         if frame.depth is not None:
             depth = torch.from_numpy(fitted(frame, read_depth(*frame.depth), size, resolution))
         return View(as_image(fitted(frame, pixels, size, resolution)), camera, number, depth)
 
 
-def camera_of(
-    frame: Frame,
-    size: tuple[int, int],
-    resolution: tuple[int, int] | None,
-    origin: Float[np.ndarray, "3"],
-    near: float | None,
-    far: float | None,
-) -> Camera:
-    """The camera of a frame.
-
-    Args:
-        frame: The frame.
-        size: Width and height of its photograph.
-        resolution: Height and width that the photograph is brought to; its own if None.
-        origin: What is subtracted from the camera's centre, while it is still in float64.
-        near: Smallest z-depth of the scene, in scene units, where known.
-        far: Largest z-depth of the scene, in scene units, where known.
-
-    Raises:
-        InputError: where the camera is impossible.
-    """
-    final = covering(*size, resolution).camera(frame.undistorted(*size))
-    c2w = frame.c2w.copy()
-    c2w[:3, 3] -= origin
-    return Camera(torch.from_numpy(c2w).float(), final.K, final.width, final.height, near, far)
+def photographs_of(name: str, title: str, frames: Sequence[Frame]) -> Photographs:
+    """Photographs told from zero, or where that is too far away, from a local origin."""
+    valid = [frame.c2w for frame in frames if pose_defect(frame.c2w) is None]
+    return Photographs(name, title, tuple(frames), local_origin(valid))
 
 
 def fitted(
@@ -229,9 +210,9 @@ def fitted(
     if not colours:
         pixels = resize(pixels, size, Image.Resampling.NEAREST)
     if frame.intrinsics.distortion:
-        lens = frame.pinhole(*size), frame.intrinsics.distortion, frame.undistorted(*size)
-        interpolation = cv2.INTER_CUBIC if colours else cv2.INTER_NEAREST
-        pixels = remap(pixels, undistortion_map(*lens), interpolation)
+        pinhole, new = frame.pinholes(*size)
+        source = undistortion_map(pinhole, frame.intrinsics.distortion, new)
+        pixels = remap(pixels, source, cv2.INTER_CUBIC if colours else cv2.INTER_NEAREST)
     filtering = Image.Resampling.LANCZOS if colours else Image.Resampling.NEAREST
     return covering(*size, resolution).image(pixels, filtering)
 
@@ -242,7 +223,7 @@ def _oddity(frame: Frame) -> str | None:
     defect = frame.defect(*size)
     if defect is not None:
         return defect
-    fov = opening_angle(frame.undistorted(*size))
+    fov = opening_angle(frame.pinholes(*size)[1])
     if fov > MAX_FOV:
         return f"its opening angle of {fov:.1f}° is above {MAX_FOV:g}°"
     farthest = float(np.abs(frame.c2w[:3, 3]).max())

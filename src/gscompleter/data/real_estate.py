@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from gscompleter.data.frame import Frame
 from gscompleter.data.intrinsics import FRACTIONS, Intrinsics
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import c2w_of
 from gscompleter.errors import InputError
 
@@ -50,8 +50,8 @@ def read_camera_file(path: Path) -> Photographs:
         raise InputError(
             f"{path} lists no frames; below the line with the address, one line a frame is needed."
         )
-    frames = tuple(_frame(line, number, path) for number, line in enumerate(lines))
-    return Photographs(path.stem, str(path), frames)
+    frames = [_frame(line, number, path) for number, line in enumerate(lines)]
+    return photographs_of(path.stem, str(path), frames)
 
 
 def intrinsics_and_pose(

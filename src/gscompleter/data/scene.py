@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.framing import check_resolution
 from gscompleter.data.limits import check_planes
-from gscompleter.data.photographs import camera_of
+from gscompleter.data.photographs import Photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL, read_frames
 from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
@@ -101,13 +100,10 @@ def load_cameras(
     Raises:
         InputError: where the file or one of its cameras is missing or impossible.
     """
-    check_resolution(resolution)
     check_planes(near, far)
-    place = np.asarray(origin, dtype=np.float64)
-    return [
-        camera_of(frame, frame.size(), resolution, place, near, far)
-        for frame in read_frames(Path(path))
-    ]
+    zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_frames(Path(path)))
+    cameras = Photographs(Path(path).stem, str(path), frames, zero, near, far)
+    return [cameras.camera(number, resolution) for number in range(len(cameras))]
 
 
 def write_cameras(

@@ -15,7 +15,7 @@ from gscompleter.data.frame import Frame, capital
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.lens import Distortion
 from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_SIDE
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import made_rigid, pose_defect
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.json_file import read_json
@@ -61,7 +61,7 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
         frames = sorted(frames, key=lambda frame: frame.name)
     file = _json_path(path).resolve()
     name = file.parent.name if file.name == NAME else file.stem
-    yield Photographs(name, str(_json_path(path)), tuple(frames))
+    yield photographs_of(name, str(_json_path(path)), frames)
 
 
 def read_frames(scene: Path) -> list[Frame]:
