@@ -56,7 +56,8 @@ def told_from(
     if not origin.any():
         return scene
     step = float(np.spacing(np.float32(np.abs(origin).max())))
-    spread = max((camera.center - cameras[0].center).norm().item() for camera in cameras)
+    centers = torch.stack([camera.center.cpu() for camera in cameras])
+    spread = (centers - centers[0]).norm(dim=-1).max().item()
     if step > MAX_STEP * spread:
         raise InputError(
             f"The scene lies {np.abs(origin).max():g} units from its origin, where float32 has "

@@ -114,7 +114,6 @@ class RunConfig:
             self.load_generator(targets),
             load_renderer(self.device),
             self.seed,
-            0.0 if self.generator == "oracle" else None,
             self.baseline_iterations,
         )
 
