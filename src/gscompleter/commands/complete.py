@@ -17,6 +17,7 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.origin import frame_from_photographs, told_from
 from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.data.scene import load_cameras
+from gscompleter.data.sparse_points import with_depth_range
 from gscompleter.errors import InputError
 from gscompleter.generators import DiffusionSettings, load_generator
 from gscompleter.io.files import check_output, output_folder
@@ -55,6 +56,9 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     config = load_config(options.config)
     check_context(options)
     given = open_photographs(options.folder, options.format, options.near, options.far)
+    given = with_depth_range(given, options.context, options.resolution)
+    for note in given.notes:
+        console.print(note, highlight=False, soft_wrap=True)
     views = [view.to(device) for view in read_views(given, options.context, options)]
     targets = read_targets(given, options)
     scene = None

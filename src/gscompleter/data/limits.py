@@ -22,6 +22,9 @@ MAX_COEFFICIENT = 1e4
 DEPTH_RANGE = (1e-9, 1e9)
 """Of near and far planes, and of the units of depth maps, in scene units."""
 
+MAX_PATH = 1024
+"""Of characters in the path of a file."""
+
 
 def check_planes(near: float | None, far: float | None) -> None:
     """Raise an InputError where the near or the far plane (in scene units) is impossible."""

@@ -27,3 +27,12 @@ def read_json(path: Path, advice: str) -> Any:
         ) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not JSON ({error}); {advice}.") from error
+
+
+def begins_a_list(path: Path) -> bool:
+    """Whether a JSON file holds a list, by its first character."""
+    try:
+        with path.open("rb") as file:
+            return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
+    except OSError:
+        return False

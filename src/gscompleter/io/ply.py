@@ -158,7 +158,7 @@ def _property(words: list[str]) -> Property:
 # --------------------------------------------------------------------------------------- data
 
 
-def _read_vertices(file: BinaryIO, header: Header, vertex: Element, path: Path) -> np.ndarray:
+def read_vertices(file: BinaryIO, header: Header, vertex: Element, path: Path) -> np.ndarray:
     """The rows of `vertex` as a structured array, whatever stands before it skipped."""
     ahead = header.elements[: header.elements.index(vertex)]
     if header.format == "ascii":
@@ -240,7 +240,7 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         with path.open("rb") as file:
             header = read_header(file, path)
             vertex = _gaussian_element(header, path)
-            vertices = _read_vertices(file, header, vertex, path)
+            vertices = read_vertices(file, header, vertex, path)
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror}.") from error
     return _whole(_gaussians(vertices, vertex), path, drop_nonfinite)

@@ -1,0 +1,183 @@
+"""Photographs with a COLMAP model, in the layouts in which users hold them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.colmap import binary, text
+from gscompleter.data.colmap.records import PosedImage
+from gscompleter.data.frame import Frame
+from gscompleter.data.image_folders import (
+    FOLDERS,
+    ORIGINALS,
+    find_path,
+    image_folders,
+    placed,
+    with_photographs,
+)
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.photographs import Photographs, photographs_of
+from gscompleter.data.point_cloud import read_point_cloud
+from gscompleter.errors import InputError, quoted
+
+DISTORTED = "distorted"
+"""The folder of a model with its lens, beside the undistorted photographs of 3DGS's scripts."""
+HOMES = ("sparse", "colmap/sparse", f"{DISTORTED}/sparse", "")
+"""Where the models of a scene lie, in the order in which they are looked for. A home is a model
+itself, or holds some in folders with a number for a name."""
+FILES = ("cameras", "images")
+"""Without them there is no model. `rigs` and `frames`, since COLMAP 3.12, tell nothing that the
+poses of the images do not."""
+
+_READERS = {".bin": binary, ".txt": text}
+
+
+def holds_colmap(path: Path) -> bool:
+    """Whether `path` is a scene with a COLMAP model, a model, or the images file of one."""
+    return is_image_file(path) or bool(_models(path))
+
+
+def open_colmap(path: Path) -> Iterator[Photographs]:
+    """The photographs of a scene, called by the name of its folder.
+
+    Of several models the one with most images is opened. Frames are numbered in the order of
+    the sorted names of those images whose photograph is there.
+
+    Args:
+        path: The folder of a scene, the folder of a model, or its images file.
+
+    Raises:
+        InputError: where there is no model or it is damaged, and where none of its photographs
+            is there.
+    """
+    models = _models(path)
+    if is_image_file(path):
+        _check_cameras_beside(path)
+    if not models:
+        raise InputError(
+            f"There is no COLMAP model in {quoted(str(path))}; a folder sparse/0 with its cameras "
+            "and images, as .bin or .txt, is needed."
+        )
+    frames = [_frames(model) for model in models]
+    best = max(range(len(models)), key=lambda number: len(frames[number]))
+    yield _scene(models[best], frames[best], _choice(models, [len(f) for f in frames], best))
+
+
+def read_image_file(path: Path) -> list[Frame]:
+    """The cameras of an images.txt or images.bin in its order, without photographs.
+
+    Raises:
+        InputError: where it is damaged, or there is no cameras file beside it.
+    """
+    _check_cameras_beside(path)
+    return _frames(path.parent)
+
+
+def is_image_file(path: Path) -> bool:
+    """Whether `path` is the file of a COLMAP model that holds its poses."""
+    name = path.name.casefold()
+    return name in {f"images{ending}" for ending in _READERS} and os.path.isfile(path)
+
+
+def _check_cameras_beside(path: Path) -> None:
+    if _file(path.parent, "cameras") is None:
+        raise InputError(
+            f"There is no cameras.txt or cameras.bin beside {quoted(str(path))}, and it holds "
+            "poses only; copy it there from the same model."
+        )
+
+
+def _models(path: Path) -> list[Path]:
+    """The folders of the models of a scene, all of one home."""
+    if is_image_file(path):
+        return [path.parent] if _is_model(path.parent) else []
+    if not os.path.isdir(path):
+        return []
+    homes = [find_path(path, home) for home in HOMES]
+    found = ([f for f in (home, *_numbered(home)) if _is_model(f)] for home in homes if home)
+    return next((models for models in found if models), [])
+
+
+def _numbered(home: Path) -> list[Path]:
+    names = os.listdir(home) if os.path.isdir(home) else []
+    return [home / name for name in sorted(names) if name.isdecimal()]
+
+
+def _is_model(folder: Path) -> bool:
+    return all(_file(folder, name) is not None for name in FILES)
+
+
+def _file(folder: Path, name: str) -> Path | None:
+    """A file of a model, binary rather than text; None where there is none."""
+    found = (find_path(folder, name + ending) for ending in _READERS)
+    return next((path for path in found if path is not None and os.path.isfile(path)), None)
+
+
+def _frames(model: Path) -> list[Frame]:
+    """The frames of a model in the order of its file, without photographs."""
+    cameras_file, images_file = (_file(model, name) for name in FILES)
+    assert cameras_file is not None
+    assert images_file is not None
+    cameras = _READERS[cameras_file.suffix.lower()].read_cameras(cameras_file)
+    images = _READERS[images_file.suffix.lower()].read_images(images_file)
+    if not images:
+        raise InputError(f"{images_file} lists no images; export the model again.")
+    return [_frame(image, cameras, images_file) for image in images]
+
+
+def _frame(image: PosedImage, cameras: dict[int, Intrinsics], path: Path) -> Frame:
+    title = f"image {quoted(image.name)} of {path}"
+    if image.camera not in cameras:
+        raise InputError(
+            f"The {title} was taken by camera {image.camera}, which is not in the cameras file "
+            "beside it; export the model again."
+        )
+    return Frame(image.name, title, image.c2w(), cameras[image.camera], None)
+
+
+def _scene(model: Path, frames: list[Frame], notes: tuple[str, ...]) -> Photographs:
+    roots = _roots(model)
+    # Beside a model with a lens, `images` may hold photographs that have lost theirs.
+    lens = any(root.name.casefold() == DISTORTED for root in roots)
+    folders = image_folders(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
+    there, missing = with_photographs([placed(f, folders, roots) for f in frames], str(model))
+    name = roots[-1].resolve().name
+    scene = photographs_of(name, str(model), there)
+    return replace(scene, notes=notes + missing, sparse=_points_of(model))
+
+
+def _roots(model: Path) -> list[Path]:
+    """The folder of a model and those above it, up to that of the scene."""
+    homes = {part for home in HOMES for part in home.split("/")}
+    roots = [model]
+    # `resolve` names the folders above one that was given as `.`.
+    while roots[-1].resolve().name.casefold() in homes or roots[-1].resolve().name.isdecimal():
+        roots.append(roots[-1].resolve().parent)
+    return roots
+
+
+def _choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
+    if len(models) == 1:
+        return ()
+    others = ", ".join(str(size) for number, size in enumerate(sizes) if number != best)
+    return (
+        f"{len(models)} models lie in {models[best].parent}: the one in {models[best].name} with "
+        f"{sizes[best]} images was opened, of the others with {others} nothing is used.",
+    )
+
+
+def _points_of(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
+    """What reads the points of a model; None where it has no file of points."""
+    path = _file(model, "points3D")
+    if path is not None:
+        return partial(_READERS[path.suffix.lower()].read_points, path)
+    # 3DGS's script leaves them as a PLY.
+    cloud = find_path(model, "points3D.ply")
+    return None if cloud is None else partial(read_point_cloud, cloud)
