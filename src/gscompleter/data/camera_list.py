@@ -18,8 +18,7 @@ from jaxtyping import Float
 from gscompleter.data.frame import Frame, capital
 from gscompleter.data.image_folders import image_folders, placed, with_photographs
 from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.json_numbers import array_of, number_of, text_of
-from gscompleter.data.limits import MAX_SIDE
+from gscompleter.data.json_numbers import array_of, number_of, size_of, text_of
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import made_rigid, pose_defect
 from gscompleter.errors import InputError
@@ -70,10 +69,9 @@ def _frame(entry: Any, number: int, path: Path) -> Frame:
     title = f"camera {number} of {path}"
     if not isinstance(entry, dict):
         raise InputError(f"{capital(title)} is no object with a position and a rotation; {ADVICE}.")
-    size = [number_of(entry, key, title, 1, MAX_SIDE) for key in ("width", "height")]
     fx, fy = (number_of(entry, key, title, 1 / LARGEST, LARGEST) for key in ("fx", "fy"))
     name = text_of(entry, "img_name", title) or str(entry.get("id", number))
-    intrinsics = Intrinsics((int(size[0]), int(size[1])), (fx, fy))
+    intrinsics = Intrinsics(size_of(entry, title), (fx, fy))
     frame = Frame(name, title, _pose(entry, title), intrinsics, None)
     defect = pose_defect(frame.c2w)
     if defect is not None:

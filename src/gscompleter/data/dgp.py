@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from gscompleter.data.frame import Frame
 from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.json_numbers import number_of, text_of
-from gscompleter.data.limits import MAX_COORDINATE, MAX_SIDE
+from gscompleter.data.json_numbers import number_of, size_of, text_of
+from gscompleter.data.limits import MAX_COORDINATE
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import rotation_of
 from gscompleter.errors import InputError, quoted
@@ -67,9 +67,8 @@ def _frame(datum: Any, cameras: Mapping[str, Intrinsics], file: Path) -> Frame:
             f"The {title} has no file name, or its camera {quoted(camera)} is not in the "
             f"calibration; {ADVICE}."
         )
-    size = tuple(int(number_of(image, key, title, 1, MAX_SIDE)) for key in ("width", "height"))
     given = cameras[camera]
-    intrinsics = Intrinsics((size[0], size[1]), given.focal, given.center)
+    intrinsics = Intrinsics(size_of(image, title), given.focal, given.center)
     return Frame(name, title, _pose(_object(image, "pose"), title), intrinsics, file.parent / name)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.limits import MAX_PATH
+from gscompleter.data.limits import MAX_PATH, MAX_SIDE
 from gscompleter.errors import InputError, quoted
 
 
@@ -41,6 +41,20 @@ def number_of(entry: Mapping[str, Any], key: str, title: str, low: float, high: 
     if value is None:
         raise InputError(f"The `{key}` of {title} is missing; add it.")
     return value
+
+
+def size_of(entry: Mapping[str, Any], title: str) -> tuple[int, int]:
+    """The numbers at `width` and `height`, in pixels.
+
+    Raises:
+        InputError: where one is missing or no whole number within the limits.
+    """
+    width, height = (
+        number_of(entry, key, title, 1.0, float(MAX_SIDE)) for key in ("width", "height")
+    )
+    if width != int(width) or height != int(height):
+        raise InputError(f"The `width` and `height` of {title} are no whole numbers; correct them.")
+    return int(width), int(height)
 
 
 def text_of(entry: Mapping[str, Any], key: str, title: str) -> str | None:

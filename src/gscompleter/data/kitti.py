@@ -19,6 +19,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import find_photograph
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.photographs import Photographs, photographs_of
+from gscompleter.data.poses import pose_defect
 from gscompleter.errors import InputError, quoted
 
 POSES, CALIBRATION = "poses.txt", "calib.txt"
@@ -32,7 +33,7 @@ def holds_kitti(path: Path) -> bool:
     """Whether `path` is a sequence of KITTI odometry, or a file of poses."""
     if os.path.isdir(path):
         return os.path.isfile(path / CALIBRATION) and _poses_of(path) is not None
-    return path.suffix == ".txt" and os.path.isfile(path) and _begins_with_a_matrix(path)
+    return path.suffix == ".txt" and os.path.isfile(path) and _begins_with_a_pose(path)
 
 
 def open_kitti(path: Path) -> Iterator[Photographs]:
@@ -54,9 +55,9 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     folder = path if os.path.isdir(path) else _sequence_of(path)
     calibration = _calibration_beside(folder, poses)
     images, camera = _camera_folder(folder)
-    intrinsics, camera_from_first = _camera(calibration, camera)
+    intrinsics, first_from_camera = _camera(calibration, camera)
     frames = [
-        _frame(number, first @ np.linalg.inv(camera_from_first), intrinsics, images, poses)
+        _frame(number, first @ first_from_camera, intrinsics, images, poses)
         for number, first in enumerate(_matrices(poses))
     ]
     yield photographs_of(folder.resolve().name, str(poses), frames)
@@ -71,7 +72,7 @@ def _frame(
 
 
 def _camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:
-    """The intrinsics of a camera, and its transform from camera 0."""
+    """The intrinsics of a camera, and the transform from its frame to that of camera 0."""
     projections = _matrices(calibration)
     if len(projections) <= camera:
         raise InputError(
@@ -79,14 +80,19 @@ def _camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarra
             f"camera {camera}; a line P{camera} is needed."
         )
     K, aside = projections[camera][:3, :3], projections[camera][:3, 3]
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2].tolist() == [0, 0, 1] and np.isfinite(K).all()):
+    if not _is_upright(K):
         raise InputError(
             f"The projection of camera {camera} in {calibration} is none of a rectified camera; "
             "name the calib.txt of KITTI odometry."
         )
     transform = np.eye(4)
-    transform[:3, 3] = np.linalg.solve(K, aside)
+    transform[:3, 3] = -np.linalg.solve(K, aside)
     return Intrinsics(None, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2])), transform
+
+
+def _is_upright(K: Float[np.ndarray, "3 3"]) -> bool:
+    """Whether a matrix is that of intrinsics: upper triangular, with positive focal lengths."""
+    return bool((np.tril(K, -1) == 0).all() and (np.diag(K) > 0).all() and K[2, 2] == 1)
 
 
 def _matrices(path: Path) -> list[Float[np.ndarray, "4 4"]]:
@@ -99,7 +105,7 @@ def _matrices(path: Path) -> list[Float[np.ndarray, "4 4"]]:
     matrices = [_matrix(line) for line in lines]
     found = [matrix for matrix in matrices if matrix is not None]
     if not found or len(found) < len(matrices):
-        raise InputError(f"{path} is no file of KITTI: each of its lines needs 12 numbers.")
+        raise InputError(f"{path} is no file of KITTI: each of its lines needs 12 finite numbers.")
     return found
 
 
@@ -109,7 +115,9 @@ def _matrix(line: str) -> Float[np.ndarray, "4 4"] | None:
         numbers = np.array([float(word) for word in words])
     except ValueError:
         return None
-    return np.vstack([numbers.reshape(3, 4), [0, 0, 0, 1]]) if len(numbers) == 12 else None
+    if len(numbers) != 12 or not np.isfinite(numbers).all():
+        return None
+    return np.vstack([numbers.reshape(3, 4), [0, 0, 0, 1]])
 
 
 def _poses_of(folder: Path) -> Path | None:
@@ -146,9 +154,10 @@ def _camera_folder(folder: Path) -> tuple[Path, int]:
     )
 
 
-def _begins_with_a_matrix(path: Path) -> bool:
+def _begins_with_a_pose(path: Path) -> bool:
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            return _matrix(file.readline(MAX_LINE)) is not None
+            first = _matrix(file.readline(MAX_LINE))
     except OSError:
         return False
+    return first is not None and pose_defect(first) is None
