@@ -150,6 +150,21 @@ def test_of_several_models_the_largest_is_opened(tmp_path):
     assert "the one in 1 with 5 images was opened" in note
 
 
+def test_photographs_are_used_as_they_are_stored_and_that_is_said(tmp_path):
+    write_photographs(tmp_path / "images")
+    write_colmap_binary(tmp_path / "sparse")
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    for name in NAMES:
+        Image.open(tmp_path / "images" / name).save(tmp_path / "images" / name, exif=turned)
+    photographs = open_photographs(tmp_path)
+    check_room(photographs)
+    (note,) = photographs.notes
+    assert "used as they are stored, which is how COLMAP saw them" in note
+    (tmp_path / "images" / "0.png").write_bytes(b"no image")
+    assert open_photographs(tmp_path).notes == ()
+
+
 @pytest.mark.parametrize("features", ["1 2 -1 3 4 7", "", "\n", "#", "\n1 2 -1\n", "1 2 -1 " * 4])
 def test_lines_of_features_may_be_empty_or_absent(tmp_path, features):
     write_photographs(tmp_path / "images")

@@ -88,6 +88,7 @@ def refusal(action: Callable[[], object]) -> str:
     return ""
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("seed", range(MUTATIONS))
 def test_a_damaged_scene_opens_or_is_refused(scenes, tmp_path, seed):
     chance = random.Random(seed)

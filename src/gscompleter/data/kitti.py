@@ -25,6 +25,8 @@ from gscompleter.errors import InputError, quoted
 POSES, CALIBRATION = "poses.txt", "calib.txt"
 CAMERAS = {"image_2": 2, "image_0": 0, "image_3": 3, "image_1": 1, "image_l": 0, "image_r": 1}
 """Folders of photographs, in the order in which they are looked for, and whose they are."""
+LARGEST = 1e12
+"""Of the numbers of a matrix."""
 MAX_LINE = 4096
 """Of characters of a line of twelve numbers."""
 
@@ -87,7 +89,8 @@ def _camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarra
         )
     transform = np.eye(4)
     transform[:3, 3] = -np.linalg.solve(K, aside)
-    return Intrinsics(None, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2])), transform
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    return Intrinsics(None, (fx, fy), (cx, cy)), transform
 
 
 def _is_upright(K: Float[np.ndarray, "3 3"]) -> bool:
@@ -105,7 +108,7 @@ def _matrices(path: Path) -> list[Float[np.ndarray, "4 4"]]:
     matrices = [_matrix(line) for line in lines]
     found = [matrix for matrix in matrices if matrix is not None]
     if not found or len(found) < len(matrices):
-        raise InputError(f"{path} is no file of KITTI: each of its lines needs 12 finite numbers.")
+        raise InputError(f"{path} is no file of KITTI: each of its lines needs 12 numbers.")
     return found
 
 
@@ -115,7 +118,7 @@ def _matrix(line: str) -> Float[np.ndarray, "4 4"] | None:
         numbers = np.array([float(word) for word in words])
     except ValueError:
         return None
-    if len(numbers) != 12 or not np.isfinite(numbers).all():
+    if len(numbers) != 12 or not (np.abs(numbers) <= LARGEST).all():
         return None
     return np.vstack([numbers.reshape(3, 4), [0, 0, 0, 1]])
 

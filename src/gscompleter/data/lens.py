@@ -180,7 +180,10 @@ def undistortion_map(
     """
     x, y = np.meshgrid(np.arange(new.width) + 0.5, np.arange(new.height) + 0.5)
     pixels = _pixels(pinhole, distort(_plane_points(new, x, y), distortion))
-    return (pixels - 0.5).astype(np.float32)
+    # Where the lens shows nothing, the nearest border stands in.
+    finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
+    with np.errstate(over="ignore"):
+        return finite.astype(np.float32)
 
 
 def remap(

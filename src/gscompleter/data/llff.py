@@ -27,8 +27,6 @@ from gscompleter.errors import InputError, quoted
 
 NAME = "poses_bounds.npy"
 IMAGES = (".jpg", ".jpeg", ".png")
-OPENCV_FROM_LLFF = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""Columns: LLFF's axes down, right and back, in OpenCV's x right, y down and z forward."""
 MAX_BYTES = 1 << 26
 """Of an array: as many as of half a million cameras."""
 
@@ -62,17 +60,15 @@ def open_llff(path: Path) -> Iterator[Photographs]:
 
 
 def _frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
-    matrix = row[:15].reshape(3, 5)
-    height, width, focal = matrix[:, 4].tolist()
+    down, right, back, center, (height, width, focal) = row[:15].reshape(3, 5).T
     if not all(1 <= side <= MAX_SIDE and side == int(side) for side in (height, width)):
         raise InputError(
             f"The {title} has an image of {width:g} × {height:g}; whole numbers of pixels from 1 "
             f"to {MAX_SIDE} are needed, so run LLFF's imgs2poses again."
         )
     c2w = np.eye(4)
-    c2w[:3, :3] = matrix[:, :3] @ OPENCV_FROM_LLFF.T
-    c2w[:3, 3] = matrix[:, 3]
-    intrinsics = Intrinsics((int(width), int(height)), (focal, focal))
+    c2w[:3] = np.stack([right, down, -back, center], axis=1)
+    intrinsics = Intrinsics((int(width), int(height)), (float(focal), float(focal)))
     return Frame(image.name, title, c2w, intrinsics, image)
 
 

@@ -28,6 +28,9 @@ _DAMAGED = (
 )
 """What Pillow raises for files that are no images, or are damaged ones."""
 
+_ORIENTATION = 0x0112
+"""The EXIF tag of how a photograph is to be turned; 1 for not at all."""
+
 
 def read_image(path: Path | str) -> Float[Tensor, "h w 3"]:
     """The image in a file, in [0, 1]; transparent parts are composited over black.
@@ -68,6 +71,15 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     with _opened(path) as image:
         return image.size
+
+
+def is_turned(path: Path) -> bool:
+    """Whether the EXIF data of a photograph tell viewers to turn it; False where it has none."""
+    try:
+        with _opened(path) as image:
+            return image.getexif().get(_ORIENTATION, 1) != 1
+    except (InputError, *_DAMAGED):
+        return False
 
 
 def read_pixels(path: Path | str) -> UInt8[np.ndarray, "h w 3"]:

@@ -26,6 +26,7 @@ from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.point_cloud import read_point_cloud
 from gscompleter.errors import InputError, quoted
+from gscompleter.io.image import is_turned
 
 DISTORTED = "distorted"
 """The folder of a model with its lens, beside the undistorted photographs of 3DGS's scripts."""
@@ -150,7 +151,8 @@ def _scene(model: Path, frames: list[Frame], notes: tuple[str, ...]) -> Photogra
     there, missing = with_photographs([placed(f, folders, roots) for f in frames], str(model))
     name = roots[-1].resolve().name
     scene = photographs_of(name, str(model), there)
-    return replace(scene, notes=notes + missing, sparse=_points_of(model))
+    notes += missing + _turned(there[0])
+    return replace(scene, notes=notes, sparse=_points_of(model))
 
 
 def _roots(model: Path) -> list[Path]:
@@ -170,6 +172,16 @@ def _choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
     return (
         f"{len(models)} models lie in {models[best].parent}: the one in {models[best].name} with "
         f"{sizes[best]} images was opened, of the others with {others} nothing is used.",
+    )
+
+
+def _turned(frame: Frame) -> tuple[str, ...]:
+    """What is said where photographs are to be turned, which COLMAP does not do."""
+    if not isinstance(frame.image, Path) or not is_turned(frame.image):
+        return ()
+    return (
+        f"The photographs are to be turned by their EXIF data, as {quoted(frame.name)} is: they "
+        "are used as they are stored, which is how COLMAP saw them.",
     )
 
 
