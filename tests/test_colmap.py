@@ -12,8 +12,9 @@ import torch
 from PIL import Image
 
 from command import run
-from gscompleter import InputError
+from gscompleter import InputError, load_cameras
 from gscompleter.data.colmap.lenses import MODELS, intrinsics_of
+from gscompleter.data.colmap.scene import _roots
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.lens import Distortion, distort
 from gscompleter.data.sparse_points import with_depth_range
@@ -64,6 +65,33 @@ def test_the_folder_of_a_model_and_its_images_file_open_too(tmp_path):
         photographs = open_photographs(path)
         assert photographs.name == "room"
         check_room(photographs)
+
+
+def test_a_scene_may_be_called_by_a_number(tmp_path):
+    """The model of scene 360 does not reach for the photographs beside the folder 360."""
+    write_photographs(tmp_path / "images", views=VIEWS[::-1])
+    for model in ("", "sparse/0", "0"):
+        scene = tmp_path / f"36{len(model)}"
+        write_photographs(scene / "images")
+        write_colmap_binary(scene / model)
+        photographs = open_photographs(scene)
+        assert photographs.name == scene.name
+        check_room(photographs)
+
+
+def test_the_images_file_that_is_named_is_read(tmp_path):
+    """A user's choice of lines of images.txt counts, also where images.bin lies beside it."""
+    write_photographs(tmp_path / "images")
+    model = write_colmap_binary(tmp_path / "sparse")
+    lines = (write_colmap_text(model) / "images.txt").read_text().splitlines()
+    (model / "images.txt").write_text("\n".join(lines[:5]))
+    check_room(open_photographs(model / "images.txt"), [0, 1])
+    assert len(load_cameras(model / "images.txt")) == 2
+    check_room(open_photographs(tmp_path))
+
+
+def test_a_model_at_the_top_of_the_file_system_ends_the_search():
+    assert _roots(Path("/sparse/0"), Path("/sparse/0"))[-1] == Path("/")
 
 
 def test_names_of_files_may_be_written_in_any_case(tmp_path):

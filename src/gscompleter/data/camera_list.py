@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.frame import Frame, capital
-from gscompleter.data.image_folders import image_folders, placed, with_photographs
+from gscompleter.data.image_folders import ImageFinder, with_photographs
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.json_numbers import array_of, number_of, size_of, text_of
 from gscompleter.data.photographs import Photographs, photographs_of
@@ -46,8 +46,8 @@ def open_camera_list(path: Path) -> Iterator[Photographs]:
         InputError: as `read_camera_list`, and where none of the photographs is there.
     """
     file = path / NAME if os.path.isdir(path) else path
-    roots = [file.parent]
-    frames = [placed(f, image_folders(roots), roots) for f in read_camera_list(file)]
+    finder = ImageFinder([file.parent])
+    frames = [finder.placed(frame) for frame in read_camera_list(file)]
     there, notes = with_photographs(frames, str(file))
     name = file.resolve().parent.name if file.name == NAME else file.stem
     yield replace(photographs_of(name, str(file), there), notes=notes)

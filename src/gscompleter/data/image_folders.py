@@ -7,7 +7,7 @@ between systems, so names are looked for as they are written first, then in any 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -25,15 +25,7 @@ MAX_NAMED = 3
 
 def find_path(folder: Path, relative: str) -> Path | None:
     """The file or folder `relative` below `folder`, in any case; None where there is none."""
-    if os.path.exists(folder / relative):
-        return folder / relative
-    found = folder
-    for part in PurePosixPath(relative).parts:
-        same = [entry for entry in _entries(found) if entry.casefold() == part.casefold()]
-        if not same:
-            return None
-        found = found / min(same)
-    return found
+    return _Listings().find(folder, relative)
 
 
 def image_folders(roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> list[Path]:
@@ -44,22 +36,32 @@ def image_folders(roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> list
         order: Names of folders in them. Photographs may also lie in the roots themselves.
     """
     found = [find_path(root, name) for root in roots for name in order]
-    return [folder for folder in found if folder is not None] + list(roots)
+    return [folder for folder in found if folder is not None and folder.is_dir()] + list(roots)
 
 
-def find_photograph(folders: Iterable[Path], name: str) -> Path | None:
-    """The photograph of that name, which may lack its ending; None where there is none."""
-    candidates = (find_path(folder, name + ending) for folder in folders for ending in ENDINGS)
-    return next((path for path in candidates if path is not None and os.path.isfile(path)), None)
+class ImageFinder:
+    """Finds the photographs and masks of one scene. Each folder is listed once at most."""
 
+    def __init__(self, roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> None:
+        """`roots` and `order` as in `image_folders`."""
+        masks = [find_path(root, MASKS) for root in roots]
+        self.folders = image_folders(roots, order)
+        self.masks = [folder for folder in masks if folder is not None]
+        self.listings = _Listings()
 
-def find_mask(roots: Iterable[Path], name: str) -> Path | None:
-    """The mask of the photograph of that name: `masks/NAME.png`, with its ending or without."""
-    folders = [find_path(root, MASKS) for root in roots]
-    stem = str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).name else name
-    names = (f"{name}.png", f"{stem}.png")
-    candidates = (find_path(folder, n) for folder in folders if folder for n in names)
-    return next((path for path in candidates if path is not None and os.path.isfile(path)), None)
+    def placed(self, frame: Frame) -> Frame:
+        """The frame with its photograph and its mask, as far as they are found."""
+        name = PurePosixPath(frame.name)
+        masks = (f"{name}.png", f"{name.parent / name.stem}.png")
+        photographs = [frame.name + ending for ending in ENDINGS]
+        return replace(
+            frame, image=self._file(self.folders, photographs), mask=self._file(self.masks, masks)
+        )
+
+    def _file(self, folders: Sequence[Path], names: Sequence[str]) -> Path | None:
+        """The first of the files of these names in the folders."""
+        found = (self.listings.find(folder, name) for folder in folders for name in names)
+        return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
 def with_photographs(
@@ -81,12 +83,6 @@ def with_photographs(
     return tuple(there), _note(missing, len(frames), title)
 
 
-def placed(frame: Frame, folders: Sequence[Path], roots: Sequence[Path]) -> Frame:
-    """The frame with its photograph and its mask, as far as they are found."""
-    image = find_photograph(folders, frame.name)
-    return replace(frame, image=image, mask=find_mask(roots, frame.name))
-
-
 def _note(missing: Sequence[str], total: int, title: str) -> tuple[str, ...]:
     if not missing:
         return ()
@@ -99,8 +95,29 @@ def _note(missing: Sequence[str], total: int, title: str) -> tuple[str, ...]:
     )
 
 
-def _entries(folder: Path) -> list[str]:
-    try:
-        return os.listdir(folder)
-    except OSError:
-        return []
+class _Listings:
+    """What lies in folders, by names in lower case, for as long as one scene is opened."""
+
+    def __init__(self) -> None:
+        self.known: dict[Path, dict[str, str]] = {}
+
+    def find(self, folder: Path, relative: str) -> Path | None:
+        """As `find_path`."""
+        if os.path.exists(folder / relative):
+            return folder / relative
+        found = folder
+        for part in PurePosixPath(relative).parts:
+            name = self._entries(found).get(part.casefold())
+            if name is None:
+                return None
+            found = found / name
+        return found
+
+    def _entries(self, folder: Path) -> dict[str, str]:
+        if folder not in self.known:
+            try:
+                names = os.listdir(folder)
+            except (OSError, ValueError):
+                names = []
+            self.known[folder] = {name.casefold(): name for name in sorted(names, reverse=True)}
+        return self.known[folder]

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.frame import Frame
-from gscompleter.data.image_folders import find_photograph
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import pose_defect
@@ -70,7 +69,7 @@ def _frame(
 ) -> Frame:
     name = f"{number:06d}"
     title = f"frame {number} of {poses}"
-    return Frame(name, title, c2w, intrinsics, find_photograph([images], name) or images / name)
+    return Frame(name, title, c2w, intrinsics, images / name)
 
 
 def _camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,9 +17,8 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import (
     FOLDERS,
     ORIGINALS,
+    ImageFinder,
     find_path,
-    image_folders,
-    placed,
     with_photographs,
 )
 from gscompleter.data.intrinsics import Intrinsics
@@ -58,17 +57,19 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
         InputError: where there is no model or it is damaged, and where none of its photographs
             is there.
     """
-    models = _models(path)
     if is_image_file(path):
-        _check_cameras_beside(path)
+        yield _scene(path.parent, path.parent, read_image_file(path), ())
+        return
+    models = _models(path)
     if not models:
         raise InputError(
             f"There is no COLMAP model in {quoted(str(path))}; a folder sparse/0 with its cameras "
             "and images, as .bin or .txt, is needed."
         )
-    frames = [_frames(model) for model in models]
+    frames = [_frames_of(model) for model in models]
     best = max(range(len(models)), key=lambda number: len(frames[number]))
-    yield _scene(models[best], frames[best], _choice(models, [len(f) for f in frames], best))
+    notes = _choice(models, [len(f) for f in frames], best)
+    yield _scene(path, models[best], frames[best], notes)
 
 
 def read_image_file(path: Path) -> list[Frame]:
@@ -77,8 +78,13 @@ def read_image_file(path: Path) -> list[Frame]:
     Raises:
         InputError: where it is damaged, or there is no cameras file beside it.
     """
-    _check_cameras_beside(path)
-    return _frames(path.parent)
+    cameras = _file(path.parent, "cameras")
+    if cameras is None:
+        raise InputError(
+            f"There is no cameras.txt or cameras.bin beside {quoted(str(path))}, and it holds "
+            "poses only; copy it there from the same model."
+        )
+    return _frames(cameras, path)
 
 
 def is_image_file(path: Path) -> bool:
@@ -87,18 +93,8 @@ def is_image_file(path: Path) -> bool:
     return name in {f"images{ending}" for ending in _READERS} and os.path.isfile(path)
 
 
-def _check_cameras_beside(path: Path) -> None:
-    if _file(path.parent, "cameras") is None:
-        raise InputError(
-            f"There is no cameras.txt or cameras.bin beside {quoted(str(path))}, and it holds "
-            "poses only; copy it there from the same model."
-        )
-
-
 def _models(path: Path) -> list[Path]:
     """The folders of the models of a scene, all of one home."""
-    if is_image_file(path):
-        return [path.parent] if _is_model(path.parent) else []
     if not os.path.isdir(path):
         return []
     homes = [find_path(path, home) for home in HOMES]
@@ -121,11 +117,15 @@ def _file(folder: Path, name: str) -> Path | None:
     return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
-def _frames(model: Path) -> list[Frame]:
+def _frames_of(model: Path) -> list[Frame]:
+    cameras, images = (_file(model, name) for name in FILES)
+    assert cameras is not None
+    assert images is not None
+    return _frames(cameras, images)
+
+
+def _frames(cameras_file: Path, images_file: Path) -> list[Frame]:
     """The frames of a model in the order of its file, without photographs."""
-    cameras_file, images_file = (_file(model, name) for name in FILES)
-    assert cameras_file is not None
-    assert images_file is not None
     cameras = _READERS[cameras_file.suffix.lower()].read_cameras(cameras_file)
     images = _READERS[images_file.suffix.lower()].read_images(images_file)
     if not images:
@@ -143,26 +143,35 @@ def _frame(image: PosedImage, cameras: dict[int, Intrinsics], path: Path) -> Fra
     return Frame(image.name, title, image.c2w(), cameras[image.camera], None)
 
 
-def _scene(model: Path, frames: list[Frame], notes: tuple[str, ...]) -> Photographs:
-    roots = _roots(model)
+def _scene(
+    scene: Path, model: Path, frames: Sequence[Frame], notes: tuple[str, ...]
+) -> Photographs:
+    roots = _roots(scene, model)
     # Beside a model with a lens, `images` may hold photographs that have lost theirs.
     lens = any(root.name.casefold() == DISTORTED for root in roots)
-    folders = image_folders(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
-    there, missing = with_photographs([placed(f, folders, roots) for f in frames], str(model))
-    name = roots[-1].resolve().name
-    scene = photographs_of(name, str(model), there)
+    finder = ImageFinder(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
+    there, missing = with_photographs([finder.placed(frame) for frame in frames], str(model))
     notes += missing + _turned(there[0])
-    return replace(scene, notes=notes, sparse=_points_of(model))
+    photographs = photographs_of(roots[-1].name, str(model), there)
+    return replace(photographs, notes=notes, sparse=_points_of(model))
 
 
-def _roots(model: Path) -> list[Path]:
-    """The folder of a model and those above it, up to that of the scene."""
-    homes = {part for home in HOMES for part in home.split("/")}
-    roots = [model]
-    # `resolve` names the folders above one that was given as `.`.
-    while roots[-1].resolve().name.casefold() in homes or roots[-1].resolve().name.isdecimal():
-        roots.append(roots[-1].resolve().parent)
+def _roots(scene: Path, model: Path) -> list[Path]:
+    """The folder of a model and those above it, up to that of the scene.
+
+    Where the path of the model itself was given, its name and the next ones tell where that is.
+    """
+    top, roots = Path(os.path.abspath(scene)), [Path(os.path.abspath(model))]
+    while top in roots[-1].parents or _is_part(roots[-1]):
+        roots.append(roots[-1].parent)
     return roots
+
+
+def _is_part(folder: Path) -> bool:
+    """Whether a folder is one of `HOMES` or a numbered model in it, rather than a scene."""
+    parts = {part for home in HOMES if home for part in home.split("/")}
+    numbered = folder.name.isdecimal() and folder.parent.name.casefold() in parts
+    return numbered or folder.name.casefold() in parts
 
 
 def _choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
