@@ -2,65 +2,53 @@
 
 from __future__ import annotations
 
-import types
-import typing
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-import yaml
+from annotated_types import Interval
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
+from gscompleter.settings import Count, Settings, Share, Weight, read_yaml, updated
 
-C = TypeVar("C")
+Pixels = Annotated[int, Interval(ge=0, le=4096)]
+Step = Annotated[float, Interval(gt=0, le=10)]
+Memory = Annotated[float, Interval(ge=0, lt=1)]
 
 
 @dataclass(frozen=True)
-class AnchorConfig:
-    max_rotation: float = 45.0
+class AnchorConfig(Settings):
+    max_rotation: Annotated[float, Interval(ge=0, le=180)] = 45.0
     """Largest turn away from the target, in degrees, that still leaves overlap."""
     selection: Literal["widest", "nearest"] = "widest"
     """`widest` baseline is the paper's rule; `nearest` view is its ablation without it."""
 
 
 @dataclass(frozen=True)
-class AffineConfig:
+class AffineConfig(Settings):
     bridge: Literal["anchor", "target", "none"] = "anchor"
     """View through which depths are compared. `target` and `none` are ablations of the paper."""
-    max_trials: int = 512
-    """Two-point hypotheses, all scored at once."""
-    max_pixels: int = 8192
-    """Pixels the hypotheses are scored on, drawn at random where there are more."""
-    residual_threshold: float = 0.05
-    """Largest residual of an inlier, relative to the context depth."""
-    min_inliers: float = 0.3
-    """Smallest share of inliers that makes a fit trustworthy."""
-    min_pixels: int = 64
-    """Fewest comparable pixels; under it there is nothing to fit."""
-    min_agreement: float | None = 0.3
+    min_agreement: Share | None = 0.3
     """Smallest share of what the target sees of the scene that must agree with an affine fitted
     through the anchor, before one that is fitted at the target may take its place. None trusts the
     anchor always, as the paper does."""
-    min_depth_spread: float = 0.05
-    """Smallest spread of the predicted depths ((p95 - p5) / median) that tells scale and shift
-    apart; under it only a scale is fitted."""
 
 
 @dataclass(frozen=True)
-class RegistrationConfig:
+class RegistrationConfig(Settings):
     affine: AffineConfig = AffineConfig()
     """Settings of the coarse fit."""
-    iterations: int = 20
+    iterations: Count = 20
     """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
-    learning_rate: float = 0.008
+    learning_rate: Step = 0.008
     """Step of Adam, in the unit that `step` names."""
     schedule: Literal["falling", "constant"] = "falling"
     """Whether the step falls linearly to nothing, so that few iterations reach far and still end
     close."""
-    beta1: float = 0.5
+    beta1: Memory = 0.5
     """Adam's memory of gradients. Its usual 0.9 remembers half of so short a run and overshoots."""
-    beta2: float = 0.9
+    beta2: Memory = 0.9
     """Adam's memory of their squares; usually 0.999."""
     step: Literal["relative", "literal"] = "relative"
     """`relative`: of each primitive's own distance, so that the unit of the scene does not
@@ -68,11 +56,11 @@ class RegistrationConfig:
     as in the paper."""
     degrees_of_freedom: Literal[1, 3] = 1
     """1 slides along the camera ray; 3 moves freely (ablation of the paper)."""
-    depth_weight: float = 1.0
+    depth_weight: Weight = 1.0
     """λ_d of Eq. 9."""
-    stereo_weight: float = 1.0
+    stereo_weight: Weight = 1.0
     """λ_s of Eq. 9."""
-    rgb_weight: float = 0.0
+    rgb_weight: Weight = 0.0
     """λ_c of Eq. 9; 0.1 in the paper. With a constant footprint a primitive looks the same at the
     target wherever it stands on its ray, and the term tells it nothing."""
     depth_of: Literal["candidates", "composite"] = "candidates"
@@ -84,71 +72,56 @@ class RegistrationConfig:
     mask_occluded: bool = True
     """Leave out of the stereo loss what the anchor cannot see: a new surface that lies behind the
     context there. The paper's literal loss pulls it forward onto the context."""
-    occlusion_tolerance: float = 0.05
-    """How far behind the context, relative to depth, still counts as the same surface."""
-    carry_tolerance: float = 0.02
-    """Largest error of depth, relative to the scene's, of an observed pixel that is taken for an
-    example by the holes."""
     carry_into_holes: bool = True
     """Let pixels in a hole, where the scene has no depth to agree with, move like the observed
     ones around them, so that no step remains at the border. The paper leaves them to the affine."""
 
 
 @dataclass(frozen=True)
-class FreeSpaceConfig:
-    num_steps: int = 48
+class FreeSpaceConfig(Settings):
+    num_steps: Annotated[int, Interval(ge=0, le=1000)] = 48
     """How often a candidate slides back before it is given up; 0 checks nothing, as in the
     paper."""
-    step: float = 0.04
-    """By how much it slides each time, relative to its distance."""
-    clearance: float = 0.01
-    """How far behind the scene's surface, relative to depth, a camera that sees this surface must
-    find the candidate. What lies a little behind is hidden there, and still closes the hole."""
-    border: int = 3
-    """Pixels beyond the border of an image at which a Gaussian still shows within it."""
 
 
 @dataclass(frozen=True)
-class HoleConfig:
-    max_alpha: float = 0.5
+class HoleConfig(Settings):
+    max_alpha: Annotated[float, Interval(gt=0, le=1)] = 0.5
     """τ of Eq. 10: a pixel that the scene covers by less is a hole."""
-    dilation: int = 3
+    dilation: Pixels = 3
     """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
-    neighbourhood: int | None = 16
+    neighbourhood: Pixels | None = 16
     """Pixels around a hole within which candidates are registered. Those farther away neither
     join the scene nor inform those that do. None registers all of them, as the paper does."""
 
 
 @dataclass(frozen=True)
-class RefineConfig:
-    iterations: int = 10
+class RefineConfig(Settings):
+    iterations: Count = 10
     """Steps of Adam; 0 leaves the opacities as they were lifted (the paper's ablation w/o MV)."""
-    learning_rate: float = 0.24
+    learning_rate: Step = 0.24
     """Step of Adam, on what `parametrization` names."""
     parametrization: Literal["logit", "linear"] = "logit"
     """What Adam moves: the logit, as 3DGS stores it, or the opacity itself, clamped to [0, 1]."""
-    target_weight: float = 0.1
+    target_weight: Weight = 0.1
     """λ of Eq. 11, on the synthesized image."""
-    num_views: int = 2
+    num_views: Count = 2
     """How many of the nearest context views take part."""
 
 
 @dataclass(frozen=True)
-class HarmConfig:
-    tolerance: float | None = 0.045
+class HarmConfig(Settings):
+    tolerance: Annotated[float, Interval(ge=0, le=100)] | None = 0.045
     """Largest loss of PSNR, in dB, that any context view may suffer; None checks nothing, as in
     the paper."""
-    max_trials: int = 16
-    """How often harmful Gaussians lose half of their opacity before a view that still does not
-    hold loses all it sees of them."""
 
 
 @dataclass(frozen=True)
-class CompleterConfig:
+class CompleterConfig(Settings):
     """Settings of the four stages. The defaults are ours, wherever measurement shows better than
     the paper's; `docs/design.md` has the table."""
 
-    margin: float = 0.25
+    margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Share of its size by which the target image is extended on every side while it is completed,
     so that a camera that moves on from the target does not meet the next hole at its border. The
     paper completes what the target itself sees."""
@@ -268,8 +241,9 @@ def named_config(name: str) -> CompleterConfig:
     base, _, ablation = name.rpartition("/")
     if (base or "default") not in bases or ablation not in ABLATIONS:
         raise InputError(
-            f"There is no config {name!r}; choose default, paper or one of {', '.join(ABLATIONS)} "
-            "(paper/no-sa for an ablation of the paper's settings), or give a YAML file."
+            f"There is no config '{quoted(name)}'; choose default, paper or one of "
+            f"{', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
+            "give a YAML file."
         )
     return ABLATIONS[ablation](bases[base or "default"])
 
@@ -278,57 +252,12 @@ def load_config(source: str) -> CompleterConfig:
     """A config by name, or from a YAML file that names only what differs from its `base`.
 
     Raises:
-        InputError: where the file is missing or not YAML, or names an unknown setting or a value
-            of the wrong type.
+        InputError: where the file is missing or not YAML, or names an unknown setting, or a value
+            of the wrong type or out of its range.
     """
     path = Path(source)
     if path.suffix not in {".yaml", ".yml"}:
         return named_config(source)
-    try:
-        content = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise InputError(f"Cannot read the config {path}: {error.strerror}.") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"The config {path} is not YAML: {' '.join(str(error).split())}."
-        ) from error
-    content = {} if content is None else content
-    if not isinstance(content, Mapping):
-        raise InputError(f"The config {path} must map settings to values, as in `holes: ...`.")
-    changes = dict(content)
+    changes = read_yaml(path)
     base = named_config(str(changes.pop("base", "default")))
-    return updated(base, changes, str(path))
-
-
-def updated(config: C, changes: Mapping[str, Any], where: str) -> C:
-    """`config` with `changes`, a mapping of its fields in which dataclasses are mappings too."""
-    hints = typing.get_type_hints(type(config))
-    values = {}
-    for name, value in changes.items():
-        if name not in hints:
-            known = ", ".join(field.name for field in fields(config))  # type: ignore[arg-type]
-            raise InputError(f"{where}: there is no setting {name!r}; choose one of {known}.")
-        current = getattr(config, name)
-        if is_dataclass(current):
-            if not isinstance(value, Mapping):
-                raise InputError(f"{where}: {name} holds settings of its own, got {value!r}.")
-            values[name] = updated(current, value, f"{where}: {name}")
-        else:
-            values[name] = _checked(value, hints[name], f"{where}: {name}")
-    return replace(config, **values)  # type: ignore[type-var]
-
-
-def _checked(value: Any, hint: Any, where: str) -> Any:
-    """`value` if it is what the annotation `hint` allows; a whole number passes as a float."""
-    if typing.get_origin(hint) is typing.Literal:
-        allowed = typing.get_args(hint)
-        if value in allowed and not isinstance(value, bool):
-            return value
-        raise InputError(f"{where} must be one of {', '.join(map(str, allowed))}, got {value!r}.")
-    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    if float in options and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if isinstance(value, options) and (bool in options or not isinstance(value, bool)):
-        return value
-    names = " or ".join("null" if o is type(None) else o.__name__ for o in options)
-    raise InputError(f"{where} must be {names}, got {value!r}.")
+    return updated(base, changes, f"{quoted(source)}: ")
