@@ -15,8 +15,8 @@ from chunk_files import as_tensor, example, save_chunk
 from command import run
 from gscompleter import GSCompleter, InputError
 from gscompleter.completer import STAGES
+from gscompleter.config.generators import PEFieldSettings
 from gscompleter.data.cases import Case
-from gscompleter.generators import DiffusionSettings
 from gscompleter.io.image import read_image
 from gscompleter.metrics.image import psnr
 from gscompleter.reports.plots import plots
@@ -162,7 +162,7 @@ def test_a_run_killed_five_times_ends_as_one_that_was_not(scenes, tmp_path):
 
 def test_a_folder_remembers_what_its_generator_was_told(tmp_path):
     def config(**settings) -> RunConfig:
-        return RunConfig(generator="pe-field", generator_settings=DiffusionSettings(**settings))
+        return RunConfig(generator="pe-field", generator_settings=PEFieldSettings(**settings))
 
     claim(tmp_path, config(steps=4))
     claim(tmp_path, config(steps=4, offload=True))  # which changes no number

@@ -9,12 +9,14 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass
 from importlib import import_module
 from io import StringIO
+from itertools import dropwhile, takewhile
 from typing import Annotated, Any, Union
 
 import tyro
+from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
 from gscompleter import __version__
-from gscompleter.commands.generator_options import registry
+from gscompleter.commands.generator_options import generator_flags
 from gscompleter.commands.options import (
     CompleteOptions,
     DemoOptions,
@@ -24,8 +26,8 @@ from gscompleter.commands.options import (
     TablesOptions,
 )
 from gscompleter.config import CompleterConfig, load_config
+from gscompleter.config.settings import checked
 from gscompleter.errors import InputError, quoted
-from gscompleter.settings import checked
 
 # Where each command lives. Its module is imported once the arguments are known to be right, so
 # that `--help` does not wait for torch.
@@ -37,6 +39,10 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "index": (IndexOptions, "gscompleter.commands.evaluate", "run_index"),
     "models": (ModelsOptions, "gscompleter.commands.models", "run_models"),
 }
+
+Command: Any = Union[  # noqa: UP007  (of as many as there are)
+    tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _, _) in COMMANDS.items())
+]
 
 
 def main() -> None:
@@ -80,12 +86,12 @@ def parsed(words: Sequence[str]) -> Any:
         with redirect_stderr(said):
             config, words = config_named(words)
             return tyro.cli(
-                commands(config),
+                Command,
                 prog="gscompleter",
                 description="Complete 3D Gaussian Splatting scenes: generate, then register.",
                 args=words,
                 config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-                registry=registry,
+                registry=registry_from(config),
             )
     except SystemExit as stop:
         if not stop.code:
@@ -108,27 +114,29 @@ def config_named(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[str]]:
     return load_config(named.config), others
 
 
-def commands(config: CompleterConfig) -> Any:
-    """The commands as tyro reads them. What `complete` is not told of its config is as in `config`."""
-    missing = tyro.MISSING
-    complete = CompleteOptions(
-        folder=missing, context=missing, target=missing, out=missing, config=config
-    )
-    return Union[  # noqa: UP007  (of as many as there are)
-        tuple(
-            Annotated[kind, tyro.conf.subcommand(name, default=complete)]
-            if kind is CompleteOptions
-            else Annotated[kind, tyro.conf.subcommand(name)]
-            for name, (kind, _, _) in COMMANDS.items()
-        )
-    ]
+def registry_from(config: CompleterConfig) -> ConstructorRegistry:
+    """How tyro reads our classes: a CompleterConfig begins as `config`."""
+
+    def config_flags(info: StructTypeInfo) -> Any:
+        if info.type is not CompleterConfig or info.default == config:
+            return None
+        return ConstructorRegistry.get_struct_spec(StructTypeInfo.make(info.type, config, False))
+
+    registry = ConstructorRegistry()
+    registry.struct_rule(generator_flags)
+    registry.struct_rule(config_flags)
+    return registry
 
 
 def unboxed(box: str, words: Sequence[str]) -> str:
     """The sentence in the box that tyro draws around an error; indented or below it stands help."""
-    lines = [line[2:-2].rstrip() for line in box.splitlines()[1:]]
-    end = next(i for i, line in enumerate(lines) if not line or line.startswith("──"))
-    sentence = " ".join(line.strip() for line in lines[:end] if not line.startswith(" " * 5))
+
+    def is_empty(line: str) -> bool:
+        return not line.strip("─- ")
+
+    lines = [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
+    said = takewhile(lambda line: not is_empty(line), dropwhile(is_empty, lines))
+    sentence = " ".join(line.strip() for line in said if not line.startswith(" " * 5))
     usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
     needed = "" if usage is None else f"; give {lines[usage].strip()}"
     command = " ".join(["gscompleter", *(word for word in words[:1] if word in COMMANDS)])

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.options import CompleteOptions, GeneratorOptions
+from gscompleter.commands.options import CompleteOptions
 from gscompleter.completer import GSCompleter
-from gscompleter.config import CompleterConfig, load_config
 from gscompleter.data.scene import load_camera, load_cameras, load_views, read_index
-from gscompleter.errors import InputError
-from gscompleter.generators import DiffusionSettings, load_generator
+from gscompleter.errors import InputError, quoted
+from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.ply import load_ply
 from gscompleter.progress import shown_on
@@ -26,6 +26,8 @@ from gscompleter.types import Completion, View
 
 MIN_SIZE = 16
 """Shorter side of an image, in pixels, under which there is nothing to match and to score."""
+MAX_DIGITS = 9
+"""Characters of the longest number of a frame."""
 
 
 def run_completion(options: CompleteOptions) -> None:
@@ -45,58 +47,41 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     Raises:
         InputError: anything about the input that the user can mend; nothing is written then.
     """
-    console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, options.overwrite)
-    device = choose_device(options.device)
-    renderer = load_renderer(device)
-    config = load_config(options.config)
-    if options.synthesis.generator == "oracle":  # a photograph ends where the target's image ends
-        config = replace(config, margin=0.0)
     check_context(options)
+    device = choose_device(options.device)
     views = [view.to(device) for view in read_views(options, options.context)]
     targets = read_targets(options)
     scene = None
     if options.scene is not None:
         scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite).to(device)
+    completer = completer_for(options, targets, device)
+    said = {"settings": settings_of(options), "seed": options.seed, "device": device}
+    with output_folder(options.out, options.overwrite) as folder:
+        with shown_on(None if options.quiet else Console(stderr=True)):
+            completion = completer(views, [t.camera.to(device) for t in targets], scene)
+        summary = write_report(folder, completion, targets, completer.renderer, said)
+    return summary, completion
 
+
+def completer_for(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
+    """The models that the options name, and the settings of the stages.
+
+    Raises:
+        InputError: where a name is unknown, or weights or packages are missing.
+    """
     photographs = [
         View(target.photograph, target.camera, target.frame)
         for target in targets
         if target.photograph is not None
     ]
-    completer = GSCompleter(
+    generator = options.synthesis
+    return GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
-        load_generator(
-            options.synthesis.generator,
-            options.seed,
-            photographs,
-            device,
-            generator_settings(options.synthesis),
-        ),
-        renderer,
-        config,
+        load_generator(generator.name, options.seed, photographs, device, generator.settings()),
+        load_renderer(device),
+        options.config,
         options.seed,
-    )
-    with output_folder(options.out, options.overwrite) as folder:
-        with shown_on(None if options.quiet else console):
-            completion = completer(views, [t.camera.to(device) for t in targets], scene)
-        settings = settings_of(options, config)
-        summary = write_report(
-            folder, completion, views, targets, renderer, settings, options.seed, device
-        )
-    return summary, completion
-
-
-def generator_settings(options: GeneratorOptions) -> DiffusionSettings:
-    """What the generator is told."""
-    return DiffusionSettings(
-        path=options.generator_path,
-        steps=options.generator_steps,
-        retries=options.generator_retries,
-        prompt=options.generator_prompt,
-        depth=options.generator_depth,
-        at_once=options.generator_at_once,
-        offload=options.generator_offload,
     )
 
 
@@ -137,23 +122,33 @@ def read_targets(options: CompleteOptions) -> list[Target]:
     resolution, near, far = options.resolution, options.near, options.far
     targets = []
     for word in options.target:
-        if not is_whole_number(word):
+        frame = frame_number(word)
+        if frame is None:
             cameras = load_cameras(word, resolution, near, far)
             targets += [Target(camera) for camera in cameras]
-        elif index.frame(int(word)).photograph is not None:
-            (view,) = read_views(options, [int(word)])
+        elif index.frame(frame).photograph is not None:
+            (view,) = read_views(options, [frame])
             targets.append(Target(view.camera, view.frame, view.image))
         else:
-            camera = load_camera(options.folder, int(word), resolution, near, far)
-            targets.append(Target(camera, int(word)))
+            camera = load_camera(options.folder, frame, resolution, near, far)
+            targets.append(Target(camera, frame))
     return targets
 
 
-def is_whole_number(word: str) -> bool:
-    return word.lstrip("-").isdigit()
+def frame_number(word: str) -> int | None:
+    """The number that `word` writes, or None where it names a file.
+
+    Raises:
+        InputError: where it has more digits than there are frames anywhere.
+    """
+    if re.fullmatch("-?[0-9]+", word) is None:
+        return None
+    if len(word) > MAX_DIGITS:
+        raise InputError(f"There is no frame {quoted(word)}; name one by its number.", "target")
+    return int(word)
 
 
-def settings_of(options: CompleteOptions, config: CompleterConfig) -> dict[str, Any]:
+def settings_of(options: CompleteOptions) -> dict[str, Any]:
     """Everything that decided the result, for `summary.json`."""
     return {
         "folder": str(options.folder),
@@ -162,12 +157,12 @@ def settings_of(options: CompleteOptions, config: CompleterConfig) -> dict[str, 
         "scene": None if options.scene is None else str(options.scene),
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
-        **asdict(options.synthesis),
-        "uses_target_photographs": options.synthesis.generator == "oracle",
+        **options.synthesis.as_summary(),
+        "uses_target_photographs": options.synthesis.name == "oracle",
         "resolution": None if options.resolution is None else list(options.resolution),
         "near": options.near,
         "far": options.far,
-        "config": asdict(config),
+        "config": asdict(options.config),
     }
 
 

@@ -1,10 +1,10 @@
-"""`--generator NAME` and `--generator-SETTING VALUE`, derived from the settings of each generator."""
+"""`--generator NAME` and `--generator-SETTING VALUE`, derived from each generator's settings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from typing import Any, cast
 
 from tyro.constructors import (
     ConstructorRegistry,
@@ -13,8 +13,8 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from gscompleter.config.generators import GENERATORS, GeneratorSettings, settings_class
 from gscompleter.errors import InputError, quoted
-from gscompleter.generator_settings import GENERATORS, GeneratorSettings, settings_class
 
 PREFIX = "generator_"
 DEFAULT = "warp-inpaint"
@@ -59,13 +59,8 @@ def generators_with(setting: str) -> list[str]:
     ]
 
 
-registry = ConstructorRegistry()
-"""What tyro reads GeneratorOptions by."""
-
-
-@registry.struct_rule
-def flags(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """A flag for the name, and one for each setting that any generator knows."""
+def generator_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """How tyro reads GeneratorOptions: by name, and by the settings that any generator knows."""
     if info.type is not GeneratorOptions:
         return None
     kinds = "; ".join(f"{name}: {kind.__doc__}" for name, kind in GENERATORS.items())
@@ -74,8 +69,8 @@ def flags(info: StructTypeInfo) -> StructConstructorSpec | None:
     for name, kind in GENERATORS.items():
         for spec in specs_of(kind):
             known.setdefault(spec.name, []).append((name, spec))
-    name = StructFieldSpec("generator", str, DEFAULT, sentence)
-    return StructConstructorSpec(options_from, (name, *map(flag, known.values())))
+    chosen = StructFieldSpec("generator", str, DEFAULT, sentence)
+    return StructConstructorSpec(options_from, (chosen, *map(flag, known.values())))
 
 
 def specs_of(kind: type[GeneratorSettings]) -> tuple[StructFieldSpec, ...]:
@@ -99,7 +94,7 @@ def flag(known: Sequence[tuple[str, StructFieldSpec]]) -> StructFieldSpec:
     switch = first.type is bool
     return StructFieldSpec(
         PREFIX + first.name,
-        bool if switch else first.type | None,
+        first.type if switch else cast(type, first.type | None),
         False if switch else None,
         " ".join(f"{', '.join(names)}: {text}" for text, names in sentences.items()),
     )

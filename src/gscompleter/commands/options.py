@@ -14,7 +14,7 @@ from annotated_types import Interval
 
 from gscompleter.commands.generator_options import GeneratorOptions
 from gscompleter.config import CompleterConfig
-from gscompleter.settings import Seed, Settings
+from gscompleter.config.settings import Seed, Settings
 
 Frame = Annotated[int, Interval(ge=0, lt=10**9)]
 Device = Literal["auto", "cpu", "cuda"]

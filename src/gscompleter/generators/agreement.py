@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
+from gscompleter.generators import Synthesis
 from gscompleter.generators.robust import robust_affine
 from gscompleter.generators.warp import Warped
 from gscompleter.interpolation import smoothed
-
 
 BLUR = 2
 """Radius, in pixels, over which colours are averaged before they are compared: a painted edge may
@@ -68,7 +68,7 @@ def checked(
     seed: int,
     observed: Warped,
     retries: int = 0,
-) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]:
+) -> Synthesis:
     """An image painted from a seed, its colours brought to those observed, and notes on it.
 
     Args:
@@ -92,7 +92,7 @@ def checked(
             f"The generator painted no finite image ({len(found)} seed(s) tried); see that its "
             "weights are sound, or choose another generator."
         )
-    return best.image, notes_on(best, len(found))
+    return Synthesis(best.image, notes_on(best, len(found)))
 
 
 def compare(
@@ -116,8 +116,7 @@ def compare(
     contrast = quantile(plain.abs().mean(dim=-1), QUANTILE)
     limit = max(LEAST, MAX_SHARE * contrast)
     plausible = bool(
-        ((gain >= 1 / MAX_GAIN) & (gain <= MAX_GAIN)).all()
-        and (offset.abs() <= MAX_OFFSET).all()
+        ((gain >= 1 / MAX_GAIN) & (gain <= MAX_GAIN)).all() and (offset.abs() <= MAX_OFFSET).all()
     )
     agrees = plausible and residual <= limit
     corrected = (gain * image + offset).clamp(0, 1) if agrees else image

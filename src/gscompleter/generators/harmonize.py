@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-
 MIN_PIXELS = 100
 """Fewest pixels that two photographs must share for their gains to be compared."""
 DARKEST = 0.05

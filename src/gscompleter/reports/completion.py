@@ -17,7 +17,7 @@ from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
 from gscompleter.metrics.image import psnr, ssim
 from gscompleter.render import Renderer
-from gscompleter.types import Camera, Completion, TargetCompletion, View
+from gscompleter.types import Camera, Completion, TargetCompletion
 
 
 @dataclass(frozen=True)
@@ -63,28 +63,23 @@ def compare(
 
 def summarize(
     completion: Completion,
-    views: Sequence[View],
     targets: Sequence[Target],
     context_images: Sequence[Images],
     target_images: Sequence[Images],
-    settings: Mapping[str, Any],
-    seed: int,
-    device: str,
+    said: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The content of `summary.json`."""
+    """The content of `summary.json`: what was `said` in advance, and what came of it."""
     return {
         "version": __version__,
-        "settings": dict(settings),
-        "seed": seed,
-        "device": device,
+        **said,
         "context": [
             {"frame": view.frame, **images.scores()}
-            for view, images in zip(views, context_images, strict=True)
+            for view, images in zip(completion.views, context_images, strict=True)
         ],
         "targets": [
             {
                 "frame": target.frame,
-                "anchor": views[result.anchor].frame,
+                "anchor": completion.views[result.anchor].frame,
                 "anchor_fallback": result.anchor_fallback,
                 "hole_fraction": result.hole_fraction,
                 "affine": {
@@ -113,23 +108,25 @@ def provenance(result: TargetCompletion) -> int | None:
 def write_report(
     folder: Path,
     completion: Completion,
-    views: Sequence[View],
     targets: Sequence[Target],
     renderer: Renderer,
-    settings: Mapping[str, Any],
-    seed: int,
-    device: str,
+    said: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Write `context.ply`, `completed.ply`, `images/` and `summary.json`; returns the summary.
+
+    Args:
+        folder: Where to.
+        completion: What was done.
+        targets: The cameras it was done for, in their order.
+        renderer: Draws the scene before and after.
+        said: Settings, seed and device, for the summary.
 
     Raises:
         InputError: where a file cannot be written.
     """
-    context_images = [compare(completion, v.camera, v.image, renderer) for v in views]
+    context_images = [compare(completion, v.camera, v.image, renderer) for v in completion.views]
     target_images = [compare(completion, t.camera, t.photograph, renderer) for t in targets]
-    summary = summarize(
-        completion, views, targets, context_images, target_images, settings, seed, device
-    )
+    summary = summarize(completion, targets, context_images, target_images, said)
     save_ply(folder / "context.ply", completion.context)
     save_ply(folder / "completed.ply", completion.scene, provenance=True)
     (folder / "images").mkdir()

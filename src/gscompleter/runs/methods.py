@@ -3,7 +3,6 @@ synthesized image take the one that `full` takes."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -13,18 +12,16 @@ from torch import Tensor
 
 from gscompleter.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.baselines.reggs import RegGSConfig, register_by_similarity
-from gscompleter.completer import Clock, GSCompleter, ranged
-from gscompleter.config import ABLATIONS, CompleterConfig, HoleConfig, named_config
+from gscompleter.completer import Clock, GSCompleter
+from gscompleter.config import ABLATIONS, HoleConfig, named_config
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator
-from gscompleter.geometry import widened
 from gscompleter.metrics.scores import Outcome
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render import Renderer
-from gscompleter.stages.anchor import lift, select_anchor, synthesize
-from gscompleter.stages.context import init_context
+from gscompleter.stages.anchor import lift, select_anchor
 from gscompleter.stages.integration import hole_mask
-from gscompleter.types import Camera, Gaussians, SceneContext, View, merge
+from gscompleter.types import Camera, Gaussians, View, merge
 
 
 @dataclass(frozen=True)
@@ -36,20 +33,12 @@ class Parts:
     renderer: Renderer
     seed: int = 0
     """Of everything random."""
-    margin: float | None = None
-    """Takes the place of `CompleterConfig.margin` where it is given: 0 for generators that know
-    no more than the target's own image."""
     baseline_iterations: int | None = None
     """Most iterations of the baselines; their own numbers if None."""
 
-    def config(self, name: str) -> CompleterConfig:
-        """The settings called `name`, with our margin."""
-        config = named_config(name)
-        return config if self.margin is None else replace(config, margin=self.margin)
-
     def completer(self, name: str = "default") -> GSCompleter:
         """Our method with the settings called `name`."""
-        config = self.config(name)
+        config = named_config(name)
         return GSCompleter(self.reconstructor, self.generator, self.renderer, config, self.seed)
 
     def iterations(self, wanted: int) -> int:
@@ -87,14 +76,10 @@ def start_of(views: Sequence[View], target: Camera, parts: Parts) -> Start:
         raise InputError(
             f"{len(views)} context view was given, and stereo needs at least 2; name more frames."
         )
-    begin = time.perf_counter()
-    near, far = parts.completer().depth_range(views, None)
-    views = tuple(replace(view, camera=ranged(view.camera, near, far)) for view in views)
-    target = ranged(target, near, far)
-    context = init_context(parts.reconstructor, views)
-    seconds = time.perf_counter() - begin
-    holes = hole_mask(parts.renderer.render(context, target), HoleConfig())
-    return Start(views, target, context, holes, seconds)
+    begun = parts.completer().begin(views)
+    target = begun.ranged(target)
+    holes = hole_mask(parts.renderer.render(begun.scene, target), HoleConfig())
+    return Start(begun.views, target, begun.scene, holes, begun.seconds["total"])
 
 
 def nothing_added(start: Start, parts: Parts) -> Outcome:
@@ -120,20 +105,20 @@ def optimized_with(config: OptimizationConfig) -> Method:
     """3DGS fitted to the photographs and the synthesized image, from the context on."""
 
     def method(start: Start, parts: Parts) -> Outcome:
-        clock = Clock()
+        clock = Clock(())
         with clock("generate"):
             views = [*start.views, synthesized(start, parts)]
         budget = replace(config, iterations=parts.iterations(config.iterations))
         with clock("optimize"):
             fitted = optimize(start.context, views, parts.renderer, parts.seed, budget)
-        return Outcome(start.context, fitted.gaussians, None, start.hole_mask, clock.seconds())
+        return Outcome(start.context, fitted.gaussians, None, start.hole_mask, clock.seconds)
 
     return method
 
 
 def registered_by_similarity(start: Start, parts: Parts) -> Outcome:
     """RegGS: all that was lifted, brought to the context by one similarity."""
-    clock = Clock()
+    clock = Clock(())
     with clock("generate"):
         reference = synthesized(start, parts)
     with clock("lift"):
@@ -146,7 +131,7 @@ def registered_by_similarity(start: Start, parts: Parts) -> Outcome:
         )
     added = replace(found.gaussians, generated=torch.ones_like(found.gaussians.generated))
     scene = merge([start.context, added])
-    return Outcome(start.context, scene, added, start.hole_mask, clock.seconds())
+    return Outcome(start.context, scene, added, start.hole_mask, clock.seconds)
 
 
 def synthesized(start: Start, parts: Parts) -> View:
@@ -154,12 +139,8 @@ def synthesized(start: Start, parts: Parts) -> View:
 
     Φ draws it with the margin of `full`, which is cut off, so that not a pixel differs.
     """
-    target = start.target
-    wide, left, top = widened(target, parts.config("default").margin)
-    renders = tuple(parts.renderer.render(start.context, v.camera) for v in start.views)
-    at_target = parts.renderer.render(start.context, wide)
-    image = synthesize(parts.generator, wide, SceneContext(start.views, renders, at_target)).image
-    return View(image[top : top + target.height, left : left + target.width], target)
+    completer = parts.completer()
+    return completer.reference(completer.begin(start.views, start.context), start.target)
 
 
 BASELINES: dict[str, Method] = {

@@ -15,8 +15,9 @@ from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
-from gscompleter.generators import DiffusionSettings, Generator, load_generator
+from gscompleter.generators import Generator, load_generator
 from gscompleter.io.image import write_image
 from gscompleter.metrics.scores import Truth, ranged_truth, score
 from gscompleter.progress import shown_on, track
@@ -86,8 +87,8 @@ class RunConfig:
     weights: str | None = None
     """The file of the reconstructor's weights; None takes the published ones."""
     generator: str = "warp-inpaint"
-    generator_settings: DiffusionSettings = DiffusionSettings()
-    """What a generator with weights is told."""
+    generator_settings: GeneratorSettings | None = None
+    """What the generator is told; None leaves all as it is."""
     device: Literal["cpu", "cuda"] = "cpu"
     seed: int = 0
     """Of everything random."""
@@ -114,7 +115,6 @@ class RunConfig:
             self.load_generator(targets),
             load_renderer(self.device),
             self.seed,
-            0.0 if self.generator == "oracle" else None,
             self.baseline_iterations,
         )
 
@@ -185,7 +185,9 @@ def begin(
     check_cases(cases)
     slow = [name for name in methods if name in BASELINES]
     if slow and config.device != "cpu":
-        raise InputError(f"{', '.join(slow)} can only run on a CPU; use --device cpu.")
+        raise InputError(
+            f"{', '.join(slow)} can only run on a CPU; choose the device cpu.", "device"
+        )
     config.load_reconstructor()
     config.load_generator()
     claim(out, config)
@@ -394,8 +396,8 @@ def deciding(config: RunConfig) -> dict[str, Any]:
     Where the parts of a generator wait is not among it.
     """
     values = asdict(config)
-    settings = values.pop("generator_settings")
-    del settings["offload"]
+    settings = values.pop("generator_settings") or {}
+    settings.pop("offload", None)
     return {**values, **{f"generator_{name}": value for name, value in settings.items()}}
 
 

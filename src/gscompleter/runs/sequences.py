@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.config import AnchorConfig, HoleConfig
+from gscompleter.config import AnchorConfig, HoleConfig, named_config
 from gscompleter.errors import InputError
 from gscompleter.metrics.image import psnr
 from gscompleter.metrics.scores import Outcome, ranged_truth
@@ -211,7 +211,7 @@ def anchor_of(method: str, start: Start, parts: Parts) -> AnchorChoice | None:
     if method == "context":
         return None
     ours = method in SETTINGS
-    config = parts.config(SETTINGS[method]).anchor if ours else AnchorConfig()
+    config = named_config(SETTINGS[method]).anchor if ours else AnchorConfig()
     return select_anchor(start.target, start.views, config)
 
 

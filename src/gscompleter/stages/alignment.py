@@ -26,9 +26,7 @@ MIN_DEPTH_SPREAD = 0.05
 under it only a scale is fitted."""
 
 
-def fit_affine(
-    predicted: DepthMap, context: DepthMap, generator: torch.Generator
-) -> DepthAffine:
+def fit_affine(predicted: DepthMap, context: DepthMap, generator: torch.Generator) -> DepthAffine:
     """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 7).
 
     Where RANSAC cannot be trusted (few pixels, hardly any range of depth, few inliers) the median
@@ -40,7 +38,7 @@ def fit_affine(
     if len(x) < MIN_PIXELS:
         return DepthAffine()
     if len(x) > MAX_PIXELS:
-        drawn = torch.randperm(len(x), generator=generator)[: MAX_PIXELS].to(x.device)
+        drawn = torch.randperm(len(x), generator=generator)[:MAX_PIXELS].to(x.device)
         x, y = x[drawn], y[drawn]
 
     if depth_spread(x) >= MIN_DEPTH_SPREAD:

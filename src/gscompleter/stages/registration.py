@@ -235,7 +235,5 @@ class Objective:
         seen = self.anchor_depth.valid & (at_anchor.alpha.detach() >= 0.5)
         if not self.config.mask_occluded:
             return seen
-        behind = at_anchor.depth.detach() > self.anchor_depth.depth * (
-            1 + OCCLUSION_TOLERANCE
-        )
+        behind = at_anchor.depth.detach() > self.anchor_depth.depth * (1 + OCCLUSION_TOLERANCE)
         return seen & ~behind

@@ -15,7 +15,6 @@ from torch.nn.functional import avg_pool2d, pad
 
 from gscompleter.kernels import patchmatch
 
-
 RADIUS = 3
 """Patches are squares of 2 * radius + 1 pixels."""
 MAX_BIAS = 0.1

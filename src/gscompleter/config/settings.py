@@ -133,9 +133,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except RecursionError as error:
         raise InputError(f"The config {path} is nested too deeply.") from error
     except (yaml.YAMLError, ValueError, TypeError) as error:
-        raise InputError(f"The config {path} is not YAML: {quoted(str(error))}.") from error
+        raise InputError(
+            f"The config {path} is not YAML: {quoted(' '.join(str(error).split()))}."
+        ) from error
     if len(text) > LONGEST_FILE:
         raise InputError(f"The config {path} has more than {LONGEST_FILE:,} characters.")
-    if not isinstance(content or {}, Mapping):
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
         raise InputError(f"The config {path} must map settings to values, as in `holes: ...`.")
-    return dict(content or {})
+    return content

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
+from gscompleter.config.settings import Count, Settings, Share, Weight, read_yaml, updated
 from gscompleter.errors import InputError, quoted
-from gscompleter.settings import Count, Settings, Share, Weight, read_yaml, updated
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
 Step = Annotated[float, Interval(gt=0, le=10)]

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from annotated_types import Interval, MinLen
 
+from gscompleter.config.settings import Settings
 from gscompleter.errors import InputError, quoted
-from gscompleter.settings import Settings
 
 Text = Annotated[str, MinLen(1)]
 Steps = Annotated[int, Interval(ge=1, le=1000)]
