@@ -21,7 +21,38 @@ Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompleteOptions(Settings):
+class Options(Settings):
+    """What every command can be told that does something."""
+
+    quiet: bool = False
+    """Say nothing but errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(Options):
+    """What every command can be told that completes something."""
+
+    device: Device = "auto"
+    """Where to run."""
+    seed: Seed = 0
+    """Of everything random. The same seed gives the same bytes on a CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(RunOptions):
+    """What every command can be told that lets its models be chosen."""
+
+    reconstructor: str = "plane-sweep"
+    """The model that turns views into Gaussians: plane-sweep, which needs no weights, or one of
+    those that `gscompleter models` lists."""
+    weights: Path | None = None
+    """The file of its weights, where they are not to be downloaded."""
+    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
+    """How the image at a target comes about."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompleteOptions(ModelOptions):
     """Fill what the photographs never saw, as seen from the targets, and write the scene."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -36,13 +67,6 @@ class CompleteOptions(Settings):
     scene: Path | None = None
     """A .ply of Gaussians to complete, in the frame of the photographs. It is kept as it is.
     Without it the context is reconstructed from the photographs."""
-    reconstructor: str = "plane-sweep"
-    """The model that turns views into Gaussians: plane-sweep, which needs no weights, or one of
-    those that `gscompleter models` lists."""
-    weights: Path | None = None
-    """The file of its weights, where they are not to be downloaded."""
-    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
-    """How the image at a target comes about."""
     resolution: tuple[int, int] | None = None
     """Height and width to work at: photographs are scaled to cover it and cropped around the
     centre. If not given, they keep their own size."""
@@ -50,10 +74,6 @@ class CompleteOptions(Settings):
     """Smallest depth in the scene, in its own unit. Estimated if not given."""
     far: float | None = None
     """Largest depth in the scene, in its own unit. Estimated if not given."""
-    device: Device = "auto"
-    """Where to run."""
-    seed: Seed = 0
-    """Of everything random. The same seed gives the same bytes on a CPU."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
     """Settings of the stages. `--config NAME` says where they start: default, paper, an ablation
     such as no-sa, or a YAML file. Those given here are applied over it."""
@@ -61,12 +81,10 @@ class CompleteOptions(Settings):
     """Leave out Gaussians of the .ply that hold NaN or infinity."""
     overwrite: bool = False
     """Replace what an earlier run left in the output folder."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions(Settings):
+class DemoOptions(RunOptions):
     """Complete a real stereo pair beyond its left and its right camera, and show before/after.
 
     The photographs are the Middlebury motorcycle pair that scikit-image carries. Nothing is
@@ -75,18 +93,12 @@ class DemoOptions(Settings):
 
     out: Path = Path("demo")
     """Folder for the scene, its completion and before_after.png."""
-    device: Device = "auto"
-    """Where to run."""
-    seed: Seed = 0
-    """Of everything random."""
     overwrite: bool = False
     """Replace what an earlier run left in the output folder."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(Settings):
+class EvaluateOptions(ModelOptions):
     """Run methods on cases of which the truth is known, and score them.
 
     Run again with the same options, it goes on where it was stopped. The tables are printed and
@@ -117,35 +129,20 @@ class EvaluateOptions(Settings):
     """Height and width to work at. If not given, that of the cases or of the photographs."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to do, in all shards together."""
-    reconstructor: str = "plane-sweep"
-    """The model that turns views into Gaussians: plane-sweep, which needs no weights, or one of
-    those that `gscompleter models` lists."""
-    weights: Path | None = None
-    """The file of its weights, where they are not to be downloaded."""
-    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
-    """How the image at a target comes about."""
-    device: Device = "auto"
-    """Where to run."""
-    seed: Seed = 0
-    """Of everything random."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class TablesOptions(Settings):
+class TablesOptions(Options):
     """Write the tables of what `evaluate` has done so far, and print them."""
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder that `evaluate` wrote. The tables and plots go there."""
     fid: bool = False
     """Compare the pictures of each method with the photographs by FID, too."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class IndexOptions(Settings):
+class IndexOptions(Options):
     """Write down which frames a protocol chooses in a data set."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -156,8 +153,6 @@ class IndexOptions(Settings):
     """The evaluation index, a JSON file."""
     overwrite: bool = False
     """Replace the file where there is one."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
-from gscompleter.config.settings import Count, Settings, Share, Weight, read_yaml, updated
+from gscompleter.config.settings import Count, Settings, Share, Weight, updated
 from gscompleter.errors import InputError, quoted
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
@@ -258,6 +258,8 @@ def load_config(source: str) -> CompleterConfig:
     path = Path(source)
     if path.suffix not in {".yaml", ".yml"}:
         return named_config(source)
+    from gscompleter.config.yaml_file import read_yaml
+
     changes = read_yaml(path)
     base = named_config(str(changes.pop("base", "default")))
     return updated(base, changes, f"{quoted(source)}: ")

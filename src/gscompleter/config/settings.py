@@ -8,29 +8,27 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
-from pathlib import Path
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
-import yaml
 from annotated_types import Interval
 
 from gscompleter.errors import InputError, quoted
 
 if TYPE_CHECKING:
+    from pydantic import TypeAdapter
     from pydantic_core import ErrorDetails
 
-S = TypeVar("S")
+S = TypeVar("S", bound="Settings")
 
 Count = Annotated[int, Interval(ge=0, le=100_000)]
 Share = Annotated[float, Interval(ge=0, le=1)]
 Weight = Annotated[float, Interval(ge=0, le=1e6)]
-Seed = Annotated[int, Interval(ge=0, lt=2**63)]
-
-LONGEST_FILE = 65_536
-"""Characters of a YAML file beyond which it holds no settings."""
+# Room is left for what is added to it on each level and in each round.
+Seed = Annotated[int, Interval(ge=0, lt=2**62)]
 
 
 class Settings:
@@ -49,10 +47,9 @@ def checked(settings: S, prefix: str = "") -> S:
     Raises:
         InputError: where one is not. `prefix` and the name of the setting are its argument.
     """
-    from pydantic import TypeAdapter
-
+    check: TypeAdapter[S] = adapter(type(settings))
     with told(settings, prefix=prefix):
-        return TypeAdapter(type(settings)).validate_python(settings, strict=True)
+        return check.validate_python(settings, strict=True)
 
 
 def updated(settings: S, changes: Mapping[str, Any], where: str) -> S:
@@ -62,11 +59,18 @@ def updated(settings: S, changes: Mapping[str, Any], where: str) -> S:
         InputError: where a name is unknown, or a value of the wrong type or out of range; it
             begins with `where` the value stands.
     """
+    text = json.dumps(merged(asdict(settings), changes))  # type: ignore[call-overload]
+    check: TypeAdapter[S] = adapter(type(settings))
+    with told(settings, where):
+        return check.validate_json(text, strict=True)
+
+
+@cache
+def adapter(kind: Hashable) -> TypeAdapter[Any]:
+    """What checks settings of a class, made once."""
     from pydantic import TypeAdapter
 
-    text = json.dumps(merged(asdict(settings), changes))  # type: ignore[call-overload]
-    with told(settings, where):
-        return TypeAdapter(type(settings)).validate_json(text, strict=True)
+    return TypeAdapter(kind)
 
 
 @contextmanager
@@ -107,39 +111,3 @@ def sentence_on(wrong: ErrorDetails, name: str, settings: object) -> str:
     if wrong["type"] == "dataclass_type":
         return f"{name} holds settings of its own, got {shown}."
     return f"{name} {re.sub(r'^[A-Z][a-z]+ should', 'must', wrong['msg'])}, got {shown}."
-
-
-class PlainLoader(yaml.SafeLoader):
-    """YAML without aliases, of which a short file can make an endless one."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("aliases are not read; write the value out")
-        return super().compose_node(parent, index)
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file, of what JSON knows.
-
-    Raises:
-        InputError: where it cannot be read, is no YAML, holds something else, or is too long.
-    """
-    try:
-        with path.open() as file:
-            text = file.read(LONGEST_FILE + 1)
-        content = json.loads(json.dumps(yaml.load(text, PlainLoader), default=str))
-    except OSError as error:
-        raise InputError(f"Cannot read the config {path}: {error.strerror}.") from error
-    except RecursionError as error:
-        raise InputError(f"The config {path} is nested too deeply.") from error
-    except (yaml.YAMLError, ValueError, TypeError) as error:
-        raise InputError(
-            f"The config {path} is not YAML: {quoted(' '.join(str(error).split()))}."
-        ) from error
-    if len(text) > LONGEST_FILE:
-        raise InputError(f"The config {path} has more than {LONGEST_FILE:,} characters.")
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
-        raise InputError(f"The config {path} must map settings to values, as in `holes: ...`.")
-    return content
