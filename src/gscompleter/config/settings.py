@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
-from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 from annotated_types import Interval
@@ -19,7 +18,6 @@ from annotated_types import Interval
 from gscompleter.errors import InputError, quoted
 
 if TYPE_CHECKING:
-    from pydantic import TypeAdapter
     from pydantic_core import ErrorDetails
 
 S = TypeVar("S", bound="Settings")
@@ -47,9 +45,10 @@ def checked(settings: S, prefix: str = "") -> S:
     Raises:
         InputError: where one is not. `prefix` and the name of the setting are its argument.
     """
-    check: TypeAdapter[S] = adapter(type(settings))
+    from pydantic import TypeAdapter
+
     with told(settings, prefix=prefix):
-        return check.validate_python(settings, strict=True)
+        return TypeAdapter(type(settings)).validate_python(settings, strict=True)
 
 
 def updated(settings: S, changes: Mapping[str, Any], where: str) -> S:
@@ -59,18 +58,11 @@ def updated(settings: S, changes: Mapping[str, Any], where: str) -> S:
         InputError: where a name is unknown, or a value of the wrong type or out of range; it
             begins with `where` the value stands.
     """
-    text = json.dumps(merged(asdict(settings), changes))  # type: ignore[call-overload]
-    check: TypeAdapter[S] = adapter(type(settings))
-    with told(settings, where):
-        return check.validate_json(text, strict=True)
-
-
-@cache
-def adapter(kind: Hashable) -> TypeAdapter[Any]:
-    """What checks settings of a class, made once."""
     from pydantic import TypeAdapter
 
-    return TypeAdapter(kind)
+    text = json.dumps(merged(asdict(settings), changes))  # type: ignore[call-overload]
+    with told(settings, where):
+        return TypeAdapter(type(settings)).validate_json(text, strict=True)
 
 
 @contextmanager
