@@ -8,13 +8,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.coverage import COVERED
 from gscompleter.generators.harmonize import gains
 from gscompleter.generators.smooth import continued
 from gscompleter.geometry import baseline_between, inside, project, sample, unproject
 from gscompleter.types import Camera, Render, SceneContext, View
 
-MIN_ALPHA = 0.5
-"""Opacity of the scene from which a pixel of the target counts as observed."""
 DEPTH_TOLERANCE = 0.03
 """Difference between the depth of a point and the depth that a photograph sees in its direction,
 relative to the depth, at which the weight of the photograph has fallen to 1/e."""
@@ -51,7 +50,7 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
     All are brought to the exposure of `nearest`.
     """
     scene = context.at_target
-    known = scene.alpha >= MIN_ALPHA
+    known = ~context.holes
     points = unproject(scene.depth, target)
     colours, weights = [], []
     for view, render in zip(context.views, context.at_views, strict=True):
@@ -68,7 +67,7 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
         [w[..., None] * c * g for w, c, g in zip(weights, colours, factors, strict=True)]
     ).sum(dim=0)
 
-    rendered = scene.image / scene.alpha.clamp_min(MIN_ALPHA)[..., None]
+    rendered = scene.image / scene.alpha.clamp_min(context.max_alpha)[..., None]
     trust = (total / (total + 1e-4))[..., None]
     image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
     return Warped(image.clamp(0, 1), known, scene.depth, tuple(factors))
@@ -89,7 +88,7 @@ def with_unexplained(
     total = torch.zeros_like(guess)
     for view, render, gain in zip(context.views, context.at_views, warped.gains, strict=True):
         pixels, z = project(points, view.camera)
-        empty = sample(render.alpha[..., None], pixels)[..., 0] < MIN_ALPHA
+        empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
         unexplained = empty & inside(pixels, z, view.camera) & ~warped.known
         weight = unexplained * _closeness(points, target, view) ** SHARPNESS
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
@@ -129,7 +128,7 @@ def _visibility(
     layers = torch.stack([render.depth, render.alpha], dim=-1)
     depth, alpha = sample(layers, pixels).unbind(-1)
     error = (z - depth).abs() / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
-    visible = inside(pixels, z, view.camera) & (alpha >= MIN_ALPHA)
+    visible = inside(pixels, z, view.camera) & (alpha >= COVERED)
     return torch.exp(-(error**2)) * visible
 
 

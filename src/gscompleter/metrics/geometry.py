@@ -113,8 +113,6 @@ def nearest(points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]) -> Float
 
 @dataclass(frozen=True)
 class AlignmentConfig:
-    min_alpha: float = 0.5
-    """A pixel is covered where alpha is at least this, as for the holes (paper, Eq. 10)."""
     threshold: float = 0.05
     """Distance that counts as matched, as a share of the median context depth at the target.
     Relative, so that scenes of any unit and size can be averaged; 5 % is wider than the spacing
@@ -152,8 +150,7 @@ def alignment(
     """AbsRel, Chamfer distance and F-score between what one target added and the context.
 
     Completion adds primitives in the dilated hole only, so the two meet at its rim. The overlap
-    is made of the target's pixels that each covers when it is rendered alone (alpha of at least
-    `min_alpha`).
+    is made of the target's pixels that each covers when it is rendered alone.
 
     - AbsRel compares the two rendered z-depths there; the context's is the reference.
     - A point of the first cloud is the mean of an added Gaussian that projects into the overlap.
@@ -173,12 +170,12 @@ def alignment(
         context: The scene as it was before, usually `Completion.context`.
         target: The camera it was completed for.
         renderer: Draws both.
-        config: What counts as covered and as matched.
+        config: What counts as matched.
     """
     added = added[added.opacities >= MIN_OPACITY]
     context = context[context.opacities >= MIN_OPACITY]
-    generated = renderer.render(added, target).depth_map(config.min_alpha)
-    reference = renderer.render(context, target).depth_map(config.min_alpha)
+    generated = renderer.render(added, target).depth_map()
+    reference = renderer.render(context, target).depth_map()
     overlap = generated.valid & reference.valid
     share = overlap.double().mean().item()
     if not overlap.any():

@@ -134,7 +134,7 @@ def score(outcome: Outcome, truth: Truth, renderer: Renderer) -> tuple[Scores, D
     target, hole = truth.target, outcome.hole_mask
     before = renderer.render(outcome.context, target.camera)
     after = renderer.render(outcome.scene, target.camera)
-    covered = after.alpha >= 0.5
+    covered = after.depth_map().valid
     context = [(_drawn(outcome, view, renderer), view.image) for view in truth.views]
     beside = [(_drawn(outcome, view, renderer), view.image) for view in truth.neighbours]
     added = outcome.added
@@ -185,7 +185,7 @@ def rim_error(
     None where fewer than `min_pixels` are covered by both.
     """
     alone = renderer.render(added, target)
-    both = (alone.alpha >= 0.5) & (context.alpha >= 0.5)
+    both = alone.depth_map().valid & context.depth_map().valid
     if both.sum() < min_pixels:
         return None
     return ((alone.depth - context.depth).abs() / context.depth)[both].median().item()

@@ -26,8 +26,8 @@ MIN_DEPTH_SPREAD = 0.05
 under it only a scale is fitted."""
 
 
-def fit_affine(predicted: DepthMap, context: DepthMap, generator: torch.Generator) -> DepthAffine:
-    """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 7).
+def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> DepthAffine:
+    """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 8).
 
     Where RANSAC cannot be trusted (few pixels, hardly any range of depth, few inliers) the median
     ratio with shift 0 takes its place, and the identity where there is nothing to compare; which
@@ -38,11 +38,11 @@ def fit_affine(predicted: DepthMap, context: DepthMap, generator: torch.Generato
     if len(x) < MIN_PIXELS:
         return DepthAffine()
     if len(x) > MAX_PIXELS:
-        drawn = torch.randperm(len(x), generator=generator)[:MAX_PIXELS].to(x.device)
+        drawn = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
         x, y = x[drawn], y[drawn]
 
     if depth_spread(x) >= MIN_DEPTH_SPREAD:
-        scale, shift = ransac_line(x, y, generator)
+        scale, shift = ransac_line(x, y, rng)
         inliers = affine_inliers(x, y, scale, shift).double().mean().item()
         if scale > 0 and inliers >= MIN_INLIERS:
             return DepthAffine(scale, shift, inliers, "ransac")
@@ -65,14 +65,14 @@ def affine_inliers(
 
 
 def ransac_line(
-    x: Float[Tensor, "n"], y: Float[Tensor, "n"], generator: torch.Generator
+    x: Float[Tensor, "n"], y: Float[Tensor, "n"], rng: torch.Generator
 ) -> tuple[float, float]:
     """Scale and shift with the most inliers among two-point hypotheses, refitted on its inliers.
 
     Residuals count relative to depth, so that the far end of the scene does not outvote the near
     one, and the refit weighs them alike. (0, 0) where no hypothesis has a positive scale.
     """
-    i, j = torch.randint(len(x), (2, MAX_TRIALS), generator=generator).to(x.device)
+    i, j = torch.randint(len(x), (2, MAX_TRIALS), generator=rng).to(x.device)
     scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
     shifts = y[i] - scales * x[i]
     residuals = (scales[:, None] * x + shifts[:, None] - y).abs()
@@ -98,7 +98,7 @@ def fit_bridge(
     lift: Lift,
     at_target: Render,
     at_anchor: Render,
-    generator: torch.Generator,
+    rng: torch.Generator,
     config: AffineConfig = AffineConfig(),
 ) -> DepthAffine:
     """The affine that brings the lifted depths to the scene's, compared in the bridge view.
@@ -109,18 +109,16 @@ def fit_bridge(
     if config.bridge == "none":
         return DepthAffine()
     if config.bridge == "target":
-        return fit_affine(lift.reference_depth, at_target.depth_map(), generator)
-    affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), generator)
-    return unless_contradicted(
-        affine, lift.reference_depth, at_target.depth_map(), generator, config
-    )
+        return fit_affine(lift.reference_depth, at_target.depth_map(), rng)
+    affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng)
+    return unless_contradicted(affine, lift.reference_depth, at_target.depth_map(), rng, config)
 
 
 def unless_contradicted(
     affine: DepthAffine,
     predicted: DepthMap,
     context: DepthMap,
-    generator: torch.Generator,
+    rng: torch.Generator,
     config: AffineConfig,
 ) -> DepthAffine:
     """`affine`, unless the scene that the target sees has other depths and one other affine.
@@ -135,7 +133,7 @@ def unless_contradicted(
     agree = affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
     if agree >= config.min_agreement:
         return affine
-    own = fit_affine(predicted, context, generator)
+    own = fit_affine(predicted, context, rng)
     # Where neither fits well, the paper's choice stands.
     trusted = own.inliers >= max(MIN_INLIERS, 2 * agree)
     return replace(own, contradicted=True) if trusted else affine
