@@ -174,9 +174,9 @@ def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
         ({"target": ("x" * 5000,)}, "xxx"),
         ({"context": ("0,1",)}, "'0,1'"),
         ({"context": ("²", 1)}, "'²'"),
-        ({"context": (-1, 0)}, "context.0 must be greater than or equal to 0"),
+        ({"context": (-1, 0)}, "context must be greater than or equal to 0, got -1 (--context)."),
         ({"context": ("9" * 5000, 0)}, "--context"),
-        ({"context": (10**12, 0)}, "context.0 must be less than 1000000000"),
+        ({"context": (10**12, 0)}, "context must be less than 1000000000"),
     ],
 )
 def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, sentence):

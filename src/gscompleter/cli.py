@@ -101,6 +101,8 @@ def parsed(words: Sequence[str]) -> Any:
 
 @dataclass(frozen=True)
 class NamedConfig:
+    """What is read before the rest: the config that single settings are applied over."""
+
     config: str = "default"
 
 

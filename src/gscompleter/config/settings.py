@@ -74,7 +74,7 @@ def told(settings: object, where: str = "", prefix: str = "") -> Iterator[None]:
         yield
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
-        name = ".".join(map(str, wrong["loc"]))
+        name = ".".join(part for part in wrong["loc"] if isinstance(part, str))
         raise InputError(where + sentence_on(wrong, name, settings), prefix + name) from None
 
 
