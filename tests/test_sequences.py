@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from command import run
 from gscompleter import InputError
 from gscompleter.baselines.reggs import RegGSConfig
-from gscompleter.data.clips import Skipped
+from gscompleter.data.datasets import Skipped
+from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.io.image import read_pixels
 from gscompleter.reports.sequence_tables import sequence_tables
 from gscompleter.runs import methods, sequences, store
@@ -50,9 +52,11 @@ TABLES = ("sequences.md", "sequences.json")
 
 
 @dataclass(frozen=True)
-class Walk:
+class Walk(PosedPhotographs):
     """A walk through the room, of which some frames cannot be read."""
 
+    names = ()
+    origin = np.zeros(3)
     name: str = "walk"
     num_frames: int = len(PLACES)
     broken: tuple[int, ...] = ()

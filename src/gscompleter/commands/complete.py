@@ -13,7 +13,10 @@ from rich.table import Table
 
 from gscompleter.commands.options import CompleteOptions
 from gscompleter.completer import GSCompleter
-from gscompleter.data.scene import load_camera, load_cameras, load_views, read_index
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.origin import frame_from_photographs, told_from
+from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.scene import load_cameras
 from gscompleter.errors import InputError, quoted
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
@@ -22,7 +25,7 @@ from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.completion import Target, write_report
-from gscompleter.types import Completion, View
+from gscompleter.types import Camera, Completion, View
 
 MIN_SIZE = 16
 """Shorter side of an image, in pixels, under which there is nothing to match and to score."""
@@ -50,13 +53,22 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     check_output(options.out, options.overwrite)
     check_context(options)
     device = choose_device(options.device)
-    views = [view.to(device) for view in read_views(options, options.context)]
-    targets = read_targets(options)
+    given = open_photographs(options.folder, options.format, options.near, options.far)
+    views = [view.to(device) for view in read_views(given, options.context, options)]
+    targets = read_targets(given, options)
     scene = None
     if options.scene is not None:
-        scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite).to(device)
+        cameras = [view.camera for view in views] + [target.camera for target in targets]
+        scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite)
+        scene = told_from(given.origin, scene, cameras).to(device)
     completer = completer_for(options, targets, device)
-    said = {"settings": settings_of(options), "seed": options.seed, "device": device}
+    frame = frame_from_photographs(given.origin)
+    said = {
+        "settings": settings_of(options),
+        "seed": options.seed,
+        "device": device,
+        "frame": {"method": "given", "transform": frame.tolist()},
+    }
     with output_folder(options.out, options.overwrite) as folder:
         with shown_on(None if options.quiet else Console(stderr=True)):
             completion = completer(views, [t.camera.to(device) for t in targets], scene)
@@ -102,37 +114,42 @@ def check_context(options: CompleteOptions) -> None:
         raise InputError("--target names no frame; name at least one, as in --target 8.")
 
 
-def read_views(options: CompleteOptions, frames: Sequence[int]) -> list[View]:
+def read_views(
+    photographs: PosedPhotographs, frames: Sequence[int], options: CompleteOptions
+) -> list[View]:
     """The photographs of `frames` as the options want them."""
-    views = load_views(
-        options.folder, list(frames), options.resolution, near=options.near, far=options.far
-    )
-    for view in views:
-        if min(view.camera.width, view.camera.height) < MIN_SIZE:
-            raise InputError(
-                f"Frame {view.frame} is {view.camera.width} x {view.camera.height} pixels, and "
-                f"both sides must have at least {MIN_SIZE}; choose a larger --resolution."
-            )
-    return views
+    for frame in frames:
+        check_size(photographs.camera(frame, options.resolution), f"Frame {frame}")
+    return photographs.views(frames, options.resolution)
 
 
-def read_targets(options: CompleteOptions) -> list[Target]:
+def read_targets(photographs: PosedPhotographs, options: CompleteOptions) -> list[Target]:
     """The target cameras in the order of the command line, with photographs where there are any."""
-    index = read_index(options.folder)
-    resolution, near, far = options.resolution, options.near, options.far
     targets = []
     for word in options.target:
         frame = frame_number(word)
         if frame is None:
-            cameras = load_cameras(word, resolution, near, far)
+            cameras = load_cameras(
+                word, options.resolution, options.near, options.far, photographs.origin.tolist()
+            )
             targets += [Target(camera) for camera in cameras]
-        elif index.frame(frame).photograph is not None:
-            (view,) = read_views(options, [frame])
+        elif photographs.has_photograph(frame):
+            (view,) = read_views(photographs, [frame], options)
             targets.append(Target(view.camera, view.frame, view.image))
         else:
-            camera = load_camera(options.folder, frame, resolution, near, far)
-            targets.append(Target(camera, frame))
+            targets.append(Target(photographs.camera(frame, options.resolution), frame))
+    for number, target in enumerate(targets, start=1):
+        check_size(target.camera, f"Target {number}")
     return targets
+
+
+def check_size(camera: Camera, name: str) -> None:
+    """Refuse images in which there is nothing to match and to score."""
+    if min(camera.width, camera.height) < MIN_SIZE:
+        raise InputError(
+            f"{name} is {camera.width} x {camera.height} pixels, and both sides must have at least "
+            f"{MIN_SIZE}; choose a larger --resolution."
+        )
 
 
 def frame_number(word: str) -> int | None:
@@ -152,6 +169,7 @@ def settings_of(options: CompleteOptions) -> dict[str, Any]:
     """Everything that decided the result, for `summary.json`."""
     return {
         "folder": str(options.folder),
+        "format": options.format,
         "context": list(options.context),
         "target": list(options.target),
         "scene": None if options.scene is None else str(options.scene),
@@ -187,6 +205,14 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
     console.print(table)
     for note in notes:
         console.print(note, highlight=False)
+    offset = [-row[3] for row in summary["frame"]["transform"][:3]]
+    if any(offset):
+        console.print(
+            f"The coordinates are large against the baselines, so the result is relative to "
+            f"{' '.join(map(str, offset))}; summary.json has the transform.",
+            highlight=False,
+            soft_wrap=True,
+        )
     counts = summary["gaussians"]
     seconds = summary["seconds"]["total"]
     console.print(

@@ -14,8 +14,7 @@ from rich.table import Table
 
 from gscompleter.commands.options import EvaluateOptions, IndexOptions, TablesOptions
 from gscompleter.data.cases import read_cases
-from gscompleter.data.clips import Skipped, usable
-from gscompleter.data.folders import open_clips
+from gscompleter.data.datasets import Skipped, open_clips, usable
 from gscompleter.data.framing import check_resolution
 from gscompleter.errors import InputError
 from gscompleter.progress import shown_on

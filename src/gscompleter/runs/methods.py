@@ -149,7 +149,7 @@ BASELINES: dict[str, Method] = {
     "distill": optimized_with(OptimizationConfig(iterations=800, density_rounds=0)),
     "reggs": registered_by_similarity,
 }
-"""Methods that are not ours. They run on a CPU."""
+"""Methods that are not ours."""
 
 _ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABLATIONS}
 # By the name of the method, that of its settings. Three degrees of freedom are no ablation but

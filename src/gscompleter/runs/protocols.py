@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from gscompleter.completer import MAX_TARGETS
-from gscompleter.data.clips import Clip, Skipped
+from gscompleter.data.datasets import Skipped
+from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
 from gscompleter.io.json_file import read_json
@@ -44,7 +45,7 @@ class EvaluationProtocol(Protocol):
     def name(self) -> str:
         """What `parse_protocol` or a table calls it."""
 
-    def splits(self, clip: Clip) -> tuple[Split, ...]:
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """The splits of a clip; none where it is skipped."""
 
 
@@ -67,7 +68,7 @@ class Extrapolation:
     def name(self) -> str:
         return f"n-{self.k}" + ("" if self.stride is None else f"-stride-{self.stride}")
 
-    def splits(self, clip: Clip) -> tuple[Split, ...]:
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         k, stride = self.k, self.stride or 2 * self.k + 1
         return tuple(
             split
@@ -82,7 +83,7 @@ class StressTest:
 
     name: str = "stress"
 
-    def splits(self, clip: Clip) -> tuple[Split, ...]:
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         split = Split((0, 30), (99,))
         return (split,) if len(clip) > max(split.targets) else ()
 
@@ -97,7 +98,7 @@ class EvaluationIndex:
     skipped: tuple[str, ...] = ()
     """Scenes with no split: null in a published file, clips that are too short in ours."""
 
-    def splits(self, clip: Clip) -> tuple[Split, ...]:
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """The splits of a clip; none where the index skips or lacks its scene."""
         return self.scenes.get(clip.name, ())
 
@@ -124,7 +125,9 @@ class ViewByView:
     def name(self) -> str:
         return f"sequence-{self.k}" + ("" if self.steps is None else f"-steps-{self.steps}")
 
-    def case(self, clip: Clip, resolution: tuple[int, int] | None = None) -> SequenceCase | None:
+    def case(
+        self, clip: PosedPhotographs, resolution: tuple[int, int] | None = None
+    ) -> SequenceCase | None:
         """The sequence of a clip; None where the clip is too short for one step."""
         targets = tuple(range(2 * self.k, len(clip), self.k))[: self.steps or MAX_TARGETS]
         return SequenceCase(clip, (0, self.k), targets, resolution) if targets else None
@@ -134,7 +137,7 @@ class ViewByView:
 class SequenceCase:
     """A clip that is completed view after view."""
 
-    clip: Clip
+    clip: PosedPhotographs
     context: tuple[int, ...]
     """Frames that are known from the beginning."""
     targets: tuple[int, ...]
@@ -157,7 +160,7 @@ class SequenceCase:
 class ClipCase:
     """One completion task in a clip."""
 
-    clip: Clip
+    clip: PosedPhotographs
     context: tuple[int, ...]
     target: int
     neighbours: tuple[int, ...]
@@ -203,7 +206,7 @@ def parse_protocol(text: str) -> EvaluationProtocol | ViewByView:
 
 
 def cases_of(
-    protocol: EvaluationProtocol, clip: Clip, resolution: tuple[int, int] | None = None
+    protocol: EvaluationProtocol, clip: PosedPhotographs, resolution: tuple[int, int] | None = None
 ) -> list[ClipCase]:
     """The cases of a clip, one for each target.
 
@@ -226,7 +229,7 @@ def cases_of(
 
 def sequences_of(
     protocol: ViewByView,
-    clips: Iterable[Clip],
+    clips: Iterable[PosedPhotographs],
     skipped: list[Skipped],
     resolution: tuple[int, int] | None = None,
 ) -> Iterator[SequenceCase]:
@@ -249,7 +252,7 @@ def neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[in
     )
 
 
-def index_of(protocol: EvaluationProtocol, clips: Iterable[Clip]) -> EvaluationIndex:
+def index_of(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) -> EvaluationIndex:
     """What a protocol chooses in each of `clips`, written down.
 
     Raises:
@@ -264,7 +267,9 @@ def index_of(protocol: EvaluationProtocol, clips: Iterable[Clip]) -> EvaluationI
     return EvaluationIndex(protocol.name, chosen, tuple(n for n in scenes if not scenes[n]))
 
 
-def n_k_index(clips: Iterable[Clip], k: int, stride: int | None = None) -> EvaluationIndex:
+def n_k_index(
+    clips: Iterable[PosedPhotographs], k: int, stride: int | None = None
+) -> EvaluationIndex:
     """The extrapolations over k frames in each of `clips`; those too short are skipped.
 
     Raises:

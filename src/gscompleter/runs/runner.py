@@ -25,7 +25,6 @@ from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.runs.memory import peak_memory
 from gscompleter.runs.methods import (
-    BASELINES,
     METHODS,
     Parts,
     Start,
@@ -183,11 +182,6 @@ def begin(
     check_methods(methods)
     check_shard(shard)
     check_cases(cases)
-    slow = [name for name in methods if name in BASELINES]
-    if slow and config.device != "cpu":
-        raise InputError(
-            f"{', '.join(slow)} can only run on a CPU; choose the device cpu.", "device"
-        )
     config.load_reconstructor()
     config.load_generator()
     claim(out, config)
