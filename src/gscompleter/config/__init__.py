@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -168,68 +167,26 @@ class CompleterConfig(Settings):
         )
 
 
-def _bridge(config: CompleterConfig, bridge: Any) -> CompleterConfig:
-    affine = replace(config.registration.affine, bridge=bridge)
-    return replace(config, registration=replace(config.registration, affine=affine))
+_NO_DA: dict[str, Any] = {"affine": {"bridge": "none"}}
+_NO_RC: dict[str, Any] = {"iterations": 0}
+_NO_SA: dict[str, Any] = {"selection": "nearest"}
 
-
-def without_anchor_selection(config: CompleterConfig) -> CompleterConfig:
-    """w/o SA: the nearest view instead of the best stereo anchor."""
-    return replace(config, anchor=replace(config.anchor, selection="nearest"))
-
-
-def without_depth_alignment(config: CompleterConfig) -> CompleterConfig:
-    """w/o DA: no affine."""
-    return _bridge(config, "none")
-
-
-def without_ray_constraint(config: CompleterConfig) -> CompleterConfig:
-    """w/o RC: no optimisation of distances."""
-    return replace(config, registration=replace(config.registration, iterations=0))
-
-
-def without_any(config: CompleterConfig) -> CompleterConfig:
-    """w/o ALL: no SA, no DA, no RC."""
-    return without_anchor_selection(without_depth_alignment(without_ray_constraint(config)))
-
-
-def without_refinement(config: CompleterConfig) -> CompleterConfig:
-    """w/o MV: opacities as they were lifted, and nothing checked afterwards."""
-    return replace(
-        config,
-        refine=replace(config.refine, iterations=0),
-        harm=replace(config.harm, tolerance=None),
-    )
-
-
-def _degrees_of_freedom_3(config: CompleterConfig) -> CompleterConfig:
-    return replace(config, registration=replace(config.registration, degrees_of_freedom=3))
-
-
-def _dilation(radius: int) -> Callable[[CompleterConfig], CompleterConfig]:
-    return lambda config: replace(config, holes=replace(config.holes, dilation=radius))
-
-
-def _max_rotation(degrees: float) -> Callable[[CompleterConfig], CompleterConfig]:
-    return lambda config: replace(config, anchor=replace(config.anchor, max_rotation=degrees))
-
-
-ABLATIONS: dict[str, Callable[[CompleterConfig], CompleterConfig]] = {
-    "no-sa": without_anchor_selection,
-    "no-da": without_depth_alignment,
-    "no-rc": without_ray_constraint,
-    "no-da-rc": lambda config: without_depth_alignment(without_ray_constraint(config)),
-    "none": without_any,
-    "no-mv": without_refinement,
-    "3-dof": _degrees_of_freedom_3,
-    "target-aligned": lambda config: _bridge(config, "target"),
-    "no-dilation": _dilation(0),
-    "dilation": _dilation(3),
-    "theta-30": _max_rotation(30.0),
-    "theta-45": _max_rotation(45.0),
-    "theta-90": _max_rotation(90.0),
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "no-sa": {"anchor": _NO_SA},  # the nearest view instead of the best stereo anchor
+    "no-da": {"registration": _NO_DA},  # no affine
+    "no-rc": {"registration": _NO_RC},  # no optimisation of distances
+    "no-da-rc": {"registration": _NO_DA | _NO_RC},
+    "none": {"anchor": _NO_SA, "registration": _NO_DA | _NO_RC},
+    "no-mv": {"refine": {"iterations": 0}, "harm": {"tolerance": None}},  # opacities as lifted
+    "3-dof": {"registration": {"degrees_of_freedom": 3}},
+    "target-aligned": {"registration": {"affine": {"bridge": "target"}}},
+    "no-dilation": {"holes": {"dilation": 0}},
+    "dilation": {"holes": {"dilation": 3}},
+    "theta-30": {"anchor": {"max_rotation": 30.0}},
+    "theta-45": {"anchor": {"max_rotation": 45.0}},
+    "theta-90": {"anchor": {"max_rotation": 90.0}},
 }
-"""The paper's ablations: each turns a config into the one that lacks (or varies) one thing."""
+"""The paper's ablations: what of a config each changes, so that it lacks (or varies) one thing."""
 
 
 def named_config(name: str) -> CompleterConfig:
@@ -248,7 +205,7 @@ def named_config(name: str) -> CompleterConfig:
             f"{', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
             "give a YAML file."
         )
-    return ABLATIONS[ablation](bases[base or "default"])
+    return updated(bases[base or "default"], ABLATIONS[ablation])
 
 
 def load_config(source: str) -> CompleterConfig:

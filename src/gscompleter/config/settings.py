@@ -51,7 +51,7 @@ def checked(settings: S, prefix: str = "") -> S:
         return TypeAdapter(type(settings)).validate_python(settings, strict=True)
 
 
-def updated(settings: S, changes: Mapping[str, Any], where: str) -> S:
+def updated(settings: S, changes: Mapping[str, Any], where: str = "") -> S:
     """`settings` with `changes`, a mapping of names in which settings of settings are mappings too.
 
     Raises:
