@@ -225,6 +225,9 @@ def without(key):
         ({**example(), "cameras": torch.zeros(5, 18).long()}, "room of .* are int64 of shape"),
         ({**example(), "cameras": [1.0]}, "room of .* of type list"),
         ({**example(), "cameras": torch.zeros(4, 18)}, "room of .* 5 images and 4 cameras"),
+        ({**example(), "cameras": torch.zeros(5, 18).to_sparse()}, "room of .* sparse or empty"),
+        ({**example(), "cameras": torch.zeros(5, 18, device="meta")}, "room of .* sparse or empty"),
+        ({**example(), "images": [torch.zeros(9).byte().to_sparse()] * 5}, "is sparse or empty"),
         ({**example(), "images": []}, "`images` of the scene room of .* are no list with images"),
         ({**example(), "images": torch.zeros(5)}, "`images` of the scene room of .* are no list"),
         (

@@ -74,7 +74,7 @@ def to(**values):
         (at(0, 1e300), "pose holds 1e+300"),
         (at(2, -1e10), "pose holds 1e+10"),
         (to(camera_model="X" * 100_000), "camera model 'XXX"),
-        (to(file_path="0" * 100_000), "frame 000"),
+        (to(file_path="0" * 100_000), "`file_path` of frame 0"),
         (to(file_path="0\nb"), "frame 0 b of"),
         (to(file_path=["z"] * 50_000), "`file_path` of frame 0"),
         (to(fl_x="9" * 100_000), "`fl_x` of frame 0.png"),

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
@@ -166,12 +166,7 @@ def _photographs(example: Any, path: Path, position: int) -> Photographs:
     if not isinstance(name, str) or not name:
         raise InputError(f"Scene {position} of {path} has no `key`; write the chunk again with it.")
     called = f"scene {quoted(name)} of {path}"
-    if (
-        not isinstance(cameras, Tensor)
-        or not cameras.is_floating_point()
-        or cameras.ndim != 2
-        or cameras.shape[1] != 18
-    ):
+    if not (_is_dense(cameras, ndim=2) and cameras.is_floating_point() and cameras.shape[1] == 18):
         raise InputError(
             f"The `cameras` of the {called} are {_described(cameras)}; floats of shape [n, 18] "
             "are needed."
@@ -184,7 +179,7 @@ def _photographs(example: Any, path: Path, position: int) -> Photographs:
             "each image is needed, so download the chunk again."
         )
     for number, image in enumerate(images):
-        if not isinstance(image, Tensor) or image.dtype != torch.uint8 or image.ndim != 1:
+        if not _is_dense(image, ndim=1) or image.dtype != torch.uint8:
             raise InputError(
                 f"Image {number} of the {called} is {_described(image)}; the bytes of a JPEG or "
                 "PNG file are needed, uint8 of one dimension."
@@ -204,7 +199,15 @@ def _image_bytes(path: Path, position: int, number: int) -> bytes:
     return data
 
 
+def _is_dense(value: Any, ndim: int) -> TypeGuard[Tensor]:
+    """Whether it is a tensor of `ndim` dimensions that holds a number for each of its entries."""
+    if not isinstance(value, Tensor) or value.ndim != ndim:
+        return False
+    return value.layout == torch.strided and not value.is_meta
+
+
 def _described(value: Any) -> str:
     if isinstance(value, Tensor):
-        return f"{str(value.dtype).removeprefix('torch.')} of shape {list(value.shape)}"
+        kind = "" if _is_dense(value, value.ndim) else "sparse or empty "
+        return f"{kind}{str(value.dtype).removeprefix('torch.')} of shape {list(value.shape)}"
     return f"of type {type(value).__name__}"

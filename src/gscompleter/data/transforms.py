@@ -32,6 +32,8 @@ ANGLE_RANGE = (1e-5, 3.14159)
 """Of opening angles, in radians; below π."""
 LARGEST = 1e12
 """Of numbers in pixels. They are compared with the size of the image once that is known."""
+MAX_PATH = 1024
+"""Of characters in the path of a file."""
 
 Pair = tuple[float | None, float | None]
 
@@ -203,7 +205,7 @@ def _number(
 
 def _text(entry: Mapping[str, Any], key: str, title: str) -> str | None:
     value = entry.get(key)
-    if value is not None and (not isinstance(value, str) or not value):
+    if value is not None and not (isinstance(value, str) and 0 < len(value) <= MAX_PATH):
         raise InputError(
             f"The `{key}` of {title} is {quoted(value)}; the path of a file is needed."
         )
