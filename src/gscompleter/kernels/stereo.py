@@ -16,7 +16,9 @@ BLOCK = 16
 
 @njit(cache=True, fastmath={"contract"}, inline="always")
 def _clip(value, low, high):
-    return min(max(value, low), high)
+    """The nearest number from low to high; of NaN low, for what comes out becomes an index."""
+    value = value if value > low else low
+    return value if value < high else high
 
 
 @njit(cache=True, fastmath={"contract"})
@@ -205,7 +207,7 @@ def best_mean(costs, share, unseen_cost):
                 if seen == 0:
                     merged[y, x, k] = unseen_cost
                     continue
-                count = max(1, np.int32(np.ceil(seen * share)))
+                count = max(1, min(seen, np.int32(np.ceil(seen * share))))
                 total = 0
                 for i in range(count):
                     total += ranked[i]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -125,8 +125,15 @@ def write_report(
     Raises:
         InputError: where a file cannot be written.
     """
-    context_images = [compare(completion, v.camera, v.image, renderer) for v in views]
-    target_images = [compare(completion, t.camera, t.photograph, renderer) for t in targets]
+    # The depth range that the completion found tells the renderer the unit of the scene.
+    near, far = completion.targets[0].target.near, completion.targets[0].target.far
+    context_images = [
+        compare(completion, replace(v.camera, near=near, far=far), v.image, renderer) for v in views
+    ]
+    target_images = [
+        compare(completion, result.target, target.photograph, renderer)
+        for target, result in zip(targets, completion.targets, strict=True)
+    ]
     summary = summarize(
         completion, views, targets, context_images, target_images, settings, seed, device
     )
