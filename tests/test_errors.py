@@ -1,5 +1,7 @@
 """A sentence quotes what was given, and stays a sentence."""
 
+from pathlib import Path
+
 from gscompleter.errors import quoted
 
 
@@ -23,3 +25,8 @@ def test_a_quote_stays_on_its_line_and_shows_no_control_characters():
 def test_integers_that_python_refuses_to_write_are_described():
     assert quoted(10**5000) == "an integer of about 5,000 digits"
     assert quoted([10**5000]) == "a list that cannot be written out"
+
+
+def test_a_path_has_more_room_and_is_written_plainly():
+    assert quoted(Path("a" * 200)) == "a" * 200
+    assert len(quoted(Path("a" * 2000))) <= 250

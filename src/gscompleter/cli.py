@@ -19,6 +19,7 @@ from gscompleter.commands.options import (
     TablesOptions,
 )
 from gscompleter.errors import InputError
+from gscompleter.interrupts import treat_stops_alike
 
 Command = (
     Annotated[CompleteOptions, tyro.conf.subcommand("complete")]
@@ -55,6 +56,7 @@ def main() -> None:
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     module, function = COMMANDS[type(options)]
+    treat_stops_alike()
     try:
         getattr(import_module(module), function)(options)
     except InputError as error:
