@@ -125,6 +125,7 @@ def matching_costs(reference, source, transform, inverse_depths, radius, noise, 
                     line[1, x] = _clip(sy, np.float32(0), np.float32(H - 1))
                 for x in range(wide):
                     sx, sy = line[0, x], line[1, x]
+                    # `_clip` has made numbers from 0 to W - 1 and H - 1 of them, whatever came in.
                     ix = min(np.int32(sx), W - 2)
                     iy = min(np.int32(sy), H - 2)
                     ax, ay = sx - np.float32(ix), sy - np.float32(iy)
