@@ -17,7 +17,7 @@ from gscompleter.io.image import MAX_PIXELS, decode_pixels, image_size, read_dep
 from gscompleter.io.json_file import read_json
 from gscompleter.weights.fitting import load_strictly
 from gscompleter.weights.published import PUBLISHED
-from gscompleter.weights.reading import tensors_of_network
+from gscompleter.weights.reading import check_kind, tensors_of_network
 from scenes import random_gaussians
 
 
@@ -190,6 +190,16 @@ def test_tensors_that_are_no_arrays_of_numbers_are_refused(tmp_path, tensor):
     content = {"state_dict": {"encoder.weight": tensor}}
     told = sentence(tensors_of_network, content, tmp_path / "a.ckpt", MVSPLAT)
     assert "tensors without plain numbers (weight)" in told
+
+
+def test_an_archive_that_claims_several_disks_is_refused(tmp_path):
+    path = tmp_path / "a.ckpt"
+    torch.save({"a": torch.ones(3)}, path)
+    data = bytearray(path.read_bytes())
+    locator = data.rindex(b"PK\x06\x07")
+    data[locator + 16 : locator + 20] = struct.pack("<I", 7)
+    path.write_bytes(bytes(data))
+    assert "ends too early" in sentence(check_kind, path, "a.ckpt")
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])

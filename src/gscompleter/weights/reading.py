@@ -63,7 +63,7 @@ def check_kind(path: Path, name: str) -> None:
         wrong = "is a pointer of git-lfs and not the file itself"
     elif head.lstrip().lower().startswith((b"<!doctype", b"<html")):
         wrong = "is a web page that was saved under this name"
-    elif head.startswith(b"PK\x03\x04") and not zipfile.is_zipfile(path):
+    elif head.startswith(b"PK\x03\x04") and not is_archive(path):
         wrong = "ends too early, as after an interrupted download"
     if wrong:
         raise InputError(f"{path} {wrong}; {_replace_it(path, name)}.")
@@ -99,13 +99,21 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
+def is_archive(path: Path) -> bool:
+    """Whether it is a whole zip archive, as which torch saves."""
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:
+        return False
+
+
 def check_archive(path: Path, name: str) -> None:
     """Compare the parts of a zip archive, as which torch saves, with their checksums.
 
     Raises:
         InputError: where one differs.
     """
-    if not zipfile.is_zipfile(path):
+    if not is_archive(path):
         return
     try:
         with zipfile.ZipFile(path) as archive:
@@ -124,7 +132,7 @@ def read_tensors(path: Path, name: str) -> Any:
     """
     try:
         # Older files of torch are no zip archives and cannot be mapped.
-        mapped = zipfile.is_zipfile(path)
+        mapped = is_archive(path)
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as error:
         found = re.search(r"GLOBAL (\S+)", str(error))
