@@ -28,6 +28,7 @@ from gscompleter.commands.options import (
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError, quoted
+from gscompleter.interrupts import treat_stops_alike
 
 # Where each command lives. Its module is imported once the arguments are known to be right, so
 # that `--help` does not wait for torch.
@@ -53,6 +54,7 @@ def main() -> None:
     if words == ["--version"]:
         print(__version__)
         return
+    treat_stops_alike()
     try:
         options = checked(parsed(words))
         _, module, function = COMMANDS[words[0]]

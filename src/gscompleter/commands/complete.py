@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.ply import load_ply
+from gscompleter.memory import check_memory
 from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
@@ -54,11 +55,14 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     check_context(options)
     device = choose_device(options.device)
     given = open_photographs(options.folder, options.format, options.near, options.far)
-    views = [view.to(device) for view in read_views(given, options.context, options)]
     targets = read_targets(given, options)
+    cameras = [given.camera(frame, options.resolution) for frame in options.context]
+    cameras += [target.camera for target in targets]
+    check_sizes(cameras)
+    views = [view.to(device) for view in given.views(options.context, options.resolution)]
+    targets = [with_photograph(target, given, options) for target in targets]
     scene = None
     if options.scene is not None:
-        cameras = [view.camera for view in views] + [target.camera for target in targets]
         scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite)
         scene = told_from(given.origin, scene, cameras).to(device)
     completer = completer_for(options, targets, device)
@@ -114,17 +118,8 @@ def check_context(options: CompleteOptions) -> None:
         raise InputError("--target names no frame; name at least one, as in --target 8.")
 
 
-def read_views(
-    photographs: PosedPhotographs, frames: Sequence[int], options: CompleteOptions
-) -> list[View]:
-    """The photographs of `frames` as the options want them."""
-    for frame in frames:
-        check_size(photographs.camera(frame, options.resolution), f"Frame {frame}")
-    return photographs.views(frames, options.resolution)
-
-
 def read_targets(photographs: PosedPhotographs, options: CompleteOptions) -> list[Target]:
-    """The target cameras in the order of the command line, with photographs where there are any."""
+    """The target cameras in the order of the command line."""
     targets = []
     for word in options.target:
         frame = frame_number(word)
@@ -133,23 +128,34 @@ def read_targets(photographs: PosedPhotographs, options: CompleteOptions) -> lis
                 word, options.resolution, options.near, options.far, photographs.origin.tolist()
             )
             targets += [Target(camera) for camera in cameras]
-        elif photographs.has_photograph(frame):
-            (view,) = read_views(photographs, [frame], options)
-            targets.append(Target(view.camera, view.frame, view.image))
         else:
             targets.append(Target(photographs.camera(frame, options.resolution), frame))
-    for number, target in enumerate(targets, start=1):
-        check_size(target.camera, f"Target {number}")
     return targets
 
 
-def check_size(camera: Camera, name: str) -> None:
-    """Refuse images in which there is nothing to match and to score."""
-    if min(camera.width, camera.height) < MIN_SIZE:
-        raise InputError(
-            f"{name} is {camera.width} x {camera.height} pixels, and both sides must have at least "
-            f"{MIN_SIZE}; choose a larger --resolution."
-        )
+def with_photograph(
+    target: Target, photographs: PosedPhotographs, options: CompleteOptions
+) -> Target:
+    """`target` and what its camera took, if it is a frame that has a photograph."""
+    if target.frame is None or not photographs.has_photograph(target.frame):
+        return target
+    (view,) = photographs.views([target.frame], options.resolution)
+    return replace(target, photograph=view.image)
+
+
+def check_sizes(cameras: Sequence[Camera]) -> None:
+    """Refuse images in which there is nothing to match and to score, and those beyond all memory.
+
+    Raises:
+        InputError: where there are such.
+    """
+    for camera in cameras:
+        if min(camera.width, camera.height) < MIN_SIZE:
+            raise InputError(
+                f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
+                f"least {MIN_SIZE}; choose a larger --resolution, or another camera."
+            )
+    check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
 
 
 def frame_number(word: str) -> int | None:

@@ -125,7 +125,10 @@ def write_report(
         InputError: where a file cannot be written.
     """
     context_images = [compare(completion, v.camera, v.image, renderer) for v in completion.views]
-    target_images = [compare(completion, t.camera, t.photograph, renderer) for t in targets]
+    target_images = [
+        compare(completion, result.target, target.photograph, renderer)
+        for target, result in zip(targets, completion.targets, strict=True)
+    ]
     summary = summarize(completion, targets, context_images, target_images, said)
     save_ply(folder / "context.ply", completion.context)
     save_ply(folder / "completed.ply", completion.scene, provenance=True)

@@ -88,7 +88,9 @@ def ransac_line(
         design = torch.stack([x[agree], torch.ones_like(x[agree])], dim=-1) * weight[:, None]
         # The normal equations have a closed form on any device, which lstsq has not.
         normal = design.T @ design
-        if torch.linalg.cond(normal) > 1e12:
+        # Its second column is in inverse depths: measured by their own size, no unit matters.
+        even = torch.stack([torch.ones_like(x[0]), y.median()])
+        if torch.linalg.cond(normal * even * even[:, None]) > 1e12:
             break
         scale, shift = torch.linalg.solve(normal, design.T @ (y[agree] * weight)).tolist()
     return scale, shift
