@@ -2,9 +2,9 @@
 
 from torch import Tensor
 
-PARITY = 5e-5
-"""Largest difference that is rounding, of the array's largest value. Sums of float32 in another
-order differ by up to 1.5e-5 between CPUs; a wrong layer, sign or half a pixel by far more."""
+PARITY = 2e-4
+"""Largest difference that is rounding, of the array's largest value. The settings of one CPU differ
+by up to 3.5e-5 (quaternions of MVSplat); the tanh form of GELU is 2.5e-3 off."""
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
