@@ -34,6 +34,7 @@ from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
 from gscompleter.generators.diffusion.pe_field import PEField, grouped
 from gscompleter.generators.diffusion.source_depth import MonocularDepth, context_depth
 from gscompleter.types import Gaussians, SceneContext, merge
+from parity import assert_close
 from scenes import Room, answer, camera_at, gaussians_of, photographed, view_of
 from test_generators import TARGET, known_room
 from test_source_depth import tiny_model
@@ -101,7 +102,7 @@ def test_with_plain_positions_our_loop_is_the_pipeline_of_diffusers(kontext_fold
     ).images[0]
     assert model.grid(size) == grid
     assert found.std() > 0.01
-    assert (found - expected.permute(1, 2, 0)).abs().max() < 1e-5
+    assert_close(found, expected.permute(1, 2, 0), "image")
 
 
 def test_the_text_encoders_leave_memory_and_the_model_is_loaded_once(kontext_folder):
@@ -145,7 +146,7 @@ def test_images_made_together_are_those_made_alone(kontext_folder):
     together = [found.image for found in generator.synthesize(calls)]
     alone = [generator.synthesize([call])[0].image for call in calls]
     for image, expected in zip(together, alone, strict=True):
-        assert (image - expected).abs().max() < 1e-5
+        assert_close(image, expected, "image", 1e-5)
     assert (together[0] - together[1]).abs().max() > 1e-4
 
 
