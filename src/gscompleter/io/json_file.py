@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ def read_json(path: Path, advice: str) -> Any:
     Raises:
         InputError: where it cannot be read, is no JSON, or holds an integer beyond 64 bits.
     """
-    if path.exists() and not path.is_file():
+    if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"{quoted(path)} is not a file; correct the path.")
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"), parse_int=_integer)

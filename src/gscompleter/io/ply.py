@@ -257,7 +257,7 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """
     path = Path(path)
     try:
-        if path.exists() and not path.is_file():
+        if os.path.exists(path) and not os.path.isfile(path):
             raise InputError(f"{quoted(path)} is a directory or a device; a 3DGS .ply is needed.")
         with path.open("rb") as file:
             header = read_header(file, path)

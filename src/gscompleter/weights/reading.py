@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import pickle
 import re
 import zipfile
@@ -47,7 +48,7 @@ def check_kind(path: Path, name: str) -> None:
     Raises:
         InputError: where it is missing, empty, a pointer, a web page, or cut off.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"There is no file {path}; {name} is needed there.")
     try:
         with path.open("rb") as file:
