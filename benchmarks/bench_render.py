@@ -71,7 +71,7 @@ def main(size: int = 256, reference_size: int = 48) -> None:
         return step
 
     small, view = pixel_gaussians(reference_size, 0.0)
-    camera = widened(view.camera, 0.0)[0]
+    camera = widened(view.camera, 0.0).wide
     ours = median_seconds(optimise(lambda g: cpu.render(g, camera).image, small))
     theirs = median_seconds(optimise(lambda g: reference.render(g, camera).image, small), runs=2)
     print(f"forward and backward, {len(small):,} Gaussians, {reference_size} px: reference / cpu")

@@ -12,6 +12,7 @@ import cv2
 import torch
 
 import gscompleter as gsc
+from gscompleter.generators import Synthesis
 from gscompleter.generators.agreement import checked
 from gscompleter.generators.warp import warp_photographs
 from gscompleter.types import SceneContext
@@ -23,14 +24,7 @@ class Telea:
 
     radius: float = 5.0
 
-    def __call__(
-        self, nearest: gsc.View, target: gsc.Camera, context: SceneContext
-    ) -> torch.Tensor:
-        return self.with_notes(nearest, target, context)[0]
-
-    def with_notes(
-        self, nearest: gsc.View, target: gsc.Camera, context: SceneContext
-    ) -> tuple[torch.Tensor, tuple[str, ...]]:
+    def __call__(self, nearest: gsc.View, target: gsc.Camera, context: SceneContext) -> Synthesis:
         """The image [h, w, 3] in [0, 1], and sentences for `notes` of the target."""
         warped = warp_photographs(nearest, target, context)
         pixels = (255 * warped.image).byte().cpu().numpy()

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.data.scene import write_cameras
+from gscompleter.generators import Request, Synthesis, as_generator
 from gscompleter.io.image import write_image
 from gscompleter.types import Camera, Gaussians, View, observed, sh_from_rgb
 
@@ -141,3 +142,8 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
         scales=gaussians.scales * factor,
         encoded=None,
     )
+
+
+def answer(phi, nearest, target, context) -> Synthesis:
+    """What a generator, or a plain function, makes of one request."""
+    return as_generator(phi).synthesize([Request(nearest, target, context)])[0]

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gscompleter import InputError
-from gscompleter.generators import NotingGenerator
+from gscompleter.generators import Synthesis, as_generator
 from gscompleter.generators.agreement import AgreementConfig, checked, compare
 from gscompleter.generators.warp import Warped
 from gscompleter.generators.warp_inpaint import WarpInpaint
@@ -26,6 +26,12 @@ def observed() -> Warped:
     return Warped(image, SEEN, torch.ones(96, 96), ())
 
 
+def told(*arguments) -> tuple[torch.Tensor, tuple[str, ...]]:
+    """The image and the notes of `checked`."""
+    found = checked(*arguments)
+    return found.image, found.notes
+
+
 def test_a_colour_shift_is_measured_and_taken_back_in_the_unseen_part_too():
     found = compare(SHIFTED, observed().image, SEEN)
     assert found.agrees
@@ -43,13 +49,13 @@ def test_a_fifth_of_the_image_that_shows_something_else_does_not_bend_the_colour
 
 
 def test_an_image_that_agrees_stays_and_is_worth_no_note():
-    image, notes = checked(lambda seed: TRUTH, 0, observed())
+    image, notes = told(lambda seed: TRUTH, 0, observed())
     assert (image - TRUTH).abs().max() < 1e-3
     assert notes == ()
 
 
 def test_something_else_is_told_and_left_as_it_is():
-    image, notes = checked(lambda seed: NOISE, 0, observed())
+    image, notes = told(lambda seed: NOISE, 0, observed())
     assert torch.equal(image, NOISE)
     assert len(notes) == 1
     assert "disagrees with the photographs" in notes[0]
@@ -60,7 +66,7 @@ def test_an_image_in_negative_is_no_colour_shift():
     found = compare(1 - TRUTH, observed().image, SEEN)
     assert not found.agrees
     assert found.residual < found.limit
-    _, (note,) = checked(lambda seed: 1 - TRUTH, 0, observed())
+    _, (note,) = told(lambda seed: 1 - TRUTH, 0, observed())
     assert "a channel matches only as -1.00 of itself +1.00" in note
 
 
@@ -91,13 +97,13 @@ def test_of_images_that_all_disagree_the_nearest_is_kept():
     assert not any(one.agrees for one in found.values())
     best = min(found, key=lambda seed: found[seed].residual)
     assert len({one.residual for one in found.values()}) == 3
-    image, _ = checked(lambda seed: images[seed], 7, observed(), AgreementConfig(retries=2))
+    image, _ = told(lambda seed: images[seed], 7, observed(), AgreementConfig(retries=2))
     assert torch.equal(image, images[best])
 
 
 def test_a_seed_that_gives_nan_is_passed_over_and_nothing_but_nan_is_refused():
     broken = torch.full_like(TRUTH, float("nan"))
-    image, _ = checked(
+    image, _ = told(
         lambda seed: broken if seed == 0 else TRUTH, 0, observed(), AgreementConfig(retries=1)
     )
     assert (image - TRUTH).abs().max() < 1e-3
@@ -117,19 +123,19 @@ def test_further_seeds_are_tried_where_asked_and_only_until_one_agrees():
         tried.append(seed)
         return SHIFTED if seed == 9 else NOISE
 
-    image, notes = checked(paint, 7, observed(), AgreementConfig(retries=5))
+    image, notes = told(paint, 7, observed(), AgreementConfig(retries=5))
     assert tried == [7, 8, 9]
     assert (image - TRUTH).abs().max() < 0.01
     assert notes[-1].startswith("3 seeds were tried")
     tried.clear()
-    _, notes = checked(paint, 0, observed(), AgreementConfig(retries=1))
+    _, notes = told(paint, 0, observed(), AgreementConfig(retries=1))
     assert tried == [0, 1]
     assert "best of 2 seeds" in notes[0]
 
 
 def test_where_nothing_was_seen_nothing_is_said():
     nothing = Warped(TRUTH, torch.zeros_like(SEEN), torch.ones(96, 96), ())
-    image, notes = checked(lambda seed: NOISE, 0, nothing)
+    image, notes = told(lambda seed: NOISE, 0, nothing)
     assert torch.equal(image, NOISE)
     assert notes == ()
 
@@ -138,14 +144,11 @@ class Talking:
     """A generator of a user's own that tells something."""
 
     def __call__(self, nearest, target, context):
-        raise AssertionError("the notes would be lost")
-
-    def with_notes(self, nearest, target, context):
-        return torch.full((target.height, target.width, 3), 0.5), ("Painted grey.",)
+        image = torch.full((target.height, target.width, 3), 0.5)
+        return Synthesis(image, ("Painted grey.",))
 
 
 def test_the_stage_takes_the_notes_of_a_generator_that_has_some():
     context = known_room()
-    assert isinstance(Talking(), NotingGenerator)
-    assert synthesize(Talking(), TARGET, context).notes == ("Painted grey.",)
-    assert synthesize(WarpInpaint(), TARGET, context).notes == ()
+    assert synthesize(as_generator(Talking()), TARGET, context).notes == ("Painted grey.",)
+    assert synthesize(as_generator(WarpInpaint()), TARGET, context).notes == ()

@@ -5,7 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter import CompleterConfig, GSCompleter, InputError, load_renderer
+from gscompleter import (
+    CompleterConfig,
+    GSCompleter,
+    InputError,
+    load_generator,
+    load_renderer,
+)
+from gscompleter.completer import STAGES
+from gscompleter.generators import Synthesis
 from gscompleter.geometry import project
 from gscompleter.metrics.image import psnr
 from gscompleter.stages.anchor import lift
@@ -70,14 +78,16 @@ class KnowingTogether(KnowingGenerator):
     """The same, two targets at a time."""
 
     at_once = 2
+    takes_margin = True
 
     def __init__(self) -> None:
         super().__init__()
         self.calls: list[list] = []
 
-    def batch(self, calls):
-        self.calls.append(list(calls))
-        return [(self(*call), (f"One of {len(calls)}.",)) for call in calls]
+    def synthesize(self, requests):
+        self.calls.append(list(requests))
+        notes = (f"One of {len(requests)}.",)
+        return [Synthesis(self(r.nearest, r.target, r.context), notes) for r in requests]
 
 
 def knowing(config: CompleterConfig = CompleterConfig(), unit: float = 1.0) -> GSCompleter:
@@ -169,11 +179,13 @@ def test_targets_are_synthesized_together_where_the_generator_can():
     targets = [target, views[0].camera, *others]
     generator = KnowingTogether()
     together = GSCompleter(KnowingReconstructor(), generator)(views, targets)
-    assert [len(calls) for calls in generator.calls] == [1, 2]
+    assert [len(calls) for calls in generator.calls] == [1, 2, 1]
     renderer, added_to = load_renderer("cpu"), [together.context]
     added_to.append(merge([together.context, together.targets[0].added]))
+    added_to.append(merge([added_to[1], *(t.added for t in together.targets[2:4])]))
     for calls, scene in zip(generator.calls, added_to, strict=True):
-        for nearest, wide, context in calls:
+        for request in calls:
+            nearest, wide, context = request.nearest, request.target, request.context
             assert wide.width > SIZE  # with its margin
             assert nearest is context.views[1]
             assert torch.equal(context.at_target.alpha, renderer.render(scene, wide).alpha)
@@ -184,7 +196,7 @@ def test_targets_are_synthesized_together_where_the_generator_can():
         ("The target is a context view: nothing to complete.",),
         ("One of 2.",),
         ("One of 2.",),
-        (),
+        ("One of 1.",),
     ]
     one_by_one = knowing()(views, targets)
     assert torch.equal(together.scene.means, one_by_one.scene.means)
@@ -252,3 +264,48 @@ def test_bad_input_is_refused_with_a_sentence():
     views = [replace(v, camera=replace(v.camera, near=None)) for v in views]
     with pytest.raises(InputError, match="No context camera sees the scene"):
         knowing()(views, target, behind)
+
+
+def test_a_call_is_a_beginning_and_a_step_for_each_target():
+    views, (_, target) = photographs(), cameras()
+    targets = [target, camera_at(-0.9, yaw=-12, size=SIZE)]
+    begun = knowing().begin(views)
+    assert begun.scene is begun.context
+    assert begun.targets == ()
+    stepwise = begun
+    for camera in targets:
+        stepwise = knowing().advance(stepwise, camera)
+    at_once = knowing()(views, targets)
+    for name, tensor in tensors(at_once.scene).items():
+        assert torch.equal(tensor, getattr(stepwise.scene, name)), name
+    assert set(stepwise.seconds) == {*STAGES, "total"}
+
+
+def test_undo_is_to_go_on_from_the_former_state():
+    views, (_, target) = photographs(), cameras()
+    begun = knowing().begin(views)
+    before = {name: tensor.clone() for name, tensor in tensors(begun.scene).items()}
+    first = knowing().advance(begun, target)
+    assert len(first.scene) > len(begun.scene)
+    for name, tensor in tensors(begun.scene).items():
+        assert torch.equal(tensor, before[name]), name
+    again = knowing().advance(begun, target)
+    for name, tensor in tensors(first.scene).items():
+        assert torch.equal(tensor, getattr(again.scene, name)), name
+
+
+def test_a_generator_that_takes_no_margin_is_asked_for_the_target_itself():
+    views, (_, target) = photographs(), cameras()
+    truth = view_of(Room(), target)
+    oracle = load_generator("oracle", photographs=[truth])
+    completion = GSCompleter(KnowingReconstructor(), oracle)(views, target)
+    assert torch.equal(completion.targets[0].reference.image, truth.image)
+    assert len(completion.added) > 0
+
+
+def test_the_reference_is_the_one_that_a_step_takes():
+    views, (_, target) = photographs(), cameras()
+    begun = knowing().begin(views)
+    reference = knowing().reference(begun, target)
+    taken = knowing().advance(begun, target).targets[0].reference
+    assert torch.equal(reference.image, taken.image)

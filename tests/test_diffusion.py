@@ -22,7 +22,7 @@ from safetensors.torch import load_file, save_file
 import tiny_diffusion
 from command import run
 from gscompleter import InputError, load_generator, load_renderer
-from gscompleter.generators import DiffusionSettings
+from gscompleter.generators import DiffusionSettings, Request
 from gscompleter.generators.agreement import AgreementConfig
 from gscompleter.generators.diffusion.inpaint import (
     DiffusersInpaint,
@@ -34,7 +34,7 @@ from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
 from gscompleter.generators.diffusion.pe_field import PEField, grouped
 from gscompleter.generators.diffusion.source_depth import MonocularDepth, context_depth
 from gscompleter.types import Gaussians, SceneContext, merge
-from scenes import Room, camera_at, gaussians_of, photographed, view_of
+from scenes import Room, answer, camera_at, gaussians_of, photographed, view_of
 from test_generators import TARGET, known_room
 from test_source_depth import tiny_model
 
@@ -116,7 +116,8 @@ def test_pe_field_depends_on_seed_and_depth_and_on_nothing_else(kontext_folder):
     model, context = load_kontext(str(kontext_folder)), known_room()
 
     def image(context=context, **changes):
-        return PEField(model, **({"steps": 1} | changes))(context.views[1], TARGET, context)
+        generator = PEField(model, **({"steps": 1} | changes))
+        return answer(generator, context.views[1], TARGET, context).image
 
     first = image(seed=1)
     assert first.shape == (TARGET.height, TARGET.width, 3)
@@ -136,12 +137,13 @@ def test_images_made_together_are_those_made_alone(kontext_folder):
     ]
     generator = PEField(load_kontext(str(kontext_folder)), steps=2, at_once=2)
     calls = [
-        (context.views[1], target, known) for target, known in zip(targets, contexts, strict=True)
+        Request(context.views[1], target, known)
+        for target, known in zip(targets, contexts, strict=True)
     ]
-    conditions = [generator.condition(*call) for call in calls]
+    conditions = [generator.condition(r.nearest, r.target, r.context) for r in calls]
     assert grouped(conditions, 2) == [[0, 1], [3], [2]]
-    together = [image for image, _ in generator.batch(calls)]
-    alone = [generator(*call) for call in calls]
+    together = [found.image for found in generator.synthesize(calls)]
+    alone = [generator.synthesize([call])[0].image for call in calls]
     for image, expected in zip(together, alone, strict=True):
         assert (image - expected).abs().max() < 1e-5
     assert (together[0] - together[1]).abs().max() > 1e-4
@@ -152,11 +154,14 @@ def test_further_seeds_are_tried_and_the_best_is_kept(kontext_folder):
     generator = load_generator(
         "pe-field", 7, settings=DiffusionSettings(str(kontext_folder), steps=1, retries=2)
     )
-    image, (note,) = generator.with_notes(context.views[1], TARGET, context)
-    assert "best of 3 seeds" in note
+    best = answer(generator, context.views[1], TARGET, context)
+    assert "best of 3 seeds" in best.notes[0]
     single = replace(generator, agreement=AgreementConfig())
-    seeds = [replace(single, seed=7 + i)(context.views[1], TARGET, context) for i in range(3)]
-    assert sum(bool(torch.equal(image, one)) for one in seeds) == 1
+    seeds = [
+        answer(replace(single, seed=7 + i), context.views[1], TARGET, context).image
+        for i in range(3)
+    ]
+    assert sum(bool(torch.equal(best.image, one)) for one in seeds) == 1
 
 
 def test_settings_reach_the_generators(kontext_folder, inpaint_folder, tmp_path):
@@ -170,23 +175,23 @@ def test_settings_reach_the_generators(kontext_folder, inpaint_folder, tmp_path)
     with_depth = load_generator("pe-field", settings=replace(asked, depth=str(network)))
     assert isinstance(with_depth.depth, MonocularDepth)
     asked = DiffusionSettings(str(inpaint_folder), steps=3, retries=1, prompt="a quiet street")
-    painter = load_generator("diffusers-inpaint", settings=asked)
+    painter = load_generator("diffusers-inpaint", settings=asked).function
     assert (painter.prompt, painter.steps, painter.agreement.retries) == ("a quiet street", 3, 1)
 
 
 def test_an_inpainter_reads_its_prompt(inpaint_folder):
     context = known_room()
     asked = DiffusionSettings(str(inpaint_folder), steps=2, prompt="a quiet street")
-    generator = load_generator("diffusers-inpaint", settings=asked)
-    other = replace(generator, prompt="a b c")
-    images = [one(context.views[1], TARGET, context) for one in (generator, other)]
+    painter = load_generator("diffusers-inpaint", settings=asked).function
+    other = replace(painter, prompt="a b c")
+    images = [one(context.views[1], TARGET, context).image for one in (painter, other)]
     assert not torch.equal(*images)
 
 
 def test_noise_in_place_of_the_scene_is_told(kontext_folder):
     context = known_room()
     generator = PEField(load_kontext(str(kontext_folder)), steps=1)
-    _, notes = generator.with_notes(context.views[1], TARGET, context)
+    notes = answer(generator, context.views[1], TARGET, context).notes
     assert len(notes) == 1
     assert "disagrees with the photographs" in notes[0]
 
@@ -195,8 +200,11 @@ def test_a_scene_that_the_photograph_does_not_see_is_refused(kontext_folder):
     context = known_room()
     empty = tuple(replace(r, alpha=0 * r.alpha) for r in context.at_views)
     with pytest.raises(InputError, match="sees nothing of the scene"):
-        PEField(load_kontext(str(kontext_folder)))(
-            context.views[1], TARGET, replace(context, at_views=empty)
+        answer(
+            PEField(load_kontext(str(kontext_folder))),
+            context.views[1],
+            TARGET,
+            replace(context, at_views=empty),
         )
 
 
@@ -206,15 +214,15 @@ def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
     context, painter = known_room(), load_painter(str(folder))
     painter = replace(painter, side=min(painter.side, 256))  # Flux counts 128 latents
     generator = DiffusersInpaint(painter, steps=2)
-    image = generator(context.views[1], TARGET, context)
+    image = generator(context.views[1], TARGET, context).image
     warped = completed_warp(context.views[1], TARGET, context)
     assert 0.05 < (~warped.known).float().mean() < 0.9
     assert torch.equal(image[warped.known], warped.image[warped.known])
     assert (image - warped.image)[~warped.known].abs().mean() > 0.01
     assert image.min() >= 0
     assert image.max() <= 1
-    assert torch.equal(image, generator(context.views[1], TARGET, context))
-    other = replace(generator, seed=1)(context.views[1], TARGET, context)
+    assert torch.equal(image, generator(context.views[1], TARGET, context).image)
+    other = replace(generator, seed=1)(context.views[1], TARGET, context).image
     assert not torch.equal(image, other)
 
 
@@ -247,7 +255,7 @@ def test_a_checker_of_images_is_no_exception(tmp_path):
     index["feature_extractor"] = ["transformers", "CLIPFeatureExtractor"]
     (folder / "model_index.json").write_text(json.dumps(index))
     generator = load_generator("diffusers-inpaint", settings=DiffusionSettings(str(folder)))
-    assert generator.painter.pipeline.safety_checker is not None
+    assert generator.function.painter.pipeline.safety_checker is not None
     broken = tmp_path / "broken"
     shutil.copytree(folder, broken)
     (file,) = (broken / "safety_checker").glob("*.safetensors")

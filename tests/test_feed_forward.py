@@ -467,7 +467,8 @@ def test_crops_are_central_of_one_size_and_as_large_as_patches_allow():
 def test_of_a_wider_view_the_network_sees_what_it_sees_of_the_others():
     """Widening a camera keeps its rays, so the crop is the image as it was."""
     views = [off_centre(x, 64, 64) for x in (-0.2, 0.2)]
-    camera, left, top = widened(views[0].camera, 0.25)
+    window = widened(views[0].camera, 0.25)
+    camera, left, top = window.wide, window.left, window.top
     wide = view_of(Room(), camera)
     model = FeedForward(network("mvsplat"))
     narrow, mixed = model(views), model([wide, views[1]])

@@ -10,13 +10,13 @@ import torch
 from gscompleter import InputError, load_generator, load_renderer
 from gscompleter.generators.harmonize import gains
 from gscompleter.generators.oracle import Oracle
+from gscompleter.generators.smooth import continued, distance_to_known
 from gscompleter.generators.warp import Warped, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint, background_first, without_cracks
 from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patches
-from gscompleter.generators.warp_inpaint.smooth import continued, distance_to_known
 from gscompleter.metrics.image import psnr
 from gscompleter.types import Camera, Render, SceneContext, View, merge
-from scenes import Room, camera_at, gaussians_of, view_of
+from scenes import Room, answer, camera_at, gaussians_of, view_of
 
 SIZE = 96
 TARGET = camera_at(0.7, yaw=12, size=SIZE)
@@ -253,10 +253,10 @@ def test_a_foreground_object_is_not_copied_behind_itself():
 def test_the_oracle_returns_the_photograph_and_refuses_without_one():
     photograph = view_of(Room(), TARGET)
     context = known_room()
-    image = Oracle([*context.views, photograph])(context.views[0], TARGET, context)
+    image = answer(Oracle([*context.views, photograph]), context.views[0], TARGET, context).image
     assert torch.equal(image, photograph.image)
     with pytest.raises(InputError, match="photograph"):
-        Oracle(context.views)(context.views[0], TARGET, context)
+        answer(Oracle(context.views), context.views[0], TARGET, context)
 
 
 def test_an_unknown_generator_is_refused():

@@ -1,11 +1,12 @@
-"""GSCompleter: the four stages of the paper, in order."""
+"""GSCompleter: a scene is taken up once, then advanced by the four stages, target after target."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import torch
 from jaxtyping import Bool
@@ -13,17 +14,17 @@ from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
-from gscompleter.generators import BatchGenerator, Generator, load_generator
+from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import same_camera, widened
 from gscompleter.masks import dilate
 from gscompleter.matching.depth_range import estimate_depth_range
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, load_renderer
 from gscompleter.stages.anchor import (
+    AnchorChoice,
     Synthesized,
     lift,
     select_anchor,
-    synthesize,
     synthesize_all,
 )
 from gscompleter.stages.context import depth_range_of_scene, init_context
@@ -37,20 +38,49 @@ from gscompleter.stages.integration import (
     refine_opacities,
     squared_error,
 )
-from gscompleter.stages.registration import register
+from gscompleter.stages.registration import Registration, register
 from gscompleter.types import (
     Camera,
     Completion,
     DepthAffine,
     Gaussians,
+    Lift,
+    Render,
     SceneContext,
     TargetCompletion,
     View,
+    Window,
     merge,
 )
 
 MAX_TARGETS = 255
 """Provenance is a byte per Gaussian: 0 for observed, 1 to 255 for the targets."""
+
+STAGES = ("context", "generate", "lift", "register", "integrate")
+"""What a completion spends its time on."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a target camera meets in the scene as it stands."""
+
+    completion: Completion
+    """As far as it went before this target."""
+    window: Window
+    """The target, and the wider camera that it is completed with."""
+    frozen: FrozenView
+    """The scene frozen at the wider camera."""
+    anchor: AnchorChoice
+
+    @property
+    def before(self) -> Render:
+        """The scene as the target itself sees it."""
+        return self.frozen.context.cropped(self.window)
+
+    @property
+    def anchor_view(self) -> View:
+        """The photograph that forms the stereo pair with the target."""
+        return self.completion.views[self.anchor.index]
 
 
 @dataclass(frozen=True)
@@ -62,7 +92,9 @@ class GSCompleter:
 
     reconstructor: Reconstructor = field(default_factory=lambda: load_reconstructor("plane-sweep"))
     """Ψ: views -> Gaussians and depth maps."""
-    generator: Generator = field(default_factory=lambda: load_generator("warp-inpaint"))
+    generator: Generator | ImageFunction = field(
+        default_factory=lambda: load_generator("warp-inpaint")
+    )
     """Φ: nearest view and target camera -> image."""
     renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
     """Draws Gaussians, differentiably."""
@@ -90,181 +122,221 @@ class GSCompleter:
             InputError: too few views, no baseline, too many targets, a scene nobody sees.
         """
         targets = [target] if isinstance(target, Camera) else list(target)
-        first_number = 1 if scene is None or len(scene) == 0 else int(scene.generated.max()) + 1
         if not targets:
             raise InputError("No target camera was given; name at least one view to complete.")
-        if first_number + len(targets) - 1 > MAX_TARGETS:
-            raise InputError(
-                f"{len(targets)} targets were given after {first_number - 1} in the scene, and a "
-                f".ply can tell {MAX_TARGETS} apart; complete the scene in several runs."
-            )
+        check_numbers(scene, len(targets))
+        completion = self.begin(views, scene)
+        at_once = as_generator(self.generator).at_once
+        for start in range(0, len(targets), at_once):
+            completion = self.advance_together(completion, targets[start : start + at_once])
+        return completion
+
+    def begin(self, views: Sequence[View], scene: Gaussians | None = None) -> Completion:
+        """Stage 1: the scene and its photographs before any target, the arguments as in a call.
+
+        Raises:
+            InputError: too few views, no baseline, a scene nobody sees.
+        """
         if len(views) < (2 if scene is None else 1):
             raise InputError(
                 f"{len(views)} context view was given, and stereo needs at least 2; name more "
                 "frames, or bring a scene."
             )
-
-        clock = Clock(STAGES)
+        clock = Clock()
         with clock("context"):
             near, far = self.depth_range(views, scene)
-            views = [replace(v, camera=ranged(v.camera, near, far)) for v in views]
-            targets = [ranged(camera, near, far) for camera in targets]
+            views = tuple(replace(v, camera=replace(v.camera, near=near, far=far)) for v in views)
             context = init_context(self.reconstructor, views) if scene is None else scene
             allowed = self.allowed_errors(context, views)
+        return Completion(context, context, views, allowed, (), clock.seconds)
 
-        current = context
-        results: list[TargetCompletion] = []
-        at_once = self.generator.at_once if isinstance(self.generator, BatchGenerator) else 1
-        for start in range(0, len(targets), at_once):
-            together = targets[start : start + at_once]
-            references = self.synthesize_together(current, views, together, clock)
-            for camera, reference in zip(together, references, strict=True):
-                number = first_number + len(results)
-                result = self.complete_target(
-                    current, views, camera, number, allowed, clock, reference
-                )
-                if len(result.added) > 0:
-                    current = merge([current, result.added])
-                results.append(result)
-        return Completion(current, context, tuple(results), clock.seconds())
+    def advance(
+        self, completion: Completion, target: Camera, reference: Synthesized | None = None
+    ) -> Completion:
+        """Stages 2 to 4 for one target: the scene with what they add to it.
 
-    def synthesize_together(
-        self, scene: Gaussians, views: Sequence[View], targets: Sequence[Camera], clock: Clock
-    ) -> list[Synthesized | None]:
-        """Images of several targets from a generator that takes them all at once.
+        Args:
+            completion: Where it goes on from; it stays as it is.
+            target: The camera to complete the scene for.
+            reference: The image at the target (at its wider camera, where the generator takes a
+                margin). The generator is asked for it if it is left out.
 
-        None for a target at which there is nothing to complete, and for all where the generator
-        takes one at a time: it then sees what was completed for the targets before.
+        Raises:
+            InputError: where the targets before are as many as a .ply can tell apart.
         """
-        if len(targets) < 2 or not isinstance(self.generator, BatchGenerator):
-            return [None] * len(targets)
-        asked: dict[int, tuple[Camera, SceneContext]] = {}
+        check_numbers(completion.context, len(completion.targets) + 1)
+        clock = Clock()
         with clock("context"):
-            renders = tuple(self.renderer.render(scene, view.camera) for view in views)
-            for i, target in enumerate(targets):
-                wide, left, top = widened(target, self.config.margin)
-                at_target = self.renderer.render(scene, wide)
-                inner = at_target.cropped(left, top, target.width, target.height)
-                if nothing_to_do(target, views, hole_mask(inner, self.config.holes)) is None:
-                    asked[i] = (wide, SceneContext(tuple(views), renders, at_target))
-        with clock("generate"):
-            found = synthesize_all(self.generator, list(asked.values())) if asked else []
-        images = dict(zip(asked, found, strict=True))
-        return [images.get(i) for i in range(len(targets))]
+            sight = self.sight(completion, target)
+        result = nothing_added(sight, self.hole_mask(sight.before))
+        reason = nothing_to_do(result, completion.views)
+        if reason is None:
+            result = self.completed(sight, result, reference, clock)
+        else:
+            result = replace(result, notes=(reason,))
+        return followed_by(completion, result, clock.seconds)
 
-    def complete_target(
-        self,
-        scene: Gaussians,
-        views: Sequence[View],
-        target: Camera,
-        number: int,
-        allowed_errors: Sequence[float],
-        clock: Clock,
-        reference: Synthesized | None = None,
+    def completed(
+        self, sight: Sight, result: TargetCompletion, reference: Synthesized | None, clock: Clock
     ) -> TargetCompletion:
-        """Stages 2 to 4 for one target: what it adds to `scene`, and how it came about.
-
-        The generator is asked for the `reference` where there is none yet.
-        """
-        random = torch.Generator().manual_seed(self.seed)
-        wide, left, top = widened(target, self.config.margin)
-        with clock("context"):
-            at_target = self.renderer.freeze(scene, wide)
-            before = at_target.context.cropped(left, top, target.width, target.height)
-            choice = select_anchor(target, views, self.config.anchor)
-            anchor = views[choice.index]
-        nothing = TargetCompletion(
-            target=target,
-            before=before,
-            after=before,
-            hole_mask=hole_mask(before, self.config.holes),
-            reference=None,
-            anchor=choice.index,
-            anchor_fallback=choice.fallback,
-            affine=DepthAffine(),
-            added=scene[:0],
-        )
-        reason = nothing_to_do(target, views, nothing.hole_mask)
-        if reason is not None:
-            return replace(nothing, notes=(reason,))
-
+        """`result` once the four stages have done their work."""
+        scene, views, target = sight.completion.scene, sight.completion.views, sight.window.target
         with clock("generate"):
-            at_views = [self.renderer.freeze(scene, view.camera) for view in views]
-            renders = tuple(frozen.context for frozen in at_views)
-            known = SceneContext(tuple(views), renders, at_target.context)
+            frozen_views = [self.renderer.freeze(scene, view.camera) for view in views]
             if reference is None:
-                reference = synthesize(self.generator, wide, known)
-
+                (reference,) = self.synthesize([sight], contexts_of(frozen_views))
         with clock("lift"):
-            lifted = lift(self.reconstructor, reference, anchor)
-            wide_holes = hole_mask(at_target.context, self.config.holes)
-            if self.config.holes.neighbourhood is not None:
-                near_holes = dilate(wide_holes, self.config.holes.neighbourhood)
-                lifted = keep_near_holes(lifted, near_holes)
-
+            lifted = self.lift(sight, reference)
         with clock("register"):
-            registration = register(
-                lifted,
-                at_target,
-                at_views[choice.index].context,
-                reference,
-                anchor.camera,
-                self.renderer,
-                random,
-                self.config.registration,
-            )
-
+            registration = self.register(sight, lifted, reference, frozen_views)
         with clock("integrate"):
-            mask = dilate(
-                hole_mask(at_target.context, self.config.holes), self.config.holes.dilation
-            )
-            kept = keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide)
-            kept, placed = respect_free_space(
-                kept,
-                wide,
-                [view.camera for view in views],
-                renders,
-                self.config.registration.footprint,
-                self.config.free_space,
-            )
-            kept = kept[placed]
-            kept = replace(kept, generated=torch.full_like(kept.generated, number))
-            refined, refine_losses = self.refine(kept, at_target, reference, at_views, views)
-            added = do_no_harm(refined, at_views, views, allowed_errors, self.config.harm)
+            kept = self.keep(sight, lifted, registration, frozen_views)
+            added, losses = self.refine(sight, kept, reference, frozen_views)
             after = self.renderer.render(merge([scene, added]), target)
-
-        rows, columns = slice(top, top + target.height), slice(left, left + target.width)
         return replace(
-            nothing,
+            result,
             after=after,
-            reference=View(reference.image[rows, columns], target),
+            reference=View(sight.window.crop(reference.image), target),
             affine=registration.affine,
             added=added,
-            losses={"register": registration.losses, "refine": refine_losses},
-            notes=(*reference.notes, *notes_of(choice.fallback, registration.affine)),
+            losses={"register": registration.losses, "refine": losses},
+            notes=(*reference.notes, *notes_of(sight.anchor.fallback, registration.affine)),
         )
+
+    def advance_together(self, completion: Completion, targets: Sequence[Camera]) -> Completion:
+        """`advance` by each of `targets`, whose images are synthesized in one go beforehand."""
+        if len(targets) < 2:
+            return reduce(self.advance, targets, completion)
+        references, seconds = self.references(completion, targets)
+        completion = replace(completion, seconds=total(completion.seconds, seconds))
+        for target, reference in zip(targets, references, strict=True):
+            completion = self.advance(completion, target, reference)
+        return completion
+
+    def reference(self, completion: Completion, target: Camera) -> View:
+        """The image of Φ as far as `target` sees it, whether or not there is a hole.
+
+        It is the one that `advance` would take: drawn with the margin, which is then cut off.
+        """
+        sight = self.sight(completion, target)
+        at_views = [self.renderer.render(completion.scene, v.camera) for v in completion.views]
+        (image,) = self.synthesize([sight], at_views)
+        return View(sight.window.crop(image.image), sight.window.target)
+
+    def references(
+        self, completion: Completion, targets: Sequence[Camera]
+    ) -> tuple[list[Synthesized | None], Mapping[str, float]]:
+        """The image at each target where there is something to complete, and the seconds taken."""
+        clock = Clock()
+        with clock("context"):
+            sights = [self.sight(completion, target) for target in targets]
+            results = [nothing_added(sight, self.hole_mask(sight.before)) for sight in sights]
+            asked = [nothing_to_do(result, completion.views) is None for result in results]
+            at_views = [self.renderer.render(completion.scene, v.camera) for v in completion.views]
+        with clock("generate"):
+            wanted = [sight for sight, needed in zip(sights, asked, strict=True) if needed]
+            found = iter(self.synthesize(wanted, at_views))
+        return [next(found) if needed else None for needed in asked], clock.seconds
+
+    def synthesize(self, sights: Sequence[Sight], at_views: Sequence[Render]) -> list[Synthesized]:
+        """Stage 2: Φ's image at each of the wider cameras."""
+        asked = [
+            (
+                sight.window.wide,
+                SceneContext(sight.completion.views, tuple(at_views), sight.frozen.context),
+            )
+            for sight in sights
+        ]
+        return synthesize_all(as_generator(self.generator), asked) if asked else []
+
+    def lift(self, sight: Sight, reference: Synthesized) -> Lift:
+        """Stage 2: the image as Gaussians, those that lie near a hole."""
+        lifted = lift(self.reconstructor, reference, sight.anchor_view)
+        radius = self.config.holes.neighbourhood
+        if radius is None:
+            return lifted
+        return keep_near_holes(lifted, dilate(self.hole_mask(sight.frozen.context), radius))
+
+    def register(
+        self,
+        sight: Sight,
+        lifted: Lift,
+        reference: Synthesized,
+        frozen_views: Sequence[FrozenView],
+    ) -> Registration:
+        """Stage 3: the candidates at the depth of the scene."""
+        return register(
+            lifted,
+            sight.frozen,
+            frozen_views[sight.anchor.index].context,
+            reference,
+            sight.anchor_view.camera,
+            self.renderer,
+            torch.Generator().manual_seed(self.seed),
+            self.config.registration,
+        )
+
+    def keep(
+        self,
+        sight: Sight,
+        lifted: Lift,
+        registration: Registration,
+        frozen_views: Sequence[FrozenView],
+    ) -> Gaussians:
+        """Stage 4: what lies in the holes, where no photograph saw through it."""
+        mask = dilate(self.hole_mask(sight.frozen.context), self.config.holes.dilation)
+        wide = sight.window.wide
+        kept, placed = respect_free_space(
+            keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide),
+            wide,
+            [view.camera for view in sight.completion.views],
+            contexts_of(frozen_views),
+            self.config.registration.footprint,
+            self.config.free_space,
+        )
+        kept = kept[placed]
+        number = torch.full_like(kept.generated, sight.completion.next_number)
+        return replace(kept, generated=number)
 
     def refine(
         self,
-        added: Gaussians,
-        at_target: FrozenView,
-        reference: View,
-        at_views: Sequence[FrozenView],
-        views: Sequence[View],
+        sight: Sight,
+        kept: Gaussians,
+        reference: Synthesized,
+        frozen_views: Sequence[FrozenView],
     ) -> tuple[Gaussians, tuple[float, ...]]:
-        """Refine the opacities of `added` against the context views nearest to the target."""
-        nearest = sorted(
-            range(len(views)),
-            key=lambda i: (views[i].camera.center - reference.camera.center).norm().item(),
-        )[: self.config.refine.num_views]
-        return refine_opacities(
-            added,
-            at_target,
+        """Stage 4: what joins the scene with the opacities it has there, and the losses."""
+        completion, config = sight.completion, self.config
+        nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
+        refined, losses = refine_opacities(
+            kept,
+            sight.frozen,
             reference,
-            [at_views[i] for i in nearest],
-            [views[i] for i in nearest],
-            self.config.refine,
+            [frozen_views[i] for i in nearest],
+            [completion.views[i] for i in nearest],
+            config.refine,
         )
+        allowed = completion.allowed_errors
+        return do_no_harm(refined, frozen_views, completion.views, allowed, config.harm), losses
+
+    def sight(self, completion: Completion, target: Camera) -> Sight:
+        """The scene as it stands, frozen at the target's wider camera, and the target's anchor."""
+        window = self.window(completion, target)
+        return Sight(
+            completion,
+            window,
+            self.renderer.freeze(completion.scene, window.wide),
+            select_anchor(window.target, completion.views, self.config.anchor),
+        )
+
+    def window(self, completion: Completion, target: Camera) -> Window:
+        """The target and its wider camera, as wide as the generator can draw."""
+        takes_margin = as_generator(self.generator).takes_margin
+        return widened(completion.ranged(target), self.config.margin if takes_margin else 0.0)
+
+    def hole_mask(self, render: Render) -> Bool[Tensor, "h w"]:
+        """Where the scene has a hole, by the settings of this completer."""
+        return hole_mask(render, self.config.holes)
 
     def depth_range(self, views: Sequence[View], scene: Gaussians | None) -> tuple[float, float]:
         """Near and far plane in scene units: as given, else estimated from what there is."""
@@ -277,28 +349,77 @@ class GSCompleter:
             low, high = depth_range_of_scene(scene, [v.camera for v in views], self.renderer)
         return near if near is not None else low, far if far is not None else high
 
-    def allowed_errors(self, context: Gaussians, views: Sequence[View]) -> list[float]:
+    def allowed_errors(self, context: Gaussians, views: Sequence[View]) -> tuple[float, ...]:
         """Largest mean squared error that each photograph may have once all is done."""
-        renders = [self.renderer.render(context, view.camera).image for view in views]
         tolerance = self.config.harm.tolerance or 0.0
-        return [
+        renders = [self.renderer.render(context, view.camera).image for view in views]
+        return tuple(
             error_with_loss(squared_error(image, view.image).item(), tolerance)
             for image, view in zip(renders, views, strict=True)
-        ]
+        )
 
 
-def nothing_to_do(target: Camera, views: Sequence[View], holes: Bool[Tensor, "h w"]) -> str | None:
+def check_numbers(scene: Gaussians | None, num_targets: int) -> None:
+    """Refuse more targets than provenance can tell apart.
+
+    Raises:
+        InputError: where `scene` holds so many already that `num_targets` more do not fit.
+    """
+    given = 0 if scene is None or len(scene) == 0 else int(scene.generated.max())
+    if given + num_targets > MAX_TARGETS:
+        raise InputError(
+            f"{num_targets} targets were given after {given} in the scene, and a .ply can tell "
+            f"{MAX_TARGETS} apart; complete the scene in several runs."
+        )
+
+
+def nothing_added(sight: Sight, holes: Bool[Tensor, "h w"]) -> TargetCompletion:
+    """The target before anything happened there."""
+    return TargetCompletion(
+        target=sight.window.target,
+        before=sight.before,
+        after=sight.before,
+        hole_mask=holes,
+        reference=None,
+        anchor=sight.anchor.index,
+        anchor_fallback=sight.anchor.fallback,
+        affine=DepthAffine(),
+        added=sight.completion.scene[:0],
+    )
+
+
+def nothing_to_do(result: TargetCompletion, views: Sequence[View]) -> str | None:
     """Why a target needs no completion, in a sentence; None where it does."""
-    if any(same_camera(target, view.camera) for view in views):
+    if any(same_camera(result.target, view.camera) for view in views):
         return "The target is a context view: nothing to complete."
-    if not holes.any():
+    if not result.hole_mask.any():
         return "The scene has no hole here: nothing to complete."
     return None
 
 
-def ranged(camera: Camera, near: float, far: float) -> Camera:
-    """`camera` with the depth range of the scene."""
-    return replace(camera, near=near, far=far)
+def followed_by(
+    completion: Completion, result: TargetCompletion, seconds: Mapping[str, float]
+) -> Completion:
+    """`completion` after what happened at one more target."""
+    added = result.added
+    return replace(
+        completion,
+        scene=merge([completion.scene, added]) if len(added) else completion.scene,
+        targets=(*completion.targets, result),
+        seconds=total(completion.seconds, seconds),
+    )
+
+
+def contexts_of(frozen_views: Sequence[FrozenView]) -> tuple[Render, ...]:
+    """The scene as each of the frozen views shows it."""
+    return tuple(frozen.context for frozen in frozen_views)
+
+
+def nearest_views(camera: Camera, views: Sequence[View]) -> list[int]:
+    """Indices of `views`, the ones taken closest to `camera` first."""
+    return sorted(
+        range(len(views)), key=lambda i: (views[i].camera.center - camera.center).norm().item()
+    )
 
 
 def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
@@ -318,14 +439,10 @@ def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
     return tuple(notes)
 
 
-STAGES = ("context", "generate", "lift", "register", "integrate")
-"""What a completion spends its time on."""
-
-
 class Clock:
-    """Wall time by stage."""
+    """Wall time by stage, and `total`."""
 
-    def __init__(self, stages: Sequence[str] = ()) -> None:
+    def __init__(self, stages: Sequence[str] = STAGES) -> None:
         self._start = time.perf_counter()
         self._seconds = dict.fromkeys(stages, 0.0)
 
@@ -340,6 +457,12 @@ class Clock:
             spent = time.perf_counter() - start
             self._seconds[stage] = self._seconds.get(stage, 0.0) + spent
 
+    @property
     def seconds(self) -> dict[str, float]:
         """Seconds of each stage so far, and of all of it."""
         return {**self._seconds, "total": time.perf_counter() - self._start}
+
+
+def total(before: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:
+    """Seconds of both, stage by stage."""
+    return {stage: before[stage] + more[stage] for stage in before}

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.types import Camera
+from gscompleter.types import Camera, Window
 
 
 def unproject(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w 3"]:
@@ -78,18 +78,14 @@ def baseline_between(a: Camera, b: Camera) -> float:
     return (a.center - b.center).norm().item()
 
 
-def widened(camera: Camera, margin: float) -> tuple[Camera, int, int]:
-    """`camera` with its image extended on every side by a share `margin` of its width and height.
-
-    Rays through the old pixels stay the same. Also returns how many pixels were added on the left
-    (and right) and at the top (and bottom).
-    """
+def widened(camera: Camera, margin: float) -> Window:
+    """`camera` and the one whose image extends it on every side by `margin` of its size."""
     left, top = round(margin * camera.width), round(margin * camera.height)
     K = camera.K.clone()
     K[0, 2] += left
     K[1, 2] += top
     wide = replace(camera, K=K, width=camera.width + 2 * left, height=camera.height + 2 * top)
-    return wide, left, top
+    return Window(camera, wide, left, top)
 
 
 def same_camera(a: Camera, b: Camera) -> bool:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 SH_C0 = 0.28209479177387814
@@ -79,6 +79,24 @@ class Camera:
 
     def to(self, device: torch.device | str) -> Camera:
         return replace(self, c2w=self.c2w.to(device), K=self.K.to(device))
+
+
+@dataclass(frozen=True)
+class Window:
+    """A target camera, and the wider one that it is completed with."""
+
+    target: Camera
+    wide: Camera
+    """The same camera with more pixels on every side; its rays through the old ones stay."""
+    left: int
+    """Pixels that were added on the left, and on the right."""
+    top: int
+    """Pixels that were added at the top, and at the bottom."""
+
+    def crop(self, image: Shaped[Tensor, "wide_h wide_w *c"]) -> Shaped[Tensor, "h w *c"]:
+        """The part of an image of `wide` that `target` sees."""
+        rows = slice(self.top, self.top + self.target.height)
+        return image[rows, self.left : self.left + self.target.width]
 
 
 @dataclass(frozen=True)
@@ -209,12 +227,9 @@ class Render:
     alpha: Float[Tensor, "h w"]
     """Accumulated opacity, sum(w)."""
 
-    def cropped(self, left: int, top: int, width: int, height: int) -> Render:
-        """The window of `width` x `height` pixels whose top-left pixel is (left, top)."""
-        rows, columns = slice(top, top + height), slice(left, left + width)
-        return Render(
-            self.image[rows, columns], self.depth[rows, columns], self.alpha[rows, columns]
-        )
+    def cropped(self, window: Window) -> Render:
+        """What the target of `window` sees of a render of its wide camera."""
+        return Render(window.crop(self.image), window.crop(self.depth), window.crop(self.alpha))
 
     def depth_map(self, min_alpha: float = 0.5) -> DepthMap:
         """The depth, valid where the Gaussians cover at least `min_alpha` of the pixel."""
@@ -312,12 +327,21 @@ class TargetCompletion:
 
 @dataclass(frozen=True)
 class Completion:
-    """A completed scene."""
+    """A scene on its way to completion: what `GSCompleter` begins with and what a step leads to.
+
+    A step gives a new value and leaves this one as it is, so that undo is to go on from the former.
+    """
 
     scene: Gaussians
     """The context, bit for bit as it was, followed by everything that was added."""
     context: Gaussians
+    """The scene before its first target."""
+    views: tuple[View, ...]
+    """The photographs, with the depth range that the completion works in."""
+    allowed_errors: tuple[float, ...]
+    """Largest mean squared error that each photograph may have, whatever is added."""
     targets: tuple[TargetCompletion, ...]
+    """What happened so far, in the order of the targets."""
     seconds: Mapping[str, float]
     """Wall time of context, generate, lift, register, integrate and total."""
 
@@ -325,3 +349,14 @@ class Completion:
     def added(self) -> Gaussians:
         """The generated Gaussians of all targets."""
         return self.scene[len(self.context) :]
+
+    @property
+    def next_number(self) -> int:
+        """Provenance of what the next target adds: it goes on from what the context holds."""
+        given = int(self.context.generated.max()) if len(self.context) else 0
+        return given + len(self.targets) + 1
+
+    def ranged(self, camera: Camera) -> Camera:
+        """`camera` with the depth range that the completion works in."""
+        known = self.views[0].camera
+        return replace(camera, near=known.near, far=known.far)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +50,6 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     device = choose_device(options.device)
     renderer = load_renderer(device)
     config = load_config(options.config)
-    if options.synthesis.generator == "oracle":  # a photograph ends where the target's image ends
-        config = replace(config, margin=0.0)
     check_context(options)
     views = [view.to(device) for view in read_views(options, options.context)]
     targets = read_targets(options)

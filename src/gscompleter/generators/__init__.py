@@ -1,6 +1,7 @@
 """Φ: the nearest photograph and a target camera -> the image that camera would take.
 
-A generator is any callable of that form. The table of names serves the command line.
+A generator says what it needs and answers requests; any callable of the form above is taken for one
+(`as_generator`). The table of names serves the command line.
 """
 
 from __future__ import annotations
@@ -16,48 +17,64 @@ from gscompleter.errors import InputError
 from gscompleter.types import Camera, SceneContext, View
 
 
+@dataclass(frozen=True)
+class Request:
+    """One image that Φ is asked for."""
+
+    nearest: View
+    """The photograph taken closest to `target`."""
+    target: Camera
+    context: SceneContext
+    """All photographs, and renders of the scene as it is; what Φ uses of it is its own affair."""
+
+
+@dataclass(frozen=True)
+class Synthesis:
+    """What Φ answers."""
+
+    image: Float[Tensor, "h w 3"]
+    """In [0, 1], of the size of the target."""
+    notes: tuple[str, ...] = ()
+    """What a reader of the results should know of it, a sentence each."""
+
+
 @runtime_checkable
 class Generator(Protocol):
-    """Φ of the paper: `image = generator(nearest, target, context)`.
+    """Φ of the paper: what it needs, and the images that it synthesizes."""
 
-    `nearest` is the photograph taken closest to `target`. What a generator uses of `context`
-    (all photographs, and renders of the scene as it is) is its own affair.
-    """
-
-    def __call__(
-        self, nearest: View, target: Camera, context: SceneContext
-    ) -> Float[Tensor, "h w 3"]: ...
-
-
-@runtime_checkable
-class NotingGenerator(Protocol):
-    """A generator that also tells what to know of its image, a sentence each, for the report."""
-
-    def __call__(
-        self, nearest: View, target: Camera, context: SceneContext
-    ) -> Float[Tensor, "h w 3"]: ...
-
-    def with_notes(
-        self, nearest: View, target: Camera, context: SceneContext
-    ) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]: ...
-
-
-@runtime_checkable
-class BatchGenerator(Protocol):
-    """A generator that synthesizes several targets at once, none of which waits for another."""
+    @property
+    def takes_margin(self) -> bool:
+        """Whether it can draw more than a target's own image, which is then completed wider."""
 
     @property
     def at_once(self) -> int:
-        """Most targets that it takes together."""
+        """Most requests that it takes together; with 1 each sees what the ones before added."""
 
-    def __call__(
-        self, nearest: View, target: Camera, context: SceneContext
-    ) -> Float[Tensor, "h w 3"]: ...
+    def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
+        """An answer for each of `requests`, in their order."""
 
-    def batch(
-        self, calls: Sequence[tuple[View, Camera, SceneContext]]
-    ) -> list[tuple[Tensor, tuple[str, ...]]]:
-        """Image [h, w, 3] and notes for each of `calls`, in their order."""
+
+ImageFunction = Callable[[View, Camera, SceneContext], Tensor | Synthesis]
+"""Φ at its simplest: (nearest, target, context) -> an image [h, w, 3], or one with notes."""
+
+
+@dataclass(frozen=True)
+class OneByOne:
+    """A plain function as a generator: one request at a time, with the margin."""
+
+    function: ImageFunction
+    takes_margin: bool = True
+    at_once: int = 1
+
+    def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
+        """What the function answers to each of `requests`."""
+        answers = [self.function(r.nearest, r.target, r.context) for r in requests]
+        return [a if isinstance(a, Synthesis) else Synthesis(a) for a in answers]
+
+
+def as_generator(phi: Generator | ImageFunction) -> Generator:
+    """`phi` itself, or the plain function that it is as a generator."""
+    return phi if isinstance(phi, Generator) else OneByOne(phi)
 
 
 @dataclass(frozen=True)
@@ -101,7 +118,7 @@ class GeneratorRequest:
 def _warp_inpaint(request: GeneratorRequest) -> Generator:
     from gscompleter.generators.warp_inpaint import WarpInpaint
 
-    return WarpInpaint(seed=request.seed)
+    return OneByOne(WarpInpaint(seed=request.seed))
 
 
 def _oracle(request: GeneratorRequest) -> Generator:
@@ -119,7 +136,7 @@ def _pe_field(request: GeneratorRequest) -> Generator:
 def _diffusers_inpaint(request: GeneratorRequest) -> Generator:
     from gscompleter.generators.diffusion.inpaint import load_diffusers_inpaint
 
-    return load_diffusers_inpaint(request.seed, request.device, request.settings)
+    return OneByOne(load_diffusers_inpaint(request.seed, request.device, request.settings))
 
 
 GENERATORS: dict[str, Callable[[GeneratorRequest], Generator]] = {

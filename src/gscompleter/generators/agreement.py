@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
+from gscompleter.generators import Synthesis
 from gscompleter.generators.robust import robust_affine
 from gscompleter.generators.warp import Warped
 from gscompleter.interpolation import smoothed
@@ -72,7 +73,7 @@ def checked(
     seed: int,
     observed: Warped,
     config: AgreementConfig = AgreementConfig(),
-) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]:
+) -> Synthesis:
     """An image painted from a seed, its colours brought to those observed, and notes on it.
 
     Args:
@@ -96,7 +97,7 @@ def checked(
             f"The generator painted no finite image ({len(found)} seed(s) tried); see that its "
             "weights are sound, or choose another generator."
         )
-    return best.image, notes_on(best, len(found))
+    return Synthesis(best.image, notes_on(best, len(found)))
 
 
 def compare(

@@ -9,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
+from gscompleter.generators import Request, Synthesis
 from gscompleter.geometry import same_camera
-from gscompleter.types import Camera, SceneContext, View
+from gscompleter.types import Camera, View
 
 
 @dataclass(frozen=True)
@@ -20,13 +21,23 @@ class Oracle:
     photographs: Sequence[View]
     """True images; the one whose camera is the target's is returned."""
 
-    def __call__(
-        self, nearest: View, target: Camera, context: SceneContext
-    ) -> Float[Tensor, "h w 3"]:
-        """The photograph of `target`.
+    takes_margin: bool = False
+    """A photograph ends where the image of its camera ends."""
+    at_once: int = 1
+
+    def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
+        """The photographs of the targets.
 
         Raises:
             InputError: where there is none.
+        """
+        return [Synthesis(self.photograph(request.target)) for request in requests]
+
+    def photograph(self, target: Camera) -> Float[Tensor, "h w 3"]:
+        """The image that the camera took.
+
+        Raises:
+            InputError: where it took none.
         """
         for photograph in self.photographs:
             if same_camera(photograph.camera, target):

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.generators.harmonize import HarmonizeConfig, gains
+from gscompleter.generators.smooth import continued
 from gscompleter.geometry import baseline_between, inside, project, sample, unproject
 from gscompleter.types import Camera, Render, SceneContext, View
 
@@ -112,6 +113,24 @@ def with_unexplained(
         known=warped.known | found,
         depth=torch.where(found, guess, warped.depth),
     )
+
+
+def background_first(
+    warped: Warped,
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+    """The image and its log-depth, continued smoothly beyond what is known.
+
+    A hole beside an object is where the object hid what stands behind it, so the farther side of
+    its border counts more: with the square of its depth.
+    """
+    warped = warped.to("cpu")
+    known = warped.known
+    middle = warped.depth[known].median()
+    relative = (warped.depth / middle).clamp(0.1, 10.0)
+    weight = relative**2 * known
+    log_depth = relative.log()[..., None]
+    layers = continued(torch.cat([warped.image, log_depth], dim=-1), weight)
+    return layers[..., :3], layers[..., 3] + middle.log()
 
 
 def _visibility(

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from gscompleter.config import AnchorConfig
-from gscompleter.generators import BatchGenerator, Generator, NotingGenerator
+from gscompleter.generators import Generator, Request, Synthesis
 from gscompleter.geometry import baseline_between, inside, project, rotation_between
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.types import Camera, Lift, SceneContext, View
@@ -69,39 +68,30 @@ class Synthesized(View):
 
 def synthesize(generator: Generator, target: Camera, context: SceneContext) -> Synthesized:
     """`Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 5)."""
-    nearest = context.views[nearest_view(target, context.views)]
-    notes: tuple[str, ...] = ()
-    if isinstance(generator, NotingGenerator):
-        image, notes = generator.with_notes(nearest, target, context)
-    else:
-        image = generator(nearest, target, context)
-    return as_view(image, target, notes)
+    return synthesize_all(generator, [(target, context)])[0]
 
 
 def synthesize_all(
-    generator: BatchGenerator, asked: Sequence[tuple[Camera, SceneContext]]
+    generator: Generator, asked: Sequence[tuple[Camera, SceneContext]]
 ) -> list[Synthesized]:
     """The same for several targets at once, each with what is known of the scene for it."""
-    calls = [
-        (context.views[nearest_view(target, context.views)], target, context)
+    requests = [
+        Request(context.views[nearest_view(target, context.views)], target, context)
         for target, context in asked
     ]
-    answers = generator.batch(calls)
-    return [
-        as_view(image, target, notes)
-        for (image, notes), (target, _) in zip(answers, asked, strict=True)
-    ]
+    answers = generator.synthesize(requests)
+    return [as_view(answer, r.target) for answer, r in zip(answers, requests, strict=True)]
 
 
-def as_view(image: Tensor, target: Camera, notes: tuple[str, ...]) -> Synthesized:
-    """What a generator returned, once it is seen to be an image of the target's size."""
+def as_view(answer: Synthesis, target: Camera) -> Synthesized:
+    """What a generator answered, once it is seen to be an image of the target's size."""
     expected = (target.height, target.width, 3)
-    if tuple(image.shape) != expected or not torch.isfinite(image).all():
+    if tuple(answer.image.shape) != expected or not torch.isfinite(answer.image).all():
         raise ValueError(
             f"the generator must return a finite image of shape {expected}, "
-            f"got {tuple(image.shape)}"
+            f"got {tuple(answer.image.shape)}"
         )
-    return Synthesized(image, target, notes=notes)
+    return Synthesized(answer.image, target, notes=answer.notes)
 
 
 def lift(reconstructor: Reconstructor, reference: View, anchor: View) -> Lift:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.generators import DiffusionSettings
+from gscompleter.generators import DiffusionSettings, Synthesis
 from gscompleter.generators.agreement import AgreementConfig, checked
 from gscompleter.generators.diffusion.complete import check_parts, language_models
 from gscompleter.generators.diffusion.kontext import resized
@@ -28,8 +28,12 @@ from gscompleter.generators.diffusion.published import (
     reading,
     source_of,
 )
-from gscompleter.generators.warp import Warped, warp_photographs, with_unexplained
-from gscompleter.generators.warp_inpaint import background_first
+from gscompleter.generators.warp import (
+    Warped,
+    background_first,
+    warp_photographs,
+    with_unexplained,
+)
 from gscompleter.masks import dilate
 from gscompleter.types import Camera, SceneContext, View
 
@@ -102,16 +106,8 @@ class DiffusersInpaint:
     agreement: AgreementConfig = AgreementConfig()
     """How the painted image is compared with what was warped, before that is put back."""
 
-    def __call__(
-        self, nearest: View, target: Camera, context: SceneContext
-    ) -> Float[Tensor, "h w 3"]:
-        """The image `target` would take, in [0, 1]; outside the hole it is the warped one."""
-        return self.with_notes(nearest, target, context)[0]
-
-    def with_notes(
-        self, nearest: View, target: Camera, context: SceneContext
-    ) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]:
-        """The image, and what to know of it."""
+    def __call__(self, nearest: View, target: Camera, context: SceneContext) -> Synthesis:
+        """The image `target` would take; outside of the hole it is the warped one."""
         observed = completed_warp(nearest, target, context)
         hole = dilate(~observed.known, self.margin)
 
@@ -119,8 +115,9 @@ class DiffusersInpaint:
             return self.painter.paint(observed.image, hole, self.prompt, seed, self.steps)
 
         compared = replace(observed, known=~hole)
-        painted, notes = checked(paint, self.seed, compared, self.agreement)
-        return torch.where(observed.known[..., None], observed.image, painted), notes
+        painted = checked(paint, self.seed, compared, self.agreement)
+        known = observed.known[..., None]
+        return replace(painted, image=torch.where(known, observed.image, painted.image))
 
 
 def completed_warp(nearest: View, target: Camera, context: SceneContext) -> Warped:

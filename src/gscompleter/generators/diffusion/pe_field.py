@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.generators import DiffusionSettings
+from gscompleter.generators import DiffusionSettings, Request, Synthesis
 from gscompleter.generators.agreement import AgreementConfig, checked
 from gscompleter.generators.diffusion.kontext import Kontext, resized
 from gscompleter.generators.diffusion.loading import load_kontext
@@ -69,44 +69,34 @@ class PEField:
     at_once: int = AT_ONCE
     """Most images that are denoised together."""
 
-    def __call__(
-        self, nearest: View, target: Camera, context: SceneContext
-    ) -> Float[Tensor, "h w 3"]:
-        """The image `target` would take, in [0, 1].
+    takes_margin: bool = True
+
+    def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
+        """The images of `requests`, their colours brought to those of the photographs.
+
+        Images of one size are denoised together.
 
         Raises:
             InputError: where the scene has no depth at the nearest photograph.
         """
-        return self.with_notes(nearest, target, context)[0]
-
-    def with_notes(
-        self, nearest: View, target: Camera, context: SceneContext
-    ) -> tuple[Float[Tensor, "h w 3"], tuple[str, ...]]:
-        """The image, its colours brought to those of the photographs, and what to know of it."""
-        return self.batch([(nearest, target, context)])[0]
-
-    def batch(
-        self, calls: Sequence[tuple[View, Camera, SceneContext]]
-    ) -> list[tuple[Tensor, tuple[str, ...]]]:
-        """What `with_notes` gives for each of `calls`; images of one size are denoised together."""
-        conditions = [self.condition(*call) for call in calls]
+        conditions = [self.condition(r.nearest, r.target, r.context) for r in requests]
         first: dict[int, Tensor] = {}
         for group in grouped(conditions, self.at_once):
             images = self.painted([conditions[i] for i in group], self.seed)
             first.update(zip(group, images, strict=True))
 
-        def answer(i: int) -> tuple[Tensor, tuple[str, ...]]:
-            nearest, target, context = calls[i]
+        def answer(i: int) -> Synthesis:
+            nearest, target = requests[i].nearest, requests[i].target
 
             def paint(seed: int) -> Float[Tensor, "h w 3"]:
                 image = first[i] if seed == self.seed else self.painted([conditions[i]], seed)[0]
                 back = resized(image, (target.height, target.width)).clamp(0, 1)
                 return back.to(nearest.image.device)
 
-            observed = warp_photographs(nearest, target, context)
+            observed = warp_photographs(nearest, target, requests[i].context)
             return checked(paint, self.seed, observed, self.agreement)
 
-        return [answer(i) for i in range(len(calls))]
+        return [answer(i) for i in range(len(requests))]
 
     def condition(self, nearest: View, target: Camera, context: SceneContext) -> Condition:
         """What the model is told of a target.

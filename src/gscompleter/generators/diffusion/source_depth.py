@@ -19,7 +19,7 @@ from gscompleter.generators.diffusion.published import (
     source_of,
 )
 from gscompleter.generators.robust import robust_affine
-from gscompleter.generators.warp_inpaint.smooth import continued
+from gscompleter.generators.smooth import continued
 from gscompleter.types import Render, View
 
 MONOCULAR = "depth-anything/Depth-Anything-V2-Small-hf"

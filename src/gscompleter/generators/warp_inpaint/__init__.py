@@ -16,14 +16,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.generators.smooth import distance_to_known
 from gscompleter.generators.warp import (
     WarpConfig,
     Warped,
+    background_first,
     warp_photographs,
     with_unexplained,
 )
 from gscompleter.generators.warp_inpaint.exemplar import ExemplarConfig, Sources, fill_by_patches
-from gscompleter.generators.warp_inpaint.smooth import continued, distance_to_known
 from gscompleter.interpolation import smoothed
 from gscompleter.types import Camera, SceneContext, View
 
@@ -82,24 +83,6 @@ class WarpInpaint:
         detail = detail - smoothed(detail, undecided, self.tone_radius)
         fading = (1 - away / reach).clamp_min(0)
         return torch.where(undecided[..., None], tone + fading[..., None] * detail, tone)
-
-
-def background_first(
-    warped: Warped,
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """The image and its log-depth, continued smoothly beyond what is known.
-
-    A hole beside an object is where the object hid what stands behind it, so the farther side of
-    its border counts more: with the square of its depth.
-    """
-    warped = warped.to("cpu")
-    known = warped.known
-    middle = warped.depth[known].median()
-    relative = (warped.depth / middle).clamp(0.1, 10.0)
-    weight = relative**2 * known
-    log_depth = relative.log()[..., None]
-    layers = continued(torch.cat([warped.image, log_depth], dim=-1), weight)
-    return layers[..., :3], layers[..., 3] + middle.log()
 
 
 def without_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]:
