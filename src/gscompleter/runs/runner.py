@@ -203,7 +203,8 @@ def context_at(path: Path, views: Sequence[View], models: Models) -> SavedContex
         return saved
     begun = models.completer().begin(views)
     camera = begun.views[0].camera
-    assert camera.near is not None and camera.far is not None
+    assert camera.near is not None
+    assert camera.far is not None
     made = SavedContext(begun.scene, camera.near, camera.far, begun.seconds["total"])
     save_context(path, made)
     return read_back(load_context(path, device), path)
@@ -216,6 +217,7 @@ def row_of(task: Task, method: str, prepared: Prepared | str, folder: Path) -> d
         OutputError: where a result cannot be written.
     """
     steps: tuple[Step, ...] = ()
+    error: str | None
     if isinstance(prepared, str):
         error, seconds = prepared, None
     else:

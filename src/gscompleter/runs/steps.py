@@ -31,6 +31,7 @@ from gscompleter.runs.store import (
     save_image,
     save_prediction,
     step_path,
+    truth_path,
 )
 from gscompleter.stages.anchor import lift
 from gscompleter.types import Camera, Completion, DepthMap, Gaussians, View
@@ -134,7 +135,7 @@ def advanced(
     step, seen = step_of(prediction, state, target, task)
     save_image(path.with_suffix(".png"), seen.after.image)
     save_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
-    save_image(folder / f"truth-{number:03d}.png", target.image)
+    save_image(truth_path(folder, number), target.image)
     return replace(
         progress,
         scene=prediction.scene,

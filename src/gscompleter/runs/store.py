@@ -79,6 +79,11 @@ def step_path(folder: Path, method: str, number: int) -> Path:
     return folder / slug(method) / f"step-{number:03d}.npz"
 
 
+def truth_path(folder: Path, number: int) -> Path:
+    """The photograph of the target of the step `number` of the task in `folder`."""
+    return folder / f"truth-{number:03d}.png"
+
+
 def row_paths(out: Path) -> list[Path]:
     """All rows of a run."""
     return sorted((out / TASKS).glob("*/*.json"))
