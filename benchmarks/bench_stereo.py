@@ -26,7 +26,7 @@ from gscompleter.commands.demo import (
     motorcycle_cameras,
 )
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.surfaces import SurfaceConfig, fit_surfaces
+from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, fit_surfaces
 
 
 def report(name: str, depth: np.ndarray, truth: np.ndarray, seconds: float) -> None:
@@ -77,12 +77,11 @@ def main() -> None:
     start = time.perf_counter()
     fit_surfaces(heights, np.ones_like(heights), halves[0].astype(np.float32) / 255)
     surfaces = time.perf_counter() - start
-    iterations = SurfaceConfig().iterations
     start = time.perf_counter()
-    denoise_tv_chambolle(heights, weight=0.1, eps=0.0, max_num_iter=iterations)
+    denoise_tv_chambolle(heights, weight=0.1, eps=0.0, max_num_iter=ITERATIONS)
     first_order = time.perf_counter() - start
     print(
-        f"{iterations} iterations: surfaces (second order, all levels) {surfaces:.2f} s, "
+        f"{ITERATIONS} iterations: surfaces (second order, all levels) {surfaces:.2f} s, "
         f"{surfaces / first_order:.2f} x scikit-image's total variation (one level)"
     )
 

@@ -2,7 +2,7 @@
 
     python examples/02_bring_your_own_models.py SCENE 0 4 8
 
-Here Ψ is the embedded stereo with another setting, and Φ fills the hole with the mean colour of
+Here Ψ is the embedded stereo with larger Gaussians, and Φ fills the hole with the mean colour of
 the nearest photograph, which is the least a generator can do.
 """
 
@@ -11,6 +11,7 @@ import sys
 import torch
 
 import gscompleter as gsc
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.types import SceneContext
 
 
@@ -27,7 +28,7 @@ def main() -> None:
     camera = gsc.load_camera(scene, frame=target, resolution=(256, 256))
 
     completer = gsc.GSCompleter(
-        reconstructor=gsc.load_reconstructor("plane-sweep"),
+        reconstructor=PlaneSweep(disc_sigma=0.7),
         generator=mean_colour,
         config=gsc.CompleterConfig.paper(),
     )

@@ -197,7 +197,7 @@ def test_a_point_that_is_not_in_front_of_the_source_is_projected_from_a_thousand
 def test_a_point_is_compared_with_the_pixel_where_the_source_sees_it():
     """At depth 3.6 a baseline of 0.4 moves the pixels of an 8 pixel wide map by 0.8."""
     K = camera_pair().intrinsics(8, 8)[0, 0]
-    transform = camera_pair().transforms_to(torch.tensor([[[1], [0]]]))[0, 0, 0]
+    transform = camera_pair().sources_from_views(torch.tensor([[[1], [0]]]))[0, 0, 0]
     grid = sampling_grid(K, transform, torch.full((1, 8, 8), 3.6))
     columns = (grid[0, 2, :, 0] + 1) / 2 * 7
     assert torch.allclose(columns, torch.arange(8) - 0.8, atol=1e-5)

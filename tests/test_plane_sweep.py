@@ -15,8 +15,9 @@ from gscompleter.commands.demo import (
     motorcycle_cameras,
 )
 from gscompleter.geometry import project
-from gscompleter.matching.depth_range import estimate_depth_range
+from gscompleter.matching.depth_range import depth_range_of, estimate_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.types import DepthMap
 from scenes import Room, camera_at, view_of
 
 SIZE = 96
@@ -54,6 +55,15 @@ def test_every_pixel_has_one_gaussian_that_projects_to_its_centre():
         expected_y = found.pixel_index[own] // SIZE + 0.5
         assert (pixels[:, 0] - expected_x).abs().max() < 0.01
         assert (pixels[:, 1] - expected_y).abs().max() < 0.01
+
+
+def test_gaussians_are_as_large_as_asked_for_in_pixels():
+    view = side_by_side()[0]
+    depth = DepthMap(view.depth, torch.ones_like(view.depth, dtype=torch.bool))
+    small, large = (PlaneSweep(disc_sigma=s).splat(view, depth) for s in (0.5, 1.0))
+    assert torch.allclose(large.scales, 2 * small.scales)
+    pixel = view.depth.flatten() / view.camera.K[0, 0]
+    assert torch.allclose(large.scales[:, 0], pixel)
 
 
 def test_moving_forward_gives_depth_too():
@@ -118,6 +128,20 @@ def test_without_texture_the_baseline_sets_the_range():
     flat = [replace(v, image=torch.full_like(v.image, 0.5)) for v in side_by_side()]
     near, far = estimate_depth_range(flat)
     assert 0 < near < far
+
+
+def test_what_the_camera_knows_of_the_range_is_taken_and_the_rest_estimated():
+    views = side_by_side()
+
+    def known(near: float | None, far: float | None) -> list[View]:
+        return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
+
+    low, high = estimate_depth_range(views)
+    assert depth_range_of(known(0.25, None)) == (0.25, high)
+    assert depth_range_of(known(None, 90.0)) == (low, 90.0)
+    assert depth_range_of(known(None, 90.0), lambda _: (0.125, 3.0)) == (0.125, 90.0)
+    with pytest.raises(InputError, match="near must be positive and less than far"):
+        depth_range_of(known(None, 90.0), lambda _: (99.0, 100.0))
 
 
 def test_too_few_views_no_baseline_and_an_empty_range_are_refused():

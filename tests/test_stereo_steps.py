@@ -10,16 +10,16 @@ import torch
 
 from gscompleter.kernels import stereo
 from gscompleter.matching.features import features_of, matches
-from gscompleter.matching.frames import Frame, frames_of, transform_between
+from gscompleter.matching.stereo_image import (
+    StereoImage,
+    source_from_reference,
+    stereo_images,
+)
 from gscompleter.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.appearance import AppearanceConfig, fit_appearance
-from gscompleter.reconstructors.plane_sweep.confidence import (
-    ConfidenceConfig,
-    confidence_of,
-    without_specks,
-)
-from gscompleter.reconstructors.plane_sweep.epipolar import distances, turned_to_matches
+from gscompleter.reconstructors.plane_sweep.appearance import fit_colours, fit_opacities
+from gscompleter.reconstructors.plane_sweep.confidence import confidence_of, without_speckles
+from gscompleter.reconstructors.plane_sweep.epipolar import distances, rotated_to_matches
 from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.render import load_renderer
@@ -50,17 +50,16 @@ def median_error(views: list[View]) -> float:
 # Poses
 
 
-def frames_and_matches(views: list[View]) -> tuple[Frame, Frame, np.ndarray, np.ndarray]:
-    (left, right), _ = frames_of(views)
+def matched_pair(views: list[View]) -> tuple[StereoImage, StereoImage, np.ndarray, np.ndarray]:
+    (left, right), _ = stereo_images(views)
     return left, right, *matches(features_of(left), features_of(right))
 
 
 def test_a_pose_that_misses_its_epipolar_lines_is_turned_back():
     left, right = pair()
-    frames = frames_and_matches([left, pitched(right, 0.6)])
-    reference, source, pixels, matched = frames
-    before, _ = distances(*frames)
-    turned = turned_to_matches(*frames)
+    reference, source, pixels, matched = matched_pair([left, pitched(right, 0.6)])
+    before, _ = distances(reference, source, pixels, matched)
+    turned = rotated_to_matches(reference, source, pixels, matched)
     after, _ = distances(reference, turned, pixels, matched)
     assert np.median(np.abs(before)) > 1
     assert np.median(np.abs(after)) < 0.15
@@ -69,35 +68,35 @@ def test_a_pose_that_misses_its_epipolar_lines_is_turned_back():
 
 
 def test_a_right_pose_stays():
-    reference, source, pixels, matched = frames_and_matches(pair())
-    turned = turned_to_matches(reference, source, pixels, matched)
+    reference, source, pixels, matched = matched_pair(pair())
+    turned = rotated_to_matches(reference, source, pixels, matched)
     assert np.abs(turned.rotation - source.rotation).max() < 1e-3
 
 
 def test_false_matches_do_not_turn_the_camera():
-    reference, source, pixels, matched = frames_and_matches(pair())
+    reference, source, pixels, matched = matched_pair(pair())
     false = matched.copy()
     false[::3] += [3.0, 5.0]
-    turned = turned_to_matches(reference, source, pixels, false)
+    turned = rotated_to_matches(reference, source, pixels, false)
     assert np.abs(turned.rotation - source.rotation).max() < 2e-3
 
 
 def test_few_matches_leave_the_pose():
-    reference, source, pixels, matched = frames_and_matches(pair())
+    reference, source, pixels, matched = matched_pair(pair())
     for few in (0, 5):
-        assert turned_to_matches(reference, source, pixels[:few], matched[:few]) is source
+        assert rotated_to_matches(reference, source, pixels[:few], matched[:few]) is source
 
 
 # Confidence and occlusion
 
 
-def test_specks_are_not_trusted_and_surfaces_are():
+def test_speckles_are_not_trusted_and_surfaces_are():
     index = np.full((40, 40), 20.0, np.float32)
     index[5:8, 5:8] = 60
     agrees = np.ones((40, 40), bool)
     agrees[:, 30:] = False
     agrees[20, 35] = True
-    solid = without_specks(index, agrees, 60, 2.0)
+    solid = without_speckles(index, agrees)
     assert not solid[5:8, 5:8].any()
     assert not solid[:, 31:].any()
     assert solid[:, :29].sum() == 40 * 29 - 9
@@ -106,7 +105,7 @@ def test_specks_are_not_trusted_and_surfaces_are():
 def test_confidence_grows_with_the_margin():
     index, agrees = np.full((10, 10), 3.0, np.float32), np.ones((10, 10), bool)
     margin = np.linspace(0, 80, 100, dtype=np.float32).reshape(10, 10)
-    confidence = confidence_of(index, margin, agrees, ConfidenceConfig())
+    confidence = confidence_of(index, margin, agrees)
     assert (np.diff(confidence.ravel()) >= 0).all()
     assert confidence.min() == 0
     assert confidence.max() == 1
@@ -126,11 +125,13 @@ def test_an_unknown_gap_takes_the_farther_side():
 def test_what_only_one_view_sees_past_an_object_is_found_occluded():
     """The pillar in the room hides a strip of the back wall from the right camera."""
     views = pair()
-    (left, right), unit = frames_of(views)
+    (left, right), unit = stereo_images(views)
     inverse = [(unit / view.depth).float().numpy() for view in views]
-    there, back = transform_between(left, right), transform_between(right, left)
-    visible, _ = stereo.reproject(inverse[0], inverse[1], there, back)
-    hidden = hidden_from_others(inverse[0], [Neighbour(inverse[1], there, back)], 1.5)
+    right_from_left = source_from_reference(left, right)
+    left_from_right = source_from_reference(right, left)
+    visible, _ = stereo.reproject(*inverse, right_from_left, left_from_right)
+    neighbour = Neighbour(inverse[1], right_from_left, left_from_right)
+    hidden = hidden_from_others(inverse[0], [neighbour])
     assert hidden.sum() > 50
     assert not hidden[(visible >= 0) & (visible < 1.5)].any()
     assert not hidden[visible < 0].any()
@@ -226,7 +227,7 @@ def with_floater(views: list[View]) -> torch.Tensor:
 def test_what_photographs_object_to_fades_and_the_rest_stays():
     views, renderer = pair(), load_renderer("cpu")
     scene = with_floater(views)
-    fitted = fit_appearance(scene, views, renderer, AppearanceConfig(colour_steps=0))
+    fitted = fit_opacities(scene, views, renderer)
     assert fitted.opacities[-400:].mean() < 0.4
     for view in views:
         assert renderer.render(fitted, view.camera).alpha.mean() > 0.97
@@ -238,8 +239,7 @@ def test_what_photographs_object_to_fades_and_the_rest_stays():
 def test_colours_get_back_what_drawing_blurs():
     views, renderer = pair(), load_renderer("cpu")
     scene = merge([gaussians_of(view) for view in views])
-    config = AppearanceConfig(opacity_steps=0)
-    fitted = fit_appearance(scene, views, renderer, config)
+    fitted = fit_colours(scene, views, renderer)
     assert torch.equal(fitted.opacities, scene.opacities)
     for view in views:
         before = psnr(renderer.render(scene, view.camera).image, view.image)
@@ -247,27 +247,20 @@ def test_colours_get_back_what_drawing_blurs():
         assert after > before + 2
 
 
-def test_no_step_changes_nothing():
-    views = pair()
-    scene = gaussians_of(views[0])
-    fitted = fit_appearance(scene, views, load_renderer("cpu"), AppearanceConfig(0, 0.3, 0.0, 0))
-    assert torch.equal(fitted.sh, scene.sh)
-    assert torch.allclose(fitted.opacities, scene.opacities, atol=1e-6)
-
-
 @pytest.mark.parametrize("x", [0.35, -0.35])
 def test_an_unseen_view_profits_too(x):
     views, renderer = pair(), load_renderer("cpu")
     unseen = view_of(Room(), camera_at(x, size=SIZE))
-    plain = PlaneSweep(appearance=AppearanceConfig(opacity_steps=0, colour_steps=0))(views)
-    fitted = PlaneSweep()(views)
-    covered = renderer.render(plain.gaussians, unseen.camera).alpha > 0.9
+    sweep = PlaneSweep()
+    plain = merge([sweep.splat(v, d) for v, d in zip(views, sweep.depths(views), strict=True)])
+    fitted = sweep(views).gaussians
+    covered = renderer.render(plain, unseen.camera).alpha > 0.9
     scores = [
         psnr(
-            renderer.render(r.gaussians, unseen.camera).image[covered][None],
+            renderer.render(gaussians, unseen.camera).image[covered][None],
             unseen.image[covered][None],
         )
-        for r in (plain, fitted)
+        for gaussians in (plain, fitted)
     ]
     assert scores[1] > scores[0] + 0.3
 

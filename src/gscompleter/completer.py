@@ -17,7 +17,7 @@ from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import same_camera, widened
 from gscompleter.masks import dilate
-from gscompleter.matching.depth_range import estimate_depth_range
+from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, load_renderer
 from gscompleter.stages.anchor import (
@@ -240,14 +240,17 @@ class GSCompleter:
 
     def synthesize(self, sights: Sequence[Sight], at_views: Sequence[Render]) -> list[Synthesized]:
         """Stage 2: Φ's image at each of the wider cameras."""
+        max_alpha = self.config.holes.max_alpha
         asked = [
             (
                 sight.window.wide,
-                SceneContext(sight.completion.views, tuple(at_views), sight.frozen.context),
+                SceneContext(
+                    sight.completion.views, tuple(at_views), sight.frozen.context, max_alpha
+                ),
             )
             for sight in sights
         ]
-        return synthesize_all(as_generator(self.generator), asked) if asked else []
+        return synthesize_all(self.generator, asked) if asked else []
 
     def lift(self, sight: Sight, reference: Synthesized) -> Lift:
         """Stage 2: the image as Gaussians, those that lie near a hole."""
@@ -274,6 +277,7 @@ class GSCompleter:
             self.renderer,
             torch.Generator().manual_seed(self.seed),
             self.config.registration,
+            self.config.holes.max_alpha,
         )
 
     def keep(
@@ -340,14 +344,10 @@ class GSCompleter:
 
     def depth_range(self, views: Sequence[View], scene: Gaussians | None) -> tuple[float, float]:
         """Near and far plane in scene units: as given, else estimated from what there is."""
-        near, far = views[0].camera.near, views[0].camera.far
-        if near is not None and far is not None:
-            return near, far
         if scene is None:
-            low, high = estimate_depth_range(views)
-        else:
-            low, high = depth_range_of_scene(scene, [v.camera for v in views], self.renderer)
-        return near if near is not None else low, far if far is not None else high
+            return depth_range_of(views)
+        cameras = [view.camera for view in views]
+        return depth_range_of(views, lambda _: depth_range_of_scene(scene, cameras, self.renderer))
 
     def allowed_errors(self, context: Gaussians, views: Sequence[View]) -> tuple[float, ...]:
         """Largest mean squared error that each photograph may have once all is done."""

@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
+from gscompleter.coverage import COVERED
 from gscompleter.errors import InputError
 
 C = TypeVar("C")
@@ -69,11 +70,11 @@ class RegistrationConfig:
     degrees_of_freedom: Literal[1, 3] = 1
     """1 slides along the camera ray; 3 moves freely (ablation of the paper)."""
     depth_weight: float = 1.0
-    """λ_d of Eq. 9."""
+    """λ_d of Eq. 11."""
     stereo_weight: float = 1.0
-    """λ_s of Eq. 9."""
+    """λ_s of Eq. 11."""
     rgb_weight: float = 0.0
-    """λ_c of Eq. 9; 0.1 in the paper. With a constant footprint a primitive looks the same at the
+    """λ_c of Eq. 11; 0.1 in the paper. With a constant footprint a primitive looks the same at the
     target wherever it stands on its ray, and the term tells it nothing."""
     depth_of: Literal["candidates", "composite"] = "candidates"
     """What L_depth renders: the candidates alone, each of which then feels its own error; or, as
@@ -110,8 +111,10 @@ class FreeSpaceConfig:
 
 @dataclass(frozen=True)
 class HoleConfig:
-    max_alpha: float = 0.5
-    """τ of Eq. 10: a pixel that the scene covers by less is a hole."""
+    max_alpha: float = COVERED
+    """τ of Eq. 12: a pixel of the target that the scene covers by less is a hole. It is painted by
+    Φ, what is lifted there joins the scene, and its depth continues that of its surroundings. Where
+    the scene's depth is compared, a pixel stays covered from one half on."""
     dilation: int = 3
     """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
     neighbourhood: int | None = 16
@@ -128,7 +131,7 @@ class RefineConfig:
     parametrization: Literal["logit", "linear"] = "logit"
     """What Adam moves: the logit, as 3DGS stores it, or the opacity itself, clamped to [0, 1]."""
     target_weight: float = 0.1
-    """λ of Eq. 11, on the synthesized image."""
+    """λ of Eq. 13, on the synthesized image."""
     num_views: int = 2
     """How many of the nearest context views take part."""
 

@@ -51,7 +51,7 @@ def sample(
 
 
 def distance_from_depth(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w"]:
-    """Euclidean distance along each pixel's ray, from z-depth (paper, Eq. 7)."""
+    """Euclidean distance along each pixel's ray, from z-depth (paper, Eq. 9)."""
     return depth * camera.z_rays().norm(dim=-1)
 
 

@@ -19,6 +19,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
+from gscompleter.coverage import COVERED
+
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
 
@@ -231,7 +233,7 @@ class Render:
         """What the target of `window` sees of a render of its wide camera."""
         return Render(window.crop(self.image), window.crop(self.depth), window.crop(self.alpha))
 
-    def depth_map(self, min_alpha: float = 0.5) -> DepthMap:
+    def depth_map(self, min_alpha: float = COVERED) -> DepthMap:
         """The depth, valid where the Gaussians cover at least `min_alpha` of the pixel."""
         return DepthMap(self.depth, self.alpha >= min_alpha)
 
@@ -268,7 +270,14 @@ class SceneContext:
     at_views: tuple[Render, ...]
     """The context scene rendered at the cameras of `views`, in their order."""
     at_target: Render
-    """The context scene rendered at the target camera: alpha tells where its holes are."""
+    """The context scene rendered at the target camera."""
+    max_alpha: float = COVERED
+    """A pixel of the target that the scene covers by less is a hole."""
+
+    @property
+    def holes(self) -> Bool[Tensor, "h w"]:
+        """Where the scene has a hole at the target, which is for Φ to fill."""
+        return self.at_target.alpha < self.max_alpha
 
 
 @dataclass(frozen=True)
@@ -285,7 +294,7 @@ class Lift:
 
 @dataclass(frozen=True)
 class DepthAffine:
-    """`context depth = scale * predicted depth + shift`, on z-depth (paper, Eq. 6)."""
+    """`context depth = scale * predicted depth + shift`, on z-depth (paper, Eq. 8)."""
 
     scale: float = 1.0
     shift: float = 0.0

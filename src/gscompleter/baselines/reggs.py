@@ -95,7 +95,7 @@ def register_by_similarity(
     camera = reference.camera
     own = renderer.render(lifted, camera)
     theirs = renderer.render(scene, camera)
-    both = (own.alpha > 0.5) & (theirs.alpha > 0.5)
+    both = own.depth_map().valid & theirs.depth_map().valid
     ratio = (
         (theirs.depth[both].median() / own.depth[both].median())
         if both.any()
@@ -123,7 +123,7 @@ def register_by_similarity(
         moved = renderer.render(carried(scene, fit), camera)
         alpha = own.alpha.detach()
         colour = ((moved.image - reference.image).abs() * alpha[..., None] ** 3).sum()
-        overlap = (alpha > 0.5) & (moved.alpha.detach() > 0.5)
+        overlap = own.depth_map().valid & moved.depth_map().valid
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
         loss = config.colour_weight * colour + config.depth_weight * depth
         if compare_mixtures:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.coverage import COVERED
 from gscompleter.generators.harmonize import HarmonizeConfig, gains
 from gscompleter.generators.smooth import continued
 from gscompleter.geometry import baseline_between, inside, project, sample, unproject
@@ -16,8 +17,6 @@ from gscompleter.types import Camera, Render, SceneContext, View
 
 @dataclass(frozen=True)
 class WarpConfig:
-    min_alpha: float = 0.5
-    """Opacity of the scene from which a pixel of the target counts as observed."""
     depth_tolerance: float = 0.03
     """Difference between the depth of a point and the depth that a photograph sees in its
     direction, relative to the depth, at which the weight of the photograph has fallen to 1/e."""
@@ -58,7 +57,7 @@ def warp_photographs(
     All are brought to the exposure of `nearest`.
     """
     scene = context.at_target
-    known = scene.alpha >= config.min_alpha
+    known = ~context.holes
     points = unproject(scene.depth, target)
     colours, weights = [], []
     for view, render in zip(context.views, context.at_views, strict=True):
@@ -75,7 +74,7 @@ def warp_photographs(
         [w[..., None] * c * g for w, c, g in zip(weights, colours, factors, strict=True)]
     ).sum(dim=0)
 
-    rendered = scene.image / scene.alpha.clamp_min(config.min_alpha)[..., None]
+    rendered = scene.image / scene.alpha.clamp_min(context.max_alpha)[..., None]
     trust = (total / (total + 1e-4))[..., None]
     image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
     return Warped(image.clamp(0, 1), known, scene.depth, tuple(factors))
@@ -100,7 +99,7 @@ def with_unexplained(
     total = torch.zeros_like(guess)
     for view, render, gain in zip(context.views, context.at_views, warped.gains, strict=True):
         pixels, z = project(points, view.camera)
-        empty = sample(render.alpha[..., None], pixels)[..., 0] < config.min_alpha
+        empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
         unexplained = empty & inside(pixels, z, view.camera) & ~warped.known
         weight = unexplained * _closeness(points, target, view) ** config.sharpness
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
@@ -144,7 +143,7 @@ def _visibility(
     layers = torch.stack([render.depth, render.alpha], dim=-1)
     depth, alpha = sample(layers, pixels).unbind(-1)
     error = (z - depth).abs() / (config.depth_tolerance * z.abs().clamp_min(1e-12))
-    visible = inside(pixels, z, view.camera) & (alpha >= config.min_alpha)
+    visible = inside(pixels, z, view.camera) & (alpha >= COVERED)
     return torch.exp(-(error**2)) * visible
 
 

@@ -338,12 +338,12 @@ def winners(total):
 
 
 @njit(cache=True, parallel=True, fastmath={"contract"})
-def reproject(depth, other, there, back):
+def reproject(depth, other, b_from_a, a_from_b):
     """Carry every pixel to another view and back by the two views' inverse depths.
 
     Args:
-        depth, other: Inverse depths [h, w] and [H, W].
-        there, back: Transforms from this view to the other and from the other to this [3, 4].
+        depth, other: Inverse depths of view a [h, w] and of view b [H, W].
+        b_from_a, a_from_b: Transforms between the pixels of the two [3, 4].
 
     Returns:
         How far from itself each pixel comes back, in pixels, negative where it falls outside of
@@ -356,11 +356,11 @@ def reproject(depth, other, there, back):
     for y in prange(h):
         for x in range(w):
             px, py, own = np.float32(x + 0.5), np.float32(y + 0.5), depth[y, x]
-            q2 = there[2, 0] * px + there[2, 1] * py + there[2, 2] + there[2, 3] * own
+            q2 = b_from_a[2, 0] * px + b_from_a[2, 1] * py + b_from_a[2, 2] + b_from_a[2, 3] * own
             if q2 <= np.float32(1e-3):
                 continue
-            sx = there[0, 0] * px + there[0, 1] * py + there[0, 2] + there[0, 3] * own
-            sy = there[1, 0] * px + there[1, 1] * py + there[1, 2] + there[1, 3] * own
+            sx = b_from_a[0, 0] * px + b_from_a[0, 1] * py + b_from_a[0, 2] + b_from_a[0, 3] * own
+            sy = b_from_a[1, 0] * px + b_from_a[1, 1] * py + b_from_a[1, 2] + b_from_a[1, 3] * own
             sx /= q2
             sy /= q2
             if not (sx >= 0 and sx < W and sy >= 0 and sy < H):
@@ -376,11 +376,11 @@ def reproject(depth, other, there, back):
                 if abs(other[yy, xx] - expected) < best:
                     best = abs(other[yy, xx] - expected)
                     value = other[yy, xx]
-            r2 = back[2, 0] * sx + back[2, 1] * sy + back[2, 2] + back[2, 3] * value
+            r2 = a_from_b[2, 0] * sx + a_from_b[2, 1] * sy + a_from_b[2, 2] + a_from_b[2, 3] * value
             if r2 <= np.float32(1e-3):
                 continue
-            rx = back[0, 0] * sx + back[0, 1] * sy + back[0, 2] + back[0, 3] * value
-            ry = back[1, 0] * sx + back[1, 1] * sy + back[1, 2] + back[1, 3] * value
+            rx = a_from_b[0, 0] * sx + a_from_b[0, 1] * sy + a_from_b[0, 2] + a_from_b[0, 3] * value
+            ry = a_from_b[1, 0] * sx + a_from_b[1, 1] * sy + a_from_b[1, 2] + a_from_b[1, 3] * value
             rx = rx / r2 - px
             ry = ry / r2 - py
             error[y, x] = np.sqrt(rx * rx + ry * ry)

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.errors import InputError
 from gscompleter.matching.features import features_of, matches
-from gscompleter.matching.frames import Frame, frames_of, transform_between
+from gscompleter.matching.stereo_image import (
+    StereoImage,
+    source_from_reference,
+    stereo_images,
+)
 from gscompleter.types import View
 
 MIN_MATCHES = 12
 """Fewest triangulated features that tell a depth range."""
 MAX_PAIRS = 12
 """Most pairs of views whose features are matched."""
+MAX_ERROR = 3.0
+"""Pixels that a match may lie off its epipolar line: poses are noisy."""
+MIN_PARALLAX = 1.0
+"""Pixels that a match must move to tell a depth."""
 
 
 def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
@@ -29,63 +38,85 @@ def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
     Raises:
         InputError: with fewer than two views, or where all of them stand in one place.
     """
-    frames, unit = frames_of(views)
-    inverse = triangulated(frames)
+    images, unit = stereo_images(views)
+    inverse = triangulated(images)
     if len(inverse) < MIN_MATCHES:
-        near, far = range_from_baseline(frames)
+        near, far = range_from_baseline(images)
     else:
         low, high = np.quantile(inverse, [0.02, 0.98])
         near, far = 0.5 / high, 4.0 / low
     return near * unit, far * unit
 
 
-def range_from_baseline(frames: Sequence[Frame]) -> tuple[float, float]:
+def depth_range_of(
+    views: Sequence[View],
+    estimate: Callable[[Sequence[View]], tuple[float, float]] = estimate_depth_range,
+) -> tuple[float, float]:
+    """Near and far z-depth, in scene units: as the first camera knows them, else estimated.
+
+    Args:
+        views: Photographs of one scene.
+        estimate: Finds what the camera does not know; as it stands, from matched features.
+
+    Raises:
+        InputError: where the range is empty.
+    """
+    near, far = views[0].camera.near, views[0].camera.far
+    if near is None or far is None:
+        low, high = estimate(views)
+        near, far = near if near is not None else low, far if far is not None else high
+    if not 0 < near < far:
+        raise InputError(
+            f"The depth range {near:g} to {far:g} is empty; near must be positive and less "
+            "than far."
+        )
+    return near, far
+
+
+def range_from_baseline(images: Sequence[StereoImage]) -> tuple[float, float]:
     """Depths (in baselines) at which the widest baseline still, and just no longer, matches."""
-    focal = float(np.median([frame.K[0, 0] for frame in frames]))
-    width = float(np.median([frame.size[1] for frame in frames]))
+    focal = float(np.median([image.K[0, 0] for image in images]))
+    width = float(np.median([image.size[1] for image in images]))
     return focal / (0.4 * width), 3.0 * focal
 
 
-def triangulated(frames: Sequence[Frame]) -> Float[np.ndarray, "n"]:
+def triangulated(images: Sequence[StereoImage]) -> Float[np.ndarray, "n"]:
     """Inverse z-depths (per baseline) of features that agree with the epipolar geometry."""
-    features = [features_of(frame) for frame in frames]
+    features = [features_of(image) for image in images]
     pairs = sorted(
-        combinations(range(len(frames)), 2),
-        key=lambda p: -float(np.linalg.norm(frames[p[0]].center - frames[p[1]].center)),
+        combinations(range(len(images)), 2),
+        key=lambda p: -float(np.linalg.norm(images[p[0]].center - images[p[1]].center)),
     )
     found = [np.zeros(0)]
     for i, j in pairs[:MAX_PAIRS]:
         a, b = matches(features[i], features[j])
         if len(a):
-            found.append(_inverse_depths(frames[i], frames[j], a, b))
-            found.append(_inverse_depths(frames[j], frames[i], b, a))
+            found.append(_inverse_depths(images[i], images[j], a, b))
+            found.append(_inverse_depths(images[j], images[i], b, a))
     return np.concatenate(found)
 
 
 def _inverse_depths(
-    reference: Frame,
-    source: Frame,
+    reference: StereoImage,
+    source: StereoImage,
     pixels: Float[np.ndarray, "n 2"],
     matched: Float[np.ndarray, "n 2"],
-    max_error: float = 3.0,
-    min_parallax: float = 1.0,
 ) -> Float[np.ndarray, "m"]:
     """Inverse z-depths in `reference` of the matches that lie on their epipolar lines.
 
-    A match that hardly moves tells nothing of depth, so that it takes a parallax of
-    `min_parallax` pixels; errors of `max_error` pixels off the line leave room for noisy poses.
+    A match that hardly moves tells nothing of depth.
     """
-    transform = transform_between(reference, source).astype(np.float64)
+    transform = source_from_reference(reference, source).astype(np.float64)
     at_infinity = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ transform[:, :3].T
     b = transform[:, 3]
     # Least squares of matched * (A p + b w)_2 = (A p + b w)_xy in w.
     slope = b[:2] - matched * b[2]
     offset = matched * at_infinity[:, 2:] - at_infinity[:, :2]
     inverse = (slope * offset).sum(1) / np.maximum((slope * slope).sum(1), 1e-12)
-    there = at_infinity + inverse[:, None] * b
-    ahead = (there[:, 2] > 1e-6) & (at_infinity[:, 2] > 1e-6)
-    scale = np.where(ahead, there[:, 2], 1.0)[:, None]
-    error = np.linalg.norm(there[:, :2] / scale - matched, axis=1)
+    at_depth = at_infinity + inverse[:, None] * b
+    ahead = (at_depth[:, 2] > 1e-6) & (at_infinity[:, 2] > 1e-6)
+    scale = np.where(ahead, at_depth[:, 2], 1.0)[:, None]
+    error = np.linalg.norm(at_depth[:, :2] / scale - matched, axis=1)
     start = at_infinity[:, :2] / np.where(ahead, at_infinity[:, 2], 1.0)[:, None]
     parallax = np.linalg.norm(start - matched, axis=1)
-    return inverse[ahead & (inverse > 0) & (error < max_error) & (parallax > min_parallax)]
+    return inverse[ahead & (inverse > 0) & (error < MAX_ERROR) & (parallax > MIN_PARALLAX)]

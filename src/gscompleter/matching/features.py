@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.matching.frames import Frame
+from gscompleter.matching.stereo_image import StereoImage
 
 Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
 """Pixels (the top-left pixel's centre is (0.5, 0.5)) and descriptors."""
 Pixels = Float[np.ndarray, "m 2"]
 
 
-def features_of(frame: Frame) -> Features:
-    grey = cv2.cvtColor((frame.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+def features_of(view: StereoImage) -> Features:
+    grey = cv2.cvtColor((view.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
     detector = cv2.SIFT.create(2000, contrastThreshold=0.02)
     keypoints, descriptors = detector.detectAndCompute(grey, None)
     if descriptors is None:

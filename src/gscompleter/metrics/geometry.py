@@ -136,7 +136,7 @@ def alignment(
     """AbsRel, Chamfer distance and F-score between what one target added and the context.
 
     Completion adds primitives in the dilated hole only, so the two meet at its rim. The overlap
-    is made of the target's pixels that each covers by half when it is rendered alone.
+    is made of the target's pixels that each covers when it is rendered alone.
 
     - AbsRel compares the two rendered z-depths there; the context's is the reference.
     - A point of the first cloud is the mean of an added Gaussian that projects into the overlap.

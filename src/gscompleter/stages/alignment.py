@@ -15,10 +15,10 @@ from gscompleter.types import DepthAffine, DepthMap, Lift, Render
 def fit_affine(
     predicted: DepthMap,
     context: DepthMap,
-    generator: torch.Generator,
+    rng: torch.Generator,
     config: AffineConfig = AffineConfig(),
 ) -> DepthAffine:
-    """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 7).
+    """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 8).
 
     Where RANSAC cannot be trusted (few pixels, hardly any range of depth, few inliers) the median
     ratio with shift 0 takes its place, and the identity where there is nothing to compare; which
@@ -29,11 +29,11 @@ def fit_affine(
     if len(x) < config.min_pixels:
         return DepthAffine()
     if len(x) > config.max_pixels:
-        drawn = torch.randperm(len(x), generator=generator)[: config.max_pixels].to(x.device)
+        drawn = torch.randperm(len(x), generator=rng)[: config.max_pixels].to(x.device)
         x, y = x[drawn], y[drawn]
 
     if depth_spread(x) >= config.min_depth_spread:
-        scale, shift = ransac_line(x, y, generator, config)
+        scale, shift = ransac_line(x, y, rng, config)
         inliers = affine_inliers(x, y, scale, shift, config).double().mean().item()
         if scale > 0 and inliers >= config.min_inliers:
             return DepthAffine(scale, shift, inliers, "ransac")
@@ -58,7 +58,7 @@ def affine_inliers(
 def ransac_line(
     x: Float[Tensor, "n"],
     y: Float[Tensor, "n"],
-    generator: torch.Generator,
+    rng: torch.Generator,
     config: AffineConfig,
 ) -> tuple[float, float]:
     """Scale and shift with the most inliers among two-point hypotheses, refitted on its inliers.
@@ -66,7 +66,7 @@ def ransac_line(
     Residuals count relative to depth, so that the far end of the scene does not outvote the near
     one, and the refit weighs them alike. (0, 0) where no hypothesis has a positive scale.
     """
-    i, j = torch.randint(len(x), (2, config.max_trials), generator=generator).to(x.device)
+    i, j = torch.randint(len(x), (2, config.max_trials), generator=rng).to(x.device)
     scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
     shifts = y[i] - scales * x[i]
     residuals = (scales[:, None] * x + shifts[:, None] - y).abs()
@@ -92,7 +92,7 @@ def fit_bridge(
     lift: Lift,
     at_target: Render,
     at_anchor: Render,
-    generator: torch.Generator,
+    rng: torch.Generator,
     config: AffineConfig = AffineConfig(),
 ) -> DepthAffine:
     """The affine that brings the lifted depths to the scene's, compared in the bridge view.
@@ -103,18 +103,16 @@ def fit_bridge(
     if config.bridge == "none":
         return DepthAffine()
     if config.bridge == "target":
-        return fit_affine(lift.reference_depth, at_target.depth_map(), generator, config)
-    affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), generator, config)
-    return unless_contradicted(
-        affine, lift.reference_depth, at_target.depth_map(), generator, config
-    )
+        return fit_affine(lift.reference_depth, at_target.depth_map(), rng, config)
+    affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng, config)
+    return unless_contradicted(affine, lift.reference_depth, at_target.depth_map(), rng, config)
 
 
 def unless_contradicted(
     affine: DepthAffine,
     predicted: DepthMap,
     context: DepthMap,
-    generator: torch.Generator,
+    rng: torch.Generator,
     config: AffineConfig,
 ) -> DepthAffine:
     """`affine`, unless the scene that the target sees has other depths and one other affine.
@@ -129,7 +127,7 @@ def unless_contradicted(
     agree = affine_inliers(x, y, affine.scale, affine.shift, config).double().mean().item()
     if agree >= config.min_agreement:
         return affine
-    own = fit_affine(predicted, context, generator, config)
+    own = fit_affine(predicted, context, rng, config)
     # Where neither fits well, the paper's choice stands.
     trusted = own.inliers >= max(config.min_inliers, 2 * agree)
     return replace(own, contradicted=True) if trusted else affine

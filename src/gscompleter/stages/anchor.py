@@ -9,7 +9,13 @@ from dataclasses import dataclass
 import torch
 
 from gscompleter.config import AnchorConfig
-from gscompleter.generators import Generator, Request, Synthesis
+from gscompleter.generators import (
+    Generator,
+    ImageFunction,
+    Request,
+    Synthesis,
+    as_generator,
+)
 from gscompleter.geometry import baseline_between, inside, project, rotation_between
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.types import Camera, Lift, SceneContext, View
@@ -66,20 +72,22 @@ class Synthesized(View):
     """A sentence each; empty for a generator that tells nothing."""
 
 
-def synthesize(generator: Generator, target: Camera, context: SceneContext) -> Synthesized:
-    """`Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 5)."""
+def synthesize(
+    generator: Generator | ImageFunction, target: Camera, context: SceneContext
+) -> Synthesized:
+    """`Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 6)."""
     return synthesize_all(generator, [(target, context)])[0]
 
 
 def synthesize_all(
-    generator: Generator, asked: Sequence[tuple[Camera, SceneContext]]
+    generator: Generator | ImageFunction, asked: Sequence[tuple[Camera, SceneContext]]
 ) -> list[Synthesized]:
     """The same for several targets at once, each with what is known of the scene for it."""
     requests = [
         Request(context.views[nearest_view(target, context.views)], target, context)
         for target, context in asked
     ]
-    answers = generator.synthesize(requests)
+    answers = as_generator(generator).synthesize(requests)
     return [as_view(answer, r.target) for answer, r in zip(answers, requests, strict=True)]
 
 
@@ -95,7 +103,7 @@ def as_view(answer: Synthesis, target: Camera) -> Synthesized:
 
 
 def lift(reconstructor: Reconstructor, reference: View, anchor: View) -> Lift:
-    """`Ψ((Ĩ_t, P_t), (I_s, P_s))`, of which the target's Gaussians are kept (paper, Eq. 6).
+    """`Ψ((Ĩ_t, P_t), (I_s, P_s))`, of which the target's Gaussians are kept (paper, Eq. 7).
 
     A pixel-aligned Ψ says which Gaussians are the reference's. Of another Ψ all those are taken
     that the target camera sees.

@@ -14,7 +14,7 @@ from gscompleter.types import Camera, Gaussians, View
 
 
 def init_context(reconstructor: Reconstructor, views: Sequence[View]) -> Gaussians:
-    """`G_ctx = Ψ(views)`: the Gaussians of the observed regions (paper, Eq. 4)."""
+    """`G_ctx = Ψ(views)`: the Gaussians of the observed regions (paper, Eq. 5)."""
     return reconstructor(views).gaussians
 
 

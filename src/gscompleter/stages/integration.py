@@ -18,7 +18,7 @@ from gscompleter.types import Camera, Gaussians, Lift, Render, View
 
 
 def hole_mask(render: Render, config: HoleConfig = HoleConfig()) -> Bool[Tensor, "h w"]:
-    """Where the scene has a hole, before dilation (paper, Eq. 10)."""
+    """Where the scene has a hole, before dilation (paper, Eq. 12)."""
     return render.alpha < config.max_alpha
 
 
@@ -47,22 +47,23 @@ def keep_near_holes(lift: Lift, near_holes: Bool[Tensor, "h w"]) -> Lift:
 
 def refine_opacities(
     added: Gaussians,
-    at_target: FrozenView,
+    frozen_target: FrozenView,
     reference: View,
-    at_views: Sequence[FrozenView],
+    frozen_views: Sequence[FrozenView],
     views: Sequence[View],
     config: RefineConfig = RefineConfig(),
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """`added` with opacities that minimise Eq. 11, and the loss of each iteration.
+    """`added` with opacities that minimise Eq. 13, and the loss of each iteration.
 
     Everything else of them, and all of the scene, stays as it is: what was good cannot be
     forgotten.
     """
     if config.iterations == 0 or len(added) == 0:
         return added, ()
-    plans = [(at_target.plan(added), reference.image, config.target_weight)]
+    plans = [(frozen_target.plan(added), reference.image, config.target_weight)]
     plans += [
-        (frozen.plan(added), view.image, 1.0) for frozen, view in zip(at_views, views, strict=True)
+        (frozen.plan(added), view.image, 1.0)
+        for frozen, view in zip(frozen_views, views, strict=True)
     ]
 
     logit = config.parametrization == "logit"
@@ -89,7 +90,7 @@ def refine_opacities(
 
 def do_no_harm(
     added: Gaussians,
-    at_views: Sequence[FrozenView],
+    frozen_views: Sequence[FrozenView],
     views: Sequence[View],
     allowed_errors: Sequence[float],
     config: HarmConfig = HarmConfig(),
@@ -103,7 +104,7 @@ def do_no_harm(
 
     Args:
         added: Generated Gaussians.
-        at_views: The scene frozen at each context camera.
+        frozen_views: The scene frozen at each context camera.
         views: The photographs.
         allowed_errors: Largest mean squared error allowed in each view.
         config: How it is checked.
@@ -112,7 +113,7 @@ def do_no_harm(
         return added
     checks = [
         (frozen.plan(added), view.image, allowed)
-        for frozen, view, allowed in zip(at_views, views, allowed_errors, strict=True)
+        for frozen, view, allowed in zip(frozen_views, views, allowed_errors, strict=True)
     ]
     opacities = added.opacities
     for trial in range(config.max_trials + 1):

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gscompleter.config import RegistrationConfig
+from gscompleter.coverage import COVERED
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, Renderer
@@ -25,41 +26,44 @@ class Registration:
     gaussians: Gaussians
     affine: DepthAffine
     losses: tuple[float, ...]
-    """Value of Eq. 9 at each iteration."""
+    """Value of Eq. 11 at each iteration."""
 
 
 def register(
     lift: Lift,
-    at_target: FrozenView,
+    frozen_target: FrozenView,
     at_anchor: Render,
     reference: View,
     anchor: Camera,
     renderer: Renderer,
-    generator: torch.Generator,
+    rng: torch.Generator,
     config: RegistrationConfig = RegistrationConfig(),
+    max_alpha: float = COVERED,
 ) -> Registration:
     """Bring the lifted Gaussians to the scene: first all by one affine, then each along its ray.
 
     Args:
         lift: Candidates and the depth maps predicted together with them.
-        at_target: The scene frozen at the target camera.
+        frozen_target: The scene frozen at the target camera.
         at_anchor: The scene rendered at the anchor camera.
         reference: The synthesized image and the target camera.
         anchor: Camera of the anchor.
         renderer: Draws the candidates under the anchor camera.
-        generator: Randomness of RANSAC.
+        rng: Randomness of RANSAC.
         config: Weights, steps and choices.
+        max_alpha: A pixel of the target that the scene covers by less is a hole.
     """
-    affine = fit_bridge(lift, at_target.context, at_anchor, generator, config.affine)
+    affine = fit_bridge(lift, frozen_target.context, at_anchor, rng, config.affine)
     coarse = apply_affine(lift.gaussians, affine, reference.camera, config.footprint)
     if config.iterations == 0 or len(coarse) == 0:
         return Registration(coarse, affine, ())
     registered, losses = register_along_rays(
-        coarse, at_target, at_anchor, reference, anchor, renderer, config
+        coarse, frozen_target, at_anchor, reference, anchor, renderer, config
     )
     if config.carry_into_holes and config.degrees_of_freedom == 1 and lift.pixel_index is not None:
+        scene = frozen_target.context.depth_map(max_alpha)
         registered = carry_into_holes(
-            coarse, registered, lift.pixel_index, at_target.context, reference.camera, config
+            coarse, registered, lift.pixel_index, scene, reference.camera, config
         )
     return Registration(registered, affine, losses)
 
@@ -68,17 +72,17 @@ def carry_into_holes(
     coarse: Gaussians,
     registered: Gaussians,
     pixel_index: Int[Tensor, "n"],
-    at_target: Render,
+    scene: DepthMap,
     camera: Camera,
     config: RegistrationConfig,
 ) -> Gaussians:
     """`registered`, where those in a hole moved like the well registered ones around them.
 
-    What is continued smoothly is the logarithm of d' / d, the correction each ray received.
+    A hole is where `scene`, its depth at the target, is not valid. What is continued smoothly is
+    the logarithm of d' / d, the correction each ray received.
     """
     before = (coarse.means - camera.center) @ camera.forward
     after = (registered.means - camera.center) @ camera.forward
-    scene = at_target.depth_map()
     error = (after / scene.depth.flatten()[pixel_index].clamp_min(1e-12) - 1).abs()
     agrees = scene.valid.flatten()[pixel_index] & (error < config.carry_tolerance)
 
@@ -102,7 +106,7 @@ def apply_affine(
     """`gaussians` at corrected z-depth `scale * z + shift`, each on its own ray of `camera`.
 
     The distance along the ray follows from the means themselves, d' = d z'/z, which is the
-    paper's Eq. 8 for z-depth models and holds for models of ray distance too. A shift must not
+    paper's Eq. 9 for z-depth models and holds for models of ray distance too. A shift must not
     push anything through the camera: a tenth of its depth is the least that remains.
     """
     z = (gaussians.means - camera.center) @ camera.forward
@@ -128,15 +132,15 @@ def slide(
 
 def register_along_rays(
     coarse: Gaussians,
-    at_target: FrozenView,
+    frozen_target: FrozenView,
     at_anchor: Render,
     reference: View,
     anchor: Camera,
     renderer: Renderer,
     config: RegistrationConfig,
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """Minimise Eq. 9 over one distance per Gaussian; also returns the loss of each iteration."""
-    objective = Objective.of(at_target.context, at_anchor, reference, config)
+    """Minimise Eq. 11 over one distance per Gaussian; also returns the loss of each iteration."""
+    objective = Objective.of(frozen_target.context, at_anchor, reference, config)
     parameters = torch.zeros(
         (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )
@@ -149,7 +153,7 @@ def register_along_rays(
             left = 1 - iteration / config.iterations
             optimizer.param_groups[0]["lr"] = left * config.learning_rate
         moved = displace(coarse, parameters, reference.camera, config)
-        loss = objective(moved, at_target, reference.camera, anchor, renderer)
+        loss = objective(moved, frozen_target, reference.camera, anchor, renderer)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -164,7 +168,7 @@ def displace(
     camera: Camera,
     config: RegistrationConfig,
 ) -> Gaussians:
-    """`coarse` moved by the optimised parameters: along the rays (Eq. 8), or freely in 3-DoF."""
+    """`coarse` moved by the optimised parameters: along the rays (Eq. 10), or freely in 3-DoF."""
     offsets = coarse.means - camera.center
     distances = offsets.norm(dim=1, keepdim=True)
     unit = distances if config.step == "relative" else torch.ones_like(distances)
@@ -176,7 +180,7 @@ def displace(
 
 @dataclass(frozen=True)
 class Objective:
-    """Eq. 9: `λ_d L_depth + λ_s L_stereo + λ_c L_rgb`, each a mean over the image."""
+    """Eq. 11: `λ_d L_depth + λ_s L_stereo + λ_c L_rgb`, each a mean over the image."""
 
     target_depth: DepthMap
     anchor_depth: DepthMap
@@ -199,7 +203,7 @@ class Objective:
     def __call__(
         self,
         candidates: Gaussians,
-        at_target: FrozenView,
+        frozen_target: FrozenView,
         target: Camera,
         anchor: Camera,
         renderer: Renderer,
@@ -208,11 +212,11 @@ class Objective:
         c = self.config
         loss = torch.zeros((), device=candidates.means.device)
         if c.depth_of == "composite" or c.rgb_weight > 0:
-            together = at_target.composite(candidates)
+            together = frozen_target.composite(candidates)
             loss = loss + c.rgb_weight * (together.image - self.image).abs().mean()
         shown = together if c.depth_of == "composite" else renderer.render(candidates, target)
         loss = loss + c.depth_weight * self.depth_error(
-            shown, self.target_depth, self.target_depth.valid & (shown.alpha.detach() >= 0.5)
+            shown, self.target_depth, self.target_depth.valid & shown.depth_map().valid
         )
         alone = renderer.render(candidates, anchor)
         return loss + c.stereo_weight * self.depth_error(
@@ -224,12 +228,12 @@ class Objective:
         error = (shown.depth - expected.depth).abs() / self.unit
         return torch.where(where, error, 0.0).mean()
 
-    def comparable(self, at_anchor: Render) -> Tensor:
+    def comparable(self, alone: Render) -> Tensor:
         """Where the anchor sees both the scene and the candidates [h, w]."""
-        seen = self.anchor_depth.valid & (at_anchor.alpha.detach() >= 0.5)
+        seen = self.anchor_depth.valid & alone.depth_map().valid
         if not self.config.mask_occluded:
             return seen
-        behind = at_anchor.depth.detach() > self.anchor_depth.depth * (
+        behind = alone.depth.detach() > self.anchor_depth.depth * (
             1 + self.config.occlusion_tolerance
         )
         return seen & ~behind

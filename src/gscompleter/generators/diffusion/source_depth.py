@@ -29,8 +29,6 @@ METRIC = {"depth_anything": False, "dpt": False, "glpn": True}
 configuration of a network may say otherwise."""
 NEVER_USED = r"fusion_stage\.layers\.0\.residual_layer1\."
 """Of DPT's first fusion layer, which has nothing to fuse. Some published files lack them."""
-MIN_ALPHA = 0.5
-"""Opacity of the scene from which a pixel has a depth."""
 
 
 @runtime_checkable
@@ -64,7 +62,7 @@ def seen(render: Render) -> Bool[Tensor, "h w"]:
     Raises:
         InputError: where that is nowhere.
     """
-    valid = (render.alpha >= MIN_ALPHA) & (render.depth > 0)
+    valid = render.depth_map().valid & (render.depth > 0)
     if not valid.any():
         raise InputError(
             "The camera nearest to the target sees nothing of the scene, and PE-Field needs its "

@@ -35,7 +35,7 @@ class Cameras:
         """Intrinsics in the pixels of maps of `height` x `width`."""
         return self.K * self.K.new_tensor([width, height, 1])[:, None]
 
-    def transforms_to(self, sources: Int[Tensor, "b v s"]) -> Float[Tensor, "b v s 4 4"]:
+    def sources_from_views(self, sources: Int[Tensor, "b v s"]) -> Float[Tensor, "b v s 4 4"]:
         """From the axes of each view to those of its sources."""
         with full_precision(self.c2w):
             return torch.linalg.inv(select(self.c2w, sources)) @ self.c2w[:, :, None]

@@ -40,7 +40,7 @@ def cost_volume(
     """
     n, _, h, w = features.shape
     K = cameras.intrinsics(h, w).flatten(0, 1)
-    transforms = cameras.transforms_to(sources).flatten(0, 1)
+    transforms = cameras.sources_from_views(sources).flatten(0, 1)
     depths = (1 / inverse_depths).expand(n, -1, h, w)
     first = torch.arange(len(sources), device=sources.device)[:, None, None] * sources.shape[1]
     numbers = (first + sources).flatten(0, 1).tolist()

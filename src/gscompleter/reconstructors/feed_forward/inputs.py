@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gscompleter.errors import InputError
+from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.reconstructors.feed_forward.cameras import Cameras
 from gscompleter.types import Camera, View
 
@@ -90,7 +91,7 @@ def batch_of(
         )
     crops = central_crops([view.camera for view in views], patch)
     pairs = list(zip(views, crops, strict=True))
-    ranges = [depth_range(view.camera, near, far) for view in views]
+    ranges = [depth_range_of([view], lambda _: (near, far)) for view in views]
     images = torch.stack([v.image[c.rows, c.columns].movedim(-1, 0) for v, c in pairs])
     cameras = Cameras(
         c2w=torch.stack([view.camera.c2w for view in views])[None].float(),
@@ -111,15 +112,3 @@ def cropped_intrinsics(camera: Camera, crop: Crop) -> Float[Tensor, "3 3"]:
     K[0, 2] -= crop.left
     K[1, 2] -= crop.top
     return K / K.new_tensor([crop.width, crop.height, 1])[:, None]
-
-
-def depth_range(camera: Camera, near: float, far: float) -> tuple[float, float]:
-    """Near and far z-depth of a view: as `camera` knows them, else `near` and `far`."""
-    low = near if camera.near is None else camera.near
-    high = far if camera.far is None else camera.far
-    if not 0 < low < high:
-        raise InputError(
-            f"The depth range {low:g} to {high:g} is empty; near must be positive and less than "
-            "far."
-        )
-    return low, high

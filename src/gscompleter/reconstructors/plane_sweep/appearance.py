@@ -8,7 +8,7 @@ of descent tell which of the two to believe, and give the colours the sharpness 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -17,40 +17,29 @@ from torch import Tensor
 from gscompleter.render import Renderer
 from gscompleter.types import SH_C0, Gaussians, View
 
-
-@dataclass(frozen=True)
-class AppearanceConfig:
-    opacity_steps: int = 15
-    """Steps of Adam on the opacities; 0 leaves them."""
-    learning_rate: float = 0.4
-    """Step of Adam, on the logit."""
-    removal_penalty: float = 0.01
-    """Cost of an opacity taken away, so that what no photograph objects to stays."""
-    colour_steps: int = 4
-    """Rounds of correcting the colours; 0 leaves them."""
+OPACITY_STEPS = 15
+"""Steps of Adam on the opacities."""
+LEARNING_RATE = 0.4
+"""Step of Adam, on the logit."""
+REMOVAL_PENALTY = 0.01
+"""Cost of an opacity taken away, so that what no photograph objects to stays."""
+COLOUR_STEPS = 4
+"""Rounds of correcting the colours."""
 
 
-def fit_appearance(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    renderer: Renderer,
-    config: AppearanceConfig = AppearanceConfig(),
-) -> Gaussians:
+def fit_appearance(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
     """`gaussians` with opacities and colours fitted to `views`."""
-    fitted = fit_opacities(gaussians, views, renderer, config)
-    return fit_colours(fitted, views, renderer, config)
+    return fit_colours(fit_opacities(gaussians, views, renderer), views, renderer)
 
 
-def fit_opacities(
-    gaussians: Gaussians, views: Sequence[View], renderer: Renderer, config: AppearanceConfig
-) -> Gaussians:
+def fit_opacities(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
     """The L1 difference from the photographs, plus a cost of whatever is taken away."""
     nothing = gaussians[:0]
     plans = [(renderer.freeze(nothing, v.camera).plan(gaussians), v.image) for v in views]
     logits = gaussians.opacities.logit(eps=1e-4).requires_grad_()
-    optimizer = torch.optim.Adam([logits], lr=config.learning_rate)
-    weight = config.removal_penalty * len(views) / len(gaussians)
-    for _ in range(config.opacity_steps):
+    optimizer = torch.optim.Adam([logits], lr=LEARNING_RATE)
+    weight = REMOVAL_PENALTY * len(views) / len(gaussians)
+    for _ in range(OPACITY_STEPS):
         opacities = logits.sigmoid()
         removed = (gaussians.opacities - opacities).clamp_min(0).sum()
         terms = [(plan(opacities).image - image).abs().mean() for plan, image in plans]
@@ -61,16 +50,14 @@ def fit_opacities(
     return replace(gaussians, opacities=logits.detach().sigmoid())
 
 
-def fit_colours(
-    gaussians: Gaussians, views: Sequence[View], renderer: Renderer, config: AppearanceConfig
-) -> Gaussians:
+def fit_colours(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
     """Each colour moved, again and again, by the mean difference from the photographs.
 
     The mean is weighted by the share that the Gaussian has in each pixel: SIRT (Gilbert 1972), as
     the image is linear in the colours.
     """
     sh, drawn = gaussians.sh.detach().clone(), torch.zeros_like(gaussians.opacities)
-    for step in range(config.colour_steps):
+    for step in range(COLOUR_STEPS):
         moved = torch.zeros_like(sh[:, 0])
         for view in views:
             colours = sh.clone().requires_grad_()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,25 +9,19 @@ from torch import Tensor
 from gscompleter.geometry import quats_from
 from gscompleter.types import Gaussians, View, observed, sh_from_rgb
 
-
-@dataclass(frozen=True)
-class DiscConfig:
-    sigma: float = 0.6
-    """Standard deviation across the line of sight, in pixels."""
-    thickness: float = 0.15
-    """Standard deviation along the surface's normal, relative to that across the line of sight."""
-    max_stretch: float = 3.0
-    """Longest a disc on a slanted surface may get, relative to a frontal one."""
-    opacity: float = 0.98
-    """Of a pixel whose depth is trusted."""
+THICKNESS = 0.15
+"""Standard deviation along the surface's normal, relative to that across the line of sight."""
+MAX_STRETCH = 3.0
+"""Longest a disc on a slanted surface may get, relative to a frontal one."""
+OPACITY = 0.98
+"""Of every disc, before the photographs have their say."""
 
 
 def discs(
     view: View,
     depth: Float[Tensor, "h w"],
     normals: Float[Tensor, "h w 3"],
-    opacity: Float[Tensor, "h w"],
-    config: DiscConfig,
+    sigma: float,
 ) -> Gaussians:
     """A Gaussian for every pixel of `view`, row by row, at its z-depth.
 
@@ -37,8 +29,7 @@ def discs(
         view: Colours and camera.
         depth: z-depth in scene units.
         normals: Of the surface, in camera axes and towards the camera.
-        opacity: In [0, 1].
-        config: Sizes.
+        sigma: Standard deviation across the line of sight, in pixels.
     """
     camera = view.camera
     rays = camera.z_rays()
@@ -47,7 +38,7 @@ def discs(
 
     normal = normals.reshape(-1, 3) @ camera.c2w[:3, :3].T
     towards = -torch.nn.functional.normalize(rays, dim=-1).reshape(-1, 3)
-    cosine = (normal * towards).sum(-1, keepdim=True).clamp_min(1 / config.max_stretch)
+    cosine = (normal * towards).sum(-1, keepdim=True).clamp_min(1 / MAX_STRETCH)
     # Along the slope the disc spans as much of the ray's width as across it.
     across = torch.linalg.cross(normal, towards)
     flat = across.norm(dim=-1, keepdim=True) < 1e-3
@@ -57,13 +48,13 @@ def discs(
     along = torch.linalg.cross(normal, across)
     axes = torch.stack([across, along, normal], dim=-1)
     sizes = torch.cat(
-        [torch.ones_like(cosine), 1 / cosine, torch.full_like(cosine, config.thickness)], dim=-1
+        [torch.ones_like(cosine), 1 / cosine, torch.full_like(cosine, THICKNESS)], dim=-1
     )
     return observed(
         means=means,
         quats=quats_from(axes),
-        scales=sizes * (config.sigma * pixel)[:, None],
-        opacities=opacity.reshape(-1),
+        scales=sizes * (sigma * pixel)[:, None],
+        opacities=torch.full_like(pixel, OPACITY),
         sh=sh_from_rgb(view.image.reshape(-1, 3)),
     )
 

@@ -3,42 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from gscompleter.kernels import stereo
-from gscompleter.matching.frames import Frame
+from gscompleter.matching.stereo_image import StereoImage
 
-Source = tuple[Frame, Float[np.ndarray, "3 4"]]
+Source = tuple[StereoImage, Float[np.ndarray, "3 4"]]
 """Another view, and the transform to its pixels from those of the reference."""
 
-
-@dataclass(frozen=True)
-class MatchingConfig:
-    step: float = 0.5
-    """Pixels by which neighbouring planes move in the other image, at most pixels."""
-    min_planes: int = 48
-    """Fewest planes."""
-    max_planes: int = 256
-    """Most planes."""
-    radius: int = 2
-    """Of the windows that are correlated, in pixels."""
-    noise: float = 0.015
-    """Standard deviation of noise in colour; weaker texture correlates with nothing."""
-    detail: float = 0.4
-    """Share of the pixels' own difference in the cost; the rest is correlation of windows."""
-    best_share: float = 0.5
-    """Share of the sources, the best ones, whose mean cost counts."""
-    unseen_cost: int = 140
-    """Cost (0 to 254) of a plane at which no other view sees the pixel."""
+STEP = 0.5
+"""Pixels by which neighbouring planes move in the other image, at most pixels."""
+MIN_PLANES, MAX_PLANES = 48, 256
+"""Fewest and most planes."""
+RADIUS = 2
+"""Of the windows that are correlated, in pixels."""
+NOISE = 0.015
+"""Standard deviation of noise in colour; weaker texture correlates with nothing."""
+DETAIL = 0.4
+"""Share of the pixels' own difference in the cost; the rest is correlation of windows."""
+BEST_SHARE = 0.5
+"""Share of the sources, the best ones, whose mean cost counts."""
+UNSEEN_COST = 140
+"""Cost (0 to 254) of a plane at which no other view sees the pixel."""
 
 
 def inverse_depth_planes(
-    reference: Frame, sources: Sequence[Source], near: float, far: float, config: MatchingConfig
+    reference: StereoImage, sources: Sequence[Source], near: float, far: float
 ) -> Float[np.ndarray, "d"]:
-    """Inverse depths from far to near, evenly spaced, so that planes move by about `step` pixels.
+    """Inverse depths from far to near, evenly spaced, so that planes move by about STEP pixels.
 
     Planes so near that hardly any pixel stays within a source are left out: nothing matches there.
     """
@@ -63,16 +57,13 @@ def inverse_depth_planes(
         overlap = np.maximum(overlap, seen.mean(axis=1))
     useful = np.flatnonzero(overlap >= 0.02)
     last = max(int(useful[-1]), 8) if len(useful) else 256
-    wanted = float(motion[:last].sum()) / config.step
-    planes = int(np.clip(np.ceil(wanted), config.min_planes, config.max_planes))
+    wanted = float(motion[:last].sum()) / STEP
+    planes = int(np.clip(np.ceil(wanted), MIN_PLANES, MAX_PLANES))
     return np.linspace(samples[0], samples[last], planes).astype(np.float32)
 
 
 def cost_volume(
-    reference: Frame,
-    sources: Sequence[Source],
-    inverse_depths: Float[np.ndarray, "d"],
-    config: MatchingConfig,
+    reference: StereoImage, sources: Sequence[Source], inverse_depths: Float[np.ndarray, "d"]
 ) -> UInt8[np.ndarray, "h w d"]:
     """Costs of the planes in 0 to 254; of several sources the best ones count."""
     costs = [
@@ -81,10 +72,10 @@ def cost_volume(
             source.image,
             transform,
             inverse_depths,
-            config.radius,
-            np.float32(config.noise),
-            np.float32(config.detail),
+            RADIUS,
+            np.float32(NOISE),
+            np.float32(DETAIL),
         )
         for source, transform in sources
     ]
-    return stereo.best_mean(np.stack(costs), config.best_share, np.uint8(config.unseen_cost))
+    return stereo.best_mean(np.stack(costs), BEST_SHARE, np.uint8(UNSEEN_COST))

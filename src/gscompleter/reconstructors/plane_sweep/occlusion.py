@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from gscompleter.kernels import stereo
+from gscompleter.reconstructors.plane_sweep.confidence import MAX_RETURN_ERROR
 
 Map = Float32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
@@ -16,17 +17,15 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True)
 class Neighbour:
-    """Another view: what it knows of its depths, and the ways to it and back."""
+    """Another view: what it knows of its depths, and the transforms to and from its pixels."""
 
     inverse: Float32[np.ndarray, "other_h other_w"]
     """Inverse depths; next to 0 where it is not sure of them."""
-    there: Float32[np.ndarray, "3 4"]
-    back: Float32[np.ndarray, "3 4"]
+    other_from_this: Float32[np.ndarray, "3 4"]
+    this_from_other: Float32[np.ndarray, "3 4"]
 
 
-def hidden_from_others(
-    background: Map, neighbours: Sequence[Neighbour], max_return_error: float
-) -> Mask:
+def hidden_from_others(background: Map, neighbours: Sequence[Neighbour]) -> Mask:
     """Where a surface at inverse depth `background` [h, w] is hidden from some and seen by none.
 
     A neighbour hides it whose own surface in that direction is nearer.
@@ -34,9 +33,11 @@ def hidden_from_others(
     hidden = np.zeros(background.shape, bool)
     seen = np.zeros(background.shape, bool)
     for other in neighbours:
-        error, ratio = stereo.reproject(background, other.inverse, other.there, other.back)
+        error, ratio = stereo.reproject(
+            background, other.inverse, other.other_from_this, other.this_from_other
+        )
         known = (error >= 0) & (ratio > 1e-3)
-        before = known & (error > max_return_error) & (ratio > 1)
+        before = known & (error > MAX_RETURN_ERROR) & (ratio > 1)
         hidden |= before
         seen |= known & ~before
     return hidden & ~seen

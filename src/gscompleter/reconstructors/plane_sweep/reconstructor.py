@@ -10,35 +10,32 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gscompleter.errors import InputError
 from gscompleter.kernels import stereo
-from gscompleter.matching.depth_range import estimate_depth_range
+from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.matching.features import features_of, matches
-from gscompleter.matching.frames import Frame, frames_of, transform_between
-from gscompleter.reconstructors.plane_sweep.aggregation import AggregationConfig, aggregate
-from gscompleter.reconstructors.plane_sweep.appearance import AppearanceConfig, fit_appearance
-from gscompleter.reconstructors.plane_sweep.confidence import (
-    ConfidenceConfig,
-    agreement,
-    confidence_of,
+from gscompleter.matching.stereo_image import (
+    StereoImage,
+    source_from_reference,
+    stereo_images,
 )
-from gscompleter.reconstructors.plane_sweep.epipolar import EpipolarConfig, turned_to_matches
-from gscompleter.reconstructors.plane_sweep.gaussians import DiscConfig, discs, normals_of
-from gscompleter.reconstructors.plane_sweep.matching import (
-    MatchingConfig,
-    cost_volume,
-    inverse_depth_planes,
-)
+from gscompleter.reconstructors.plane_sweep.aggregation import aggregate
+from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance
+from gscompleter.reconstructors.plane_sweep.confidence import confidence_of, consistent
+from gscompleter.reconstructors.plane_sweep.epipolar import rotated_to_matches
+from gscompleter.reconstructors.plane_sweep.gaussians import discs, normals_of
+from gscompleter.reconstructors.plane_sweep.matching import cost_volume, inverse_depth_planes
 from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
-from gscompleter.reconstructors.plane_sweep.surfaces import SurfaceConfig, fit_surfaces
+from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
 
 Map = Float32[np.ndarray, "_ _"]
 Transforms = dict[tuple[int, int], Float32[np.ndarray, "3 4"]]
-"""From the pixels of one view, at an inverse depth, to those of another, by their numbers."""
+"""`transforms[i, j]` is j_from_i: from the pixels of view i, at an inverse depth, to those of j."""
 UNKNOWN = np.float32(1e-9)
 """Inverse depth of what a view is not sure of."""
+BACKGROUND_WEIGHT = np.float32(0.3)
+"""How much the background's depth counts where an object hides it from the other views."""
 
 
 @dataclass(frozen=True)
@@ -63,20 +60,8 @@ class Sweep:
 class PlaneSweep:
     """Plane-sweep stereo, completed by surfaces, splatted, and fitted to the photographs."""
 
-    epipolar: EpipolarConfig = EpipolarConfig()
-    """Small errors of the poses."""
-    matching: MatchingConfig = MatchingConfig()
-    """Planes and costs."""
-    aggregation: AggregationConfig = AggregationConfig()
-    """Penalties of the semi-global aggregation."""
-    confidence: ConfidenceConfig = ConfidenceConfig()
-    """Which matches count."""
-    surfaces: SurfaceConfig = SurfaceConfig()
-    """How depth is smoothed, and completed where nothing matches."""
-    discs: DiscConfig = DiscConfig()
-    """Sizes of the Gaussians."""
-    appearance: AppearanceConfig = AppearanceConfig()
-    """How opacities and colours are fitted."""
+    disc_sigma: float = 0.6
+    """Standard deviation of a Gaussian across the line of sight, in pixels."""
     renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
     """Draws Gaussians while they are fitted."""
 
@@ -90,10 +75,7 @@ class PlaneSweep:
         parts = [self.splat(view, depth) for view, depth in zip(views, depths, strict=True)]
         device = views[0].image.device
         fitted = fit_appearance(
-            merge(parts).to("cpu"),
-            [view.to("cpu") for view in views],
-            self.renderer,
-            self.appearance,
+            merge(parts).to("cpu"), [view.to("cpu") for view in views], self.renderer
         )
         return Reconstruction(
             fitted.to(device),
@@ -104,11 +86,11 @@ class PlaneSweep:
 
     def depths(self, views: Sequence[View]) -> list[DepthMap]:
         """z-depth of all pixels of `views`, valid where it was measured, and how sure of it."""
-        frames, unit = frames_of(views)
-        near, far = depth_range(views)
-        transforms = transforms_among(frames, self.epipolar)
+        images, unit = stereo_images(views)
+        near, far = depth_range_of(views)
+        transforms = transforms_among(images)
         sweeps = [
-            self.sweep(i, frames, transforms, near / unit, far / unit) for i in range(len(frames))
+            self.sweep(i, images, transforms, near / unit, far / unit) for i in range(len(images))
         ]
         confidences = self.confidences(sweeps, transforms)
         sure = [
@@ -116,11 +98,11 @@ class PlaneSweep:
             for sweep, confidence in zip(sweeps, confidences, strict=True)
         ]
         depths = []
-        for number, (view, frame, sweep) in enumerate(zip(views, frames, sweeps, strict=True)):
+        for number, (view, image, sweep) in enumerate(zip(views, images, sweeps, strict=True)):
             measured, weight = self.with_background(
                 number, sweep, confidences[number], sure, transforms
             )
-            heights = fit_surfaces(measured, weight, frame.image, self.surfaces)
+            heights = fit_surfaces(measured, weight, image.image)
             depth = torch.from_numpy(np.float32(unit) / sweep.inverse(heights))
             confidence = torch.from_numpy(confidences[number])
             device = view.image.device
@@ -132,18 +114,18 @@ class PlaneSweep:
     def sweep(
         self,
         number: int,
-        frames: Sequence[Frame],
+        images: Sequence[StereoImage],
         transforms: Transforms,
         near: float,
         far: float,
     ) -> Sweep:
         """The planes that match best in view `number`."""
-        frame = frames[number]
-        others = [i for i in range(len(frames)) if i != number]
-        sources = [(frames[i], transforms[number, i]) for i in others]
-        planes = inverse_depth_planes(frame, sources, near, far, self.matching)
-        costs = cost_volume(frame, sources, planes, self.matching)
-        index, margin = stereo.winners(aggregate(costs, frame, self.aggregation))
+        image = images[number]
+        others = [i for i in range(len(images)) if i != number]
+        sources = [(images[i], transforms[number, i]) for i in others]
+        planes = inverse_depth_planes(image, sources, near, far)
+        costs = cost_volume(image, sources, planes)
+        index, margin = stereo.winners(aggregate(costs, image))
         return Sweep(planes, index, margin)
 
     def confidences(self, sweeps: Sequence[Sweep], transforms: Transforms) -> list[Map]:
@@ -151,10 +133,10 @@ class PlaneSweep:
         inverses = [sweep.inverse(sweep.index) for sweep in sweeps]
         agrees = [np.zeros(inverse.shape, bool) for inverse in inverses]
         for i, j in permutations(range(len(sweeps)), 2):
-            there, back = transforms[i, j], transforms[j, i]
-            agrees[i] |= agreement(inverses[i], inverses[j], there, back, self.confidence)
+            j_from_i, i_from_j = transforms[i, j], transforms[j, i]
+            agrees[i] |= consistent(inverses[i], inverses[j], j_from_i, i_from_j)
         return [
-            confidence_of(sweep.index, sweep.margin, agree, self.confidence)
+            confidence_of(sweep.index, sweep.margin, agree)
             for sweep, agree in zip(sweeps, agrees, strict=True)
         ]
 
@@ -176,39 +158,22 @@ class PlaneSweep:
             for i, inverse in enumerate(sure)
             if i != number
         ]
-        occluded = (confidence == 0) & hidden_from_others(
-            sweep.inverse(background), neighbours, self.confidence.max_return_error
-        )
-        weight = np.where(occluded, np.float32(self.confidence.of_background), confidence)
+        occluded = (confidence == 0) & hidden_from_others(sweep.inverse(background), neighbours)
+        weight = np.where(occluded, BACKGROUND_WEIGHT, confidence)
         return np.where(occluded, background, sweep.index), weight
 
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
         """A disc for every pixel of `view`."""
-        opacity = torch.full_like(depth.depth, self.discs.opacity)
-        return discs(view, depth.depth, normals_of(depth.depth, view), opacity, self.discs)
+        return discs(view, depth.depth, normals_of(depth.depth, view), self.disc_sigma)
 
 
-def transforms_among(frames: Sequence[Frame], config: EpipolarConfig) -> Transforms:
+def transforms_among(images: Sequence[StereoImage]) -> Transforms:
     """From every view to every other, through poses that agree with the matched features."""
-    features = [features_of(frame) for frame in frames]
+    features = [features_of(image) for image in images]
     transforms = {}
-    for i, j in combinations(range(len(frames)), 2):
+    for i, j in combinations(range(len(images)), 2):
         pixels, matched = matches(features[i], features[j])
-        turned = turned_to_matches(frames[i], frames[j], pixels, matched, config)
-        transforms[i, j] = transform_between(frames[i], turned)
-        transforms[j, i] = transform_between(turned, frames[i])
+        rotated = rotated_to_matches(images[i], images[j], pixels, matched)
+        transforms[i, j] = source_from_reference(images[i], rotated)
+        transforms[j, i] = source_from_reference(rotated, images[i])
     return transforms
-
-
-def depth_range(views: Sequence[View]) -> tuple[float, float]:
-    """Near and far z-depth of `views`: as their cameras know it, else estimated."""
-    near, far = views[0].camera.near, views[0].camera.far
-    if near is None or far is None:
-        low, high = estimate_depth_range(views)
-        near, far = near if near is not None else low, far if far is not None else high
-    if not 0 < near < far:
-        raise InputError(
-            f"The depth range {near:g} to {far:g} is empty; near must be positive and less "
-            "than far."
-        )
-    return near, far

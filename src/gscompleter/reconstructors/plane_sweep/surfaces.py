@@ -8,8 +8,6 @@ the frame or on a blank wall, the planes around go on; they end at the edges of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import torch
@@ -24,31 +22,25 @@ AnyMap = Float32[np.ndarray, "_ _"]
 Level = tuple[AnyMap, AnyMap, AnyMap, Float32[np.ndarray, "_ _ 3"]]
 """Where to begin, measurements, their weights, and the image, all of one size."""
 
-
-@dataclass(frozen=True)
-class SurfaceConfig:
-    """Heights are inverse depths, in steps between the planes of the sweep."""
-
-    step_penalty: float = 3.0
-    """Cost of a step by one plane where the image is even; a measurement that counts in full costs
-    1 per plane that is missed."""
-    bend_penalty: float = 12.0
-    """Cost of a change of slope by one plane per pixel."""
-    edge_contrast: float = 0.1
-    """Difference of colour at which a step costs 1/e of that."""
-    least_penalty: float = 0.02
-    """Cost of a step at the strongest edge, relative to one where the image is even."""
-    tolerance: float = 0.15
-    """Planes by which a measurement may be off as a matter of course."""
-    levels: int = 5
-    """Levels of the pyramid, each of half the size; planes travel far on the coarse ones."""
-    iterations: int = 250
-    """Steps on each level."""
+# Heights are inverse depths, in steps between the planes of the sweep.
+STEP_PENALTY = 3.0
+"""Cost of a step by one plane where the image is even; a measurement that counts in full costs 1
+per plane that is missed."""
+BEND_PENALTY = 12.0
+"""Cost of a change of slope by one plane per pixel."""
+EDGE_CONTRAST = 0.1
+"""Difference of colour at which a step costs 1/e of that."""
+LEAST_PENALTY = 0.02
+"""Cost of a step at the strongest edge, relative to one where the image is even."""
+TOLERANCE = 0.15
+"""Planes by which a measurement may be off as a matter of course."""
+LEVELS = 5
+"""Levels of the pyramid, each of half the size; planes travel far on the coarse ones."""
+ITERATIONS = 250
+"""Steps on each level."""
 
 
-def fit_surfaces(
-    measured: Map, confidence: Map, image: Image, config: SurfaceConfig = SurfaceConfig()
-) -> Map:
+def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
     """Heights [h, w] that follow `measured` as far as `confidence` [h, w] in [0, 1] goes.
 
     Where nothing at all is measured, the result is `measured`.
@@ -58,7 +50,7 @@ def fit_surfaces(
         return measured
     start = fill_smoothly(torch.from_numpy(measured), torch.from_numpy(known)).numpy()
     levels: list[Level] = [(start, measured, confidence, image)]
-    while len(levels) < config.levels and min(levels[-1][0].shape) > 4:
+    while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
         levels.append(halved(*levels[-1]))
     heights = levels[-1][0].copy()
     slopes = np.zeros((2, *heights.shape), np.float32)
@@ -68,7 +60,7 @@ def fit_surfaces(
             slopes = np.stack([doubled(slope, start.shape) / 2 for slope in slopes])
         # A coarse pixel holds 4 ** number fine ones; its steps are 2 ** number times as high.
         scale = 2.0**number
-        across, down = step_costs(colours, config)
+        across, down = step_costs(colours)
         variation.fit(
             heights,
             slopes,
@@ -76,19 +68,19 @@ def fit_surfaces(
             weight,
             across / np.float32(scale),
             down / np.float32(scale),
-            np.float32(config.bend_penalty / scale**2),
-            np.float32(config.tolerance),
-            config.iterations,
+            np.float32(BEND_PENALTY / scale**2),
+            np.float32(TOLERANCE),
+            ITERATIONS,
         )
     return heights
 
 
-def step_costs(image: Image, config: SurfaceConfig) -> tuple[Map, Map]:
+def step_costs(image: Image) -> tuple[Map, Map]:
     """What a step to the right neighbour costs, and to the one below: less at an edge."""
 
     def cost(contrast: Map) -> Map:
-        share = np.maximum(np.exp(-contrast / config.edge_contrast), config.least_penalty)
-        return (config.step_penalty * share).astype(np.float32)
+        share = np.maximum(np.exp(-contrast / EDGE_CONTRAST), LEAST_PENALTY)
+        return (STEP_PENALTY * share).astype(np.float32)
 
     across = np.abs(np.diff(image, axis=1, append=image[:, -1:])).max(axis=-1)
     down = np.abs(np.diff(image, axis=0, append=image[-1:])).max(axis=-1)

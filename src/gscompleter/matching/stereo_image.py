@@ -11,12 +11,9 @@ from jaxtyping import Float
 from gscompleter.errors import InputError
 from gscompleter.types import View
 
-Image = Float[np.ndarray, "h w 3"]
-Map = Float[np.ndarray, "h w"]
-
 
 @dataclass(frozen=True)
-class Frame:
+class StereoImage:
     """An image and its camera; lengths are in units of the widest baseline."""
 
     image: Float[np.ndarray, "h w 3"]
@@ -31,11 +28,11 @@ class Frame:
         return self.image.shape[0], self.image.shape[1]
 
 
-def frames_of(views: Sequence[View]) -> tuple[list[Frame], float]:
+def stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]:
     """`views` in units of their widest baseline, and that unit in scene units.
 
     Offsets are rounded to 2^-16 of the baseline, which no image can tell apart, so that a scene
-    whose float32 poses were multiplied by any factor gives the very same frames.
+    whose float32 poses were multiplied by any factor gives the very same values.
 
     Raises:
         InputError: with fewer than two views, or where all of them stand in one place.
@@ -52,12 +49,12 @@ def frames_of(views: Sequence[View]) -> tuple[list[Frame], float]:
             "them; give photographs taken from different positions."
         )
     offsets = np.round((centers - centers[0]) / unit * 2**16) / 2**16
-    return [_frame(view, offset) for view, offset in zip(views, offsets, strict=True)], unit
+    return [_stereo_image(view, offset) for view, offset in zip(views, offsets, strict=True)], unit
 
 
-def _frame(view: View, center: Float[np.ndarray, "3"]) -> Frame:
+def _stereo_image(view: View, center: Float[np.ndarray, "3"]) -> StereoImage:
     camera = view.camera
-    return Frame(
+    return StereoImage(
         np.ascontiguousarray(view.image.detach().cpu().float().numpy()),
         camera.K.detach().cpu().double().numpy(),
         camera.c2w[:3, :3].detach().cpu().double().numpy(),
@@ -65,12 +62,12 @@ def _frame(view: View, center: Float[np.ndarray, "3"]) -> Frame:
     )
 
 
-def transform_between(reference: Frame, source: Frame) -> Float[np.ndarray, "3 4"]:
+def source_from_reference(reference: StereoImage, source: StereoImage) -> Float[np.ndarray, "3 4"]:
     """[A | b]: a pixel (x, y, 1) of `reference` at inverse depth w lies at A (x, y, 1) + b w.
 
     The result is a homogeneous pixel of `source`; its third entry is the ratio of the z-depths.
     """
-    source_from_reference = source.rotation.T @ reference.rotation
-    homography = source.K @ source_from_reference @ np.linalg.inv(reference.K)
+    rotation = source.rotation.T @ reference.rotation
+    homography = source.K @ rotation @ np.linalg.inv(reference.K)
     shift = source.K @ source.rotation.T @ (reference.center - source.center)
     return np.concatenate([homography, shift[:, None]], axis=1).astype(np.float32)
