@@ -23,14 +23,13 @@ from gscompleter.runs.protocols import (
     Extrapolation,
     Split,
     StressTest,
-    cases_of,
     index_of,
     n_k_index,
-    neighbours,
     parse_protocol,
     read_evaluation_index,
     write_evaluation_index,
 )
+from gscompleter.runs.tasks import neighbours, tasks_of
 from gscompleter.types import View
 
 
@@ -547,13 +546,14 @@ def test_neighbours_exist_and_are_not_context():
 
 def test_a_case_has_one_target_and_loads_its_views():
     index = EvaluationIndex("x", {"a": (Split((0, 2), (3, 4)),)})
-    first, second = cases_of(index, Frames("a", 5))
-    assert (first.scene, first.name, first.target, first.neighbours) == ("a", "a 0+2>3", 3, (4,))
-    assert (second.target, second.neighbours) == (4, (3,))
+    first, second = tasks_of(index, Frames("a", 5))
+    assert (first.scene, first.name, first.targets) == ("a", "a 0+2>3", (3,))
+    assert (first.neighbours, second.neighbours) == ((4,), (3,))
+    assert second.targets == (4,)
     assert first.load(first.context) == [VIEWS[0], VIEWS[2]]
-    assert cases_of(index, Frames("b", 5)) == []
+    assert tasks_of(index, Frames("b", 5)) == []
     with pytest.raises(InputError, match="The protocol x asks for frame 4 of a, which has 4"):
-        cases_of(index, Frames("a", 4))
+        tasks_of(index, Frames("a", 4))
 
 
 def test_an_index_is_read_back_as_it_was_written(tmp_path):
@@ -611,9 +611,9 @@ def test_an_evaluation_index_that_is_missing_is_named(tmp_path):
 
 def test_cases_of_a_chunk_load_photographs_at_a_resolution(tmp_path):
     (clip,) = open_chunks(save_chunk(tmp_path / "000000.torch", example()))
-    there, back = cases_of(parse_protocol("n-2"), clip, (32, 32))
+    there, back = tasks_of(parse_protocol("n-2"), clip, (32, 32))
     assert (there.name, back.name) == ("room 0+2>4", "room 4+2>0")
-    (target,) = back.load([back.target])
+    (target,) = back.load(back.targets)
     assert target.image.shape == (32, 32, 3)
 
 
@@ -658,5 +658,5 @@ def test_the_scenes_of_the_development_cases_are_clips(shared):
     clip = next(clip for clip in clips if clip.name == "re10k_0d4de33c")
     assert len(clip) == len(scene_clip(shared / "data" / "re10k_0d4de33c"))
     assert clip.reason_to_skip() is None
-    (case, *_) = cases_of(parse_protocol("n-4"), clip, (64, 64))
+    (case, *_) = tasks_of(parse_protocol("n-4"), clip, (64, 64))
     assert [view.frame for view in case.load(case.context)] == [0, 4]
