@@ -9,7 +9,7 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH_INDEX := $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url $(TORCH_CPU_INDEX))
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow lint format types evaluate bench clean
+.PHONY: demo test test-slow lint format types evaluate bench gpu clean
 
 demo: $(VENV)/installed
 	$(BIN)/gscompleter demo --out demo --overwrite
@@ -44,6 +44,24 @@ bench: $(VENV)/installed-test
 		$(BIN)/python $$script || exit 1; done
 	$(BIN)/python benchmarks/bench_inpaint.py $(CASES)
 
+# What needs a GPU, within nine minutes, into docs/gpu.md and docs/gpu.json. The venv takes the torch
+# of the machine where that sees the GPU, for it is large. gsplat compiles with the venv's ninja.
+GPU_VENV ?= .venv-gpu
+GPU_SECONDS ?= 530
+gpu:
+	@nvidia-smi -L 2>/dev/null | grep -q '^GPU' || { \
+		echo 'make gpu needs an NVIDIA GPU, and nvidia-smi finds none on this machine.' >&2; exit 2; }
+	@start=$$(date +%s) && timeout $(GPU_SECONDS) $(MAKE) --no-print-directory $(GPU_VENV)/installed && \
+		PYTHONPATH=src:tests PATH="$(CURDIR)/$(GPU_VENV)/bin:$$PATH" $(GPU_VENV)/bin/python benchmarks/gpu.py \
+		--seconds $$(($(GPU_SECONDS) + start - $$(date +%s)))
+
+$(GPU_VENV)/installed: pyproject.toml
+	if $(PYTHON) -c 'import sys, torch; sys.exit(not torch.cuda.is_available())' 2>/dev/null; \
+		then $(PYTHON) -m venv --system-site-packages $(GPU_VENV); \
+		else $(PYTHON) -m venv $(GPU_VENV) && $(GPU_VENV)/bin/python -m pip install --quiet $(TORCH); fi
+	$(GPU_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -e '.[cuda,test]'
+	touch $@
+
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "gscompleter needs Python 3.10 or newer: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
@@ -69,4 +87,4 @@ $(VENV)/installed-dev: pyproject.toml | $(VENV)/torch
 	touch $@ $(VENV)/installed $(VENV)/installed-test
 
 clean:
-	rm -rf $(VENV) demo results build dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(GPU_VENV) demo results build dist .pytest_cache .mypy_cache .ruff_cache

@@ -8,8 +8,6 @@ own, so that its peak of memory is its own: the process, torch and the weights i
 
 from __future__ import annotations
 
-import statistics
-import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -21,6 +19,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from bench_render import median_seconds
 from gscompleter.commands.demo import write_motorcycle_scene
 from gscompleter.data.scene import load_views
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
@@ -41,7 +40,6 @@ MODELS = (
 
 @dataclass(frozen=True)
 class Measured:
-    parameters: int
     seconds: float
     """Median of the repetitions."""
     peak_bytes: int | None
@@ -54,7 +52,9 @@ def photographs(size: int) -> list[View]:
         return load_views(folder, resolution=(size, size), near=1.0, far=20.0)
 
 
-def model(name: str) -> tuple[Reconstructor, int]:
+def model(
+    name: str, device: str = "cpu", dtype: torch.dtype = torch.float32
+) -> tuple[Reconstructor, int]:
     """The reconstructor, with random weights if it has any, and how many."""
     if name not in PUBLISHED:
         return load_reconstructor(name), 0
@@ -62,22 +62,21 @@ def model(name: str) -> tuple[Reconstructor, int]:
     from gscompleter.reconstructors.feed_forward.build import network_of
 
     torch.manual_seed(0)
-    network = network_of(PUBLISHED[name]).eval().requires_grad_(False)
-    return FeedForward(network), sum(p.numel() for p in network.parameters())
+    network = network_of(PUBLISHED[name]).eval().requires_grad_(False).to(device)
+    return FeedForward(network, dtype), sum(p.numel() for p in network.parameters())
 
 
-def measure(name: str, size: int, repetitions: int) -> Measured:
+def repeated(reconstruct: Reconstructor, views: list[View], repetitions: int) -> Measured:
     """Run it once to warm up, then a few times with a clock."""
-    views = photographs(size)
+    with peak_memory(views[0].image.device) as peak:
+        seconds = median_seconds(lambda: reconstruct(views), repetitions)
+    return Measured(seconds, peak.bytes)
+
+
+def measure(name: str, size: int, repetitions: int) -> tuple[int, Measured]:
+    """Parameters of a model, and what it takes on a CPU."""
     reconstruct, parameters = model(name)
-    seconds = []
-    with peak_memory() as peak:
-        reconstruct(views)
-        for _ in range(repetitions):
-            start = time.perf_counter()
-            reconstruct(views)
-            seconds.append(time.perf_counter() - start)
-    return Measured(parameters, statistics.median(seconds), peak.bytes)
+    return parameters, repeated(reconstruct, photographs(size), repetitions)
 
 
 def main(size: int = 256, repetitions: int = 3, only: tuple[str, ...] = MODELS) -> None:
@@ -92,12 +91,12 @@ def main(size: int = 256, repetitions: int = 3, only: tuple[str, ...] = MODELS) 
     first = None
     for name in only:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            found = pool.submit(measure, name, size, repetitions).result()
+            parameters, found = pool.submit(measure, name, size, repetitions).result()
         first = first or found
         peak, base = found.peak_bytes or float("nan"), first.peak_bytes or float("nan")
         table.add_row(
             name,
-            f"{found.parameters / 1e6:.1f} M",
+            f"{parameters / 1e6:.1f} M",
             f"{found.seconds:.2f}",
             f"{found.seconds / first.seconds:.1f}",
             f"{peak / 2**30:.2f}",

@@ -11,7 +11,6 @@ table says so. Needs `pip install 'gscompleter[diffusion]'`.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -21,6 +20,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from bench_render import now
 from gscompleter.generators.diffusion.kontext import nearest_size
 from gscompleter.generators.diffusion.placing import precision_on
 from gscompleter.generators.diffusion.position_ids import target_ids
@@ -103,18 +103,10 @@ def call(model: Any, options: Options, numbers: int) -> Callable[[], None]:
     return once
 
 
-def now(device: str) -> float:
-    """Seconds, once the GPU has done all that it was told."""
-    if device == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter()
-
-
 class Stopwatch:
     """Seconds that some blocks of a network take."""
 
-    def __init__(self, blocks: Iterable[torch.nn.Module], device: str) -> None:
-        self.device = device
+    def __init__(self, blocks: Iterable[torch.nn.Module]) -> None:
         self.seconds = 0.0
         self.hooks = []
         for block in blocks:
@@ -122,10 +114,10 @@ class Stopwatch:
             self.hooks.append(block.register_forward_hook(self.stop))
 
     def start(self, *_: Any) -> None:
-        self.seconds -= now(self.device)
+        self.seconds -= now()
 
     def stop(self, *_: Any) -> None:
-        self.seconds += now(self.device)
+        self.seconds += now()
 
     def remove(self) -> None:
         for hook in self.hooks:
@@ -141,10 +133,10 @@ def measured(model: Any, once: Callable[[], None], options: Options) -> Pass:
         torch.cuda.reset_peak_memory_stats()
     passes = []
     for _ in range(options.repetitions):
-        watches = [Stopwatch(blocks, options.device) for blocks in kinds] if any(missing) else []
-        start = now(options.device)
+        watches = [Stopwatch(blocks) for blocks in kinds] if any(missing) else []
+        start = now()
         once()
-        seconds = now(options.device) - start
+        seconds = now() - start
         for watch, share in zip(watches, missing, strict=False):
             watch.remove()
             seconds += share * watch.seconds

@@ -22,14 +22,22 @@ from gscompleter.geometry import widened
 from gscompleter.types import observed, sh_from_rgb
 
 
-def median_seconds(function: Callable[[], object], runs: int = 7) -> float:
-    """Median over `runs`, after one that is not counted."""
-    function()
+def now() -> float:
+    """Seconds, once a GPU has done all that it was told."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def median_seconds(function: Callable[[], object], runs: int = 7, warm: bool = True) -> float:
+    """Median over `runs`, after one that is not counted where `warm`."""
+    if warm:
+        function()
     seconds = []
     for _ in range(runs):
-        start = time.perf_counter()
+        start = now()
         function()
-        seconds.append(time.perf_counter() - start)
+        seconds.append(now() - start)
     return statistics.median(seconds)
 
 

@@ -1,6 +1,7 @@
 """Chunks in the format of pixelSplat, made of a synthetic room."""
 
 import io
+import json
 from pathlib import Path
 
 import numpy as np
@@ -52,3 +53,12 @@ def save_chunk(path: Path, *examples: object) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save(list(examples), path)
     return path
+
+
+def save_dataset(root: Path) -> Path:
+    """Three scenes in two chunks, as the test half of a data set."""
+    save_chunk(root / "test" / "000000.torch", example("a"), example("b"))
+    save_chunk(root / "test" / "000001.torch", example("c"))
+    index = {"a": "000000.torch", "b": "000000.torch", "c": "000001.torch"}
+    (root / "test" / "index.json").write_text(json.dumps(index))
+    return root

@@ -1,13 +1,17 @@
 """The renderers agree with each other and with what can be worked out by hand."""
 
-from dataclasses import replace
+import sys
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
+import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
+from gscompleter.render.cuda import CudaView
+from gscompleter.render.reference import ReferenceRenderer, ReferenceView
 from gscompleter.types import observed, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, random_gaussians, scaled, view_of
 
@@ -245,8 +249,88 @@ def test_without_a_gpu_cuda_is_refused_and_auto_is_the_cpu():
         load_renderer("cuda")
 
 
+@dataclass(frozen=True)
+class SlowDrawing(ReferenceRenderer):
+    """The reference in the place of gsplat: it tries out which Gaussians leave a trace."""
+
+    def visible(self, gaussians, camera):
+        traces = [self.render(gaussians[i : i + 1], camera).alpha for i in range(len(gaussians))]
+        return torch.tensor([bool(trace.any()) for trace in traces], dtype=torch.bool)
+
+    def plan(self, gaussians, camera):
+        return lambda opacities: self.render(replace(gaussians, opacities=opacities), camera)
+
+
+def check_frozen(view, plain, new: Gaussians, bound: float) -> None:
+    """Two frozen views draw the same, composite and plan, with the same gradients in `new`."""
+
+    def composited(frozen):
+        return lambda leaves: frozen.composite(replace(new, **leaves))
+
+    leaves = {name: getattr(new, name) for name in PARAMETERS}
+    pairs = [(composited(view), composited(plain), leaves)]
+    plans = view.plan(new), plain.plan(new)
+    for opacities in (new.opacities, 1 - new.opacities):
+        ours, theirs = ((lambda ls, p=plan: p(ls["opacities"])) for plan in plans)
+        pairs.append((ours, theirs, {"opacities": opacities}))
+    for ours, theirs, values in pairs:
+        found, expected = slopes_of(ours, values), slopes_of(theirs, values)
+        for name, truth in expected.items():
+            assert (found[name] - truth).norm() <= bound * (truth.norm() + 1e-3), name
+
+
+def slopes_of(draw, values: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Image, depth, alpha, and the gradient of a weighting of all three in each of `values`."""
+    variables = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
+    render = draw(variables)
+    weight = torch.linspace(0, 1, render.image.numel()).view_as(render.image).to(render.image)
+    covered = (render.alpha.detach() > 0.05).to(render.image)
+    loss = (render.image * weight).sum() + (render.alpha + render.depth * covered).sum()
+    gradients = torch.autograd.grad(loss, list(variables.values()))
+    drawn = {"image": render.image, "depth": render.depth * covered, "alpha": render.alpha}
+    return {**drawn, **dict(zip(variables, gradients, strict=True))}
+
+
+@pytest.mark.parametrize("name", ["harmonics", "strange-harmonics"])
+def test_a_frozen_view_that_drops_what_its_camera_does_not_see_draws_the_same(name):
+    beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
+    context, new = merge([SCENES[name], beside]), random_gaussians(40, seed=5, sh_degree=1)
+    view = CudaView(SlowDrawing(), context, CAMERA)
+    assert 0 < len(view.seen) < len(context) / 2 + 1
+    assert view.seen.sh.shape[1] == 1
+    plain = REFERENCE.freeze(context, CAMERA)
+    check_frozen(view, plain, new, 1e-5)
+    assert torch.equal(view.context.image, plain.context.image)
+
+
+def test_a_frozen_view_of_nothing_draws_what_is_new():
+    new = SCENES["random"]
+    view = CudaView(SlowDrawing(), new[:0], CAMERA)
+    assert torch.equal(view.composite(new).image, REFERENCE.render(new, CAMERA).image)
+
+
+@pytest.mark.parametrize("name", ["harmonics", "strange"])
+def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", stand_in_gsplat.module())
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    cuda = load_renderer("cuda")
+    beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
+    context, new = merge([SCENES[name], beside]), random_gaussians(40, seed=5, sh_degree=1)
+    ours, truth = cuda.render(context, CAMERA), REFERENCE.render(context, CAMERA)
+    assert outliers(ours.depth, truth.depth, 1e-5) == 0
+    assert outliers(ours.image, truth.image, 1e-5) == 0
+    view = cuda.freeze(context, CAMERA)
+    assert 0 < len(view.seen) < len(context)
+    check_frozen(view, REFERENCE.freeze(context, CAMERA), new, 1e-4)
+    assert not cuda.render(new[:0], CAMERA).image.any()
+    assert len(cuda.freeze(new[:0], CAMERA).seen) == 0
+
+
+on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU")
+
+
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU")
+@on_a_gpu
 @pytest.mark.parametrize("name", SCENES)
 def test_cuda_and_reference_draw_the_same_with_the_same_gradients(name):
     pytest.importorskip("gsplat", reason="gsplat is not installed")
@@ -258,3 +342,17 @@ def test_cuda_and_reference_draw_the_same_with_the_same_gradients(name):
     for parameter in PARAMETERS:
         difference = a[parameter].cpu() - b[parameter]
         assert difference.norm() <= 2e-2 * b[parameter].norm(), parameter
+
+
+@pytest.mark.gpu
+@on_a_gpu
+@pytest.mark.parametrize("name", SCENES)
+def test_a_frozen_view_on_a_gpu_draws_what_drawing_everything_anew_does(name):
+    pytest.importorskip("gsplat", reason="gsplat is not installed")
+    cuda, camera = load_renderer("cuda"), CAMERA.to("cuda")
+    beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
+    context = merge([SCENES[name], beside]).to("cuda")
+    new = random_gaussians(200, seed=5, sh_degree=1).to("cuda")
+    view = cuda.freeze(context, camera)
+    assert 0 < len(view.seen) < len(context) / 2 + 1
+    check_frozen(view, ReferenceView(cuda, context, camera), new, 1e-3)

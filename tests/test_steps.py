@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from command import run
 from gscompleter import InputError
 from gscompleter.baselines.reggs import RegGSConfig
+from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.io.image import read_pixels
 from gscompleter.reports.plots import plots
 from gscompleter.reports.summary import SEQUENCE, gains_by_gap
@@ -45,9 +47,11 @@ TABLES = ("tables.md", "tables.tex", "tables.json")
 
 
 @dataclass(frozen=True)
-class Walk:
+class Walk(PosedPhotographs):
     """A walk through the room, of which some frames cannot be read."""
 
+    names = ()
+    origin = np.zeros(3)
     name: str = "walk"
     num_frames: int = len(PLACES)
     broken: tuple[int, ...] = ()

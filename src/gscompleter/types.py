@@ -250,7 +250,10 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What a reconstructor Ψ makes of its views: Gaussians and a depth map per view."""
+    """What a reconstructor Ψ makes of its views: Gaussians and a depth map per view.
+
+    All of its tensors lie on the device of the views' images, the indices too.
+    """
 
     gaussians: Gaussians
     depths: tuple[DepthMap, ...]

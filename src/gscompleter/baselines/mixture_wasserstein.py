@@ -39,14 +39,14 @@ class SinkhornConfig:
 def reduced(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
     """One component per cluster with the same mean and covariance as the cluster (moments)."""
     count = int(clusters.max()) + 1
-    weight = torch.zeros(count, dtype=mixture.weights.dtype).index_add(0, clusters, mixture.weights)
+    weight = mixture.weights.new_zeros(count).index_add(0, clusters, mixture.weights)
     filled = weight > 0
     share = mixture.weights / weight[clusters]
-    means = torch.zeros(count, 3, dtype=mixture.means.dtype)
+    means = mixture.means.new_zeros(count, 3)
     means = means.index_add(0, clusters, share[:, None] * mixture.means)
     offset = mixture.means - means[clusters]
     spread = mixture.covariances + offset[:, :, None] * offset[:, None, :]
-    covariances = torch.zeros(count, 3, 3, dtype=mixture.means.dtype)
+    covariances = mixture.means.new_zeros(count, 3, 3)
     covariances = covariances.index_add(0, clusters, share[:, None, None] * spread)
     weights = weight[filled] / weight[filled].sum()
     return Mixture(means[filled], covariances[filled], weights)

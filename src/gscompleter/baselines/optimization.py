@@ -73,7 +73,7 @@ def optimize(
     random = torch.Generator().manual_seed(seed)
     extent = extent_of([view.camera for view in views])
     state = Parameters.of(scene, config, extent)
-    slopes, counts = torch.zeros(len(scene)), torch.zeros(len(scene))
+    slopes = counts = torch.zeros_like(scene.opacities)
     rounds = round_numbers(config)
     losses: list[float] = []
     order: list[int] = []
@@ -94,7 +94,7 @@ def optimize(
             crowded = slopes / counts.clamp_min(1) >= config.gradient_threshold
             dense = densified(state.gaussians(), crowded, extent, random, config)
             state = Parameters.of(dense, config, extent)
-            slopes, counts = torch.zeros(len(dense)), torch.zeros(len(dense))
+            slopes = counts = torch.zeros_like(dense.opacities)
     return Optimized(state.gaussians(detached=True), tuple(losses))
 
 
@@ -168,12 +168,12 @@ def image_slopes(
     It is taken from the slope in space across the line of sight: a pixel is z / f scene units.
     """
     if slope is None:
-        return torch.zeros(len(means)), torch.zeros(len(means))
+        return torch.zeros_like(means[:, 0]), torch.zeros_like(means[:, 0])
     with torch.no_grad():
         z = (means - camera.center) @ camera.forward
         across = slope @ camera.c2w[:3, :2]
         focal = torch.stack([camera.K[0, 0], camera.K[1, 1]])
-        halves = torch.tensor([camera.width / 2, camera.height / 2])
+        halves = focal.new_tensor([camera.width / 2, camera.height / 2])
         lengths = (across * z[:, None] / focal * halves).norm(dim=-1)
         seen = (slope != 0).any(dim=-1)
         return torch.where(seen, lengths, 0.0), seen.float()
@@ -193,7 +193,8 @@ def densified(
         kept = scene[~(crowded & large)]
         children = []
         for _ in range(2):
-            offset = parents.scales * torch.randn(len(parents), 3, generator=random)
+            normal = torch.randn(len(parents), 3, generator=random).to(parents.means.device)
+            offset = parents.scales * normal
             moved = parents.means + (rotations_from(parents.quats) @ offset[..., None])[..., 0]
             children.append(replace(parents, means=moved, scales=parents.scales / 1.6))
         dense = merge([kept, clones, *children])
@@ -204,7 +205,7 @@ def ssim_map(
     image: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "1 3 h w"]:
     """Structural similarity (Wang et al. 2004), window of 11, sigma 1.5; differentiable."""
-    offsets = torch.arange(11, dtype=image.dtype) - 5
+    offsets = torch.arange(11, dtype=image.dtype, device=image.device) - 5
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = (line / line.sum()).repeat(3, 1)
 

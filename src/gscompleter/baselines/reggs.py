@@ -102,8 +102,8 @@ def register_by_similarity(
         else own.depth.new_ones(())
     )
     scale = ratio.detach().clone().requires_grad_()
-    quaternion = torch.tensor([1.0, 0.0, 0.0, 0.0], requires_grad=True)
-    translation = torch.zeros(3, requires_grad=True)
+    quaternion = scale.detach().new_tensor([1.0, 0.0, 0.0, 0.0]).requires_grad_()
+    translation = torch.zeros(3, device=scale.device, requires_grad=True)
     optimizer = torch.optim.Adam(
         [
             {"params": [scale], "lr": config.scale_rate},
@@ -182,7 +182,7 @@ def clustered(gaussians: Gaussians, camera: Camera, components: int, seed: int) 
         return mixture
     points = mixture.means.double().cpu().numpy()
     _, labels = kmeans2(points, components, iter=10, minit="points", seed=seed)
-    return reduced(mixture, torch.from_numpy(labels.astype(np.int64)))
+    return reduced(mixture, torch.from_numpy(labels.astype(np.int64)).to(mixture.means.device))
 
 
 def scaled(mixture: Mixture, scale: Float[Tensor, ""]) -> Mixture:

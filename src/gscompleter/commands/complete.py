@@ -13,7 +13,10 @@ from rich.table import Table
 from gscompleter.commands.options import CompleteOptions, GeneratorOptions
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig, load_config
-from gscompleter.data.scene import load_camera, load_cameras, load_views, read_index
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.origin import frame_from_photographs, told_from
+from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.scene import load_cameras
 from gscompleter.errors import InputError
 from gscompleter.generators import DiffusionSettings, load_generator
 from gscompleter.io.files import check_output, output_folder
@@ -22,7 +25,7 @@ from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.completion import Target, write_report
-from gscompleter.types import Completion, View
+from gscompleter.types import Camera, Completion, View
 
 MIN_SIZE = 16
 """Shorter side of an image, in pixels, under which there is nothing to match and to score."""
@@ -51,11 +54,14 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     renderer = load_renderer(device)
     config = load_config(options.config)
     check_context(options)
-    views = [view.to(device) for view in read_views(options, options.context)]
-    targets = read_targets(options)
+    given = open_photographs(options.folder, options.format, options.near, options.far)
+    views = [view.to(device) for view in read_views(given, options.context, options)]
+    targets = read_targets(given, options)
     scene = None
     if options.scene is not None:
-        scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite).to(device)
+        cameras = [view.camera for view in views] + [target.camera for target in targets]
+        scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite)
+        scene = told_from(given.origin, scene, cameras).to(device)
 
     photographs = [
         View(target.photograph, target.camera, target.frame)
@@ -79,8 +85,9 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         with shown_on(None if options.quiet else console):
             completion = completer(views, [t.camera.to(device) for t in targets], scene)
         settings = settings_of(options, config)
+        frame = frame_from_photographs(given.origin)
         summary = write_report(
-            folder, completion, views, targets, renderer, settings, options.seed, device
+            folder, completion, views, targets, renderer, settings, options.seed, device, frame
         )
     return summary, completion
 
@@ -115,36 +122,41 @@ def check_context(options: CompleteOptions) -> None:
         raise InputError("--target names no frame; name at least one, as in --target 8.")
 
 
-def read_views(options: CompleteOptions, frames: Sequence[int]) -> list[View]:
+def read_views(
+    photographs: PosedPhotographs, frames: Sequence[int], options: CompleteOptions
+) -> list[View]:
     """The photographs of `frames` as the options want them."""
-    views = load_views(
-        options.folder, list(frames), options.resolution, near=options.near, far=options.far
-    )
-    for view in views:
-        if min(view.camera.width, view.camera.height) < MIN_SIZE:
-            raise InputError(
-                f"Frame {view.frame} is {view.camera.width} x {view.camera.height} pixels, and "
-                f"both sides must have at least {MIN_SIZE}; choose a larger --resolution."
-            )
-    return views
+    for frame in frames:
+        check_size(photographs.camera(frame, options.resolution), f"Frame {frame}")
+    return photographs.views(frames, options.resolution)
 
 
-def read_targets(options: CompleteOptions) -> list[Target]:
+def read_targets(photographs: PosedPhotographs, options: CompleteOptions) -> list[Target]:
     """The target cameras in the order of the command line, with photographs where there are any."""
-    index = read_index(options.folder)
-    resolution, near, far = options.resolution, options.near, options.far
     targets = []
     for word in options.target:
         if not is_whole_number(word):
-            cameras = load_cameras(word, resolution, near, far)
+            cameras = load_cameras(
+                word, options.resolution, options.near, options.far, photographs.origin.tolist()
+            )
             targets += [Target(camera) for camera in cameras]
-        elif index.frame(int(word)).photograph is not None:
-            (view,) = read_views(options, [int(word)])
+        elif photographs.has_photograph(int(word)):
+            (view,) = read_views(photographs, [int(word)], options)
             targets.append(Target(view.camera, view.frame, view.image))
         else:
-            camera = load_camera(options.folder, int(word), resolution, near, far)
-            targets.append(Target(camera, int(word)))
+            targets.append(Target(photographs.camera(int(word), options.resolution), int(word)))
+    for number, target in enumerate(targets, start=1):
+        check_size(target.camera, f"Target {number}")
     return targets
+
+
+def check_size(camera: Camera, name: str) -> None:
+    """Refuse images in which there is nothing to match and to score."""
+    if min(camera.width, camera.height) < MIN_SIZE:
+        raise InputError(
+            f"{name} is {camera.width} x {camera.height} pixels, and both sides must have at least "
+            f"{MIN_SIZE}; choose a larger --resolution."
+        )
 
 
 def is_whole_number(word: str) -> bool:
@@ -155,6 +167,7 @@ def settings_of(options: CompleteOptions, config: CompleterConfig) -> dict[str, 
     """Everything that decided the result, for `summary.json`."""
     return {
         "folder": str(options.folder),
+        "format": options.format,
         "context": list(options.context),
         "target": list(options.target),
         "scene": None if options.scene is None else str(options.scene),
@@ -190,6 +203,14 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
     console.print(table)
     for note in notes:
         console.print(note, highlight=False)
+    offset = [-row[3] for row in summary["frame"]["transform"][:3]]
+    if any(offset):
+        console.print(
+            f"The coordinates are large against the baselines, so the result is relative to "
+            f"{' '.join(map(str, offset))}; summary.json has the transform.",
+            highlight=False,
+            soft_wrap=True,
+        )
     counts = summary["gaussians"]
     seconds = summary["seconds"]["total"]
     console.print(

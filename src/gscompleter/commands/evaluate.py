@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,10 +16,9 @@ from rich.table import Table
 from gscompleter.commands.complete import generator_settings
 from gscompleter.commands.options import EvaluateOptions, IndexOptions, TablesOptions
 from gscompleter.data.cases import read_cases
-from gscompleter.data.clips import Skipped, usable
-from gscompleter.data.folders import open_clips
+from gscompleter.data.datasets import Skipped, open_clips, usable
 from gscompleter.data.framing import check_resolution
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.progress import shown_on
 from gscompleter.render import choose_device
 from gscompleter.reports.plots import PlotsNotAvailable, plots
@@ -185,10 +185,12 @@ def cases_file(path: Path) -> Path:
     Raises:
         InputError: where it is and holds none.
     """
-    file = path / "cases.json" if path.is_dir() else path
-    if not file.exists() and not path.exists():
-        raise InputError(f"There is no {path}; name a cases.json, or scenes with --protocol.")
-    if file.suffix != ".json" or not file.exists() or file.name in ("transforms.json",):
+    if not os.path.exists(path):
+        raise InputError(
+            f"There is no '{quoted(path)}'; name a cases.json, or scenes with --protocol."
+        )
+    file = path / "cases.json" if os.path.isdir(path) else path
+    if file.suffix != ".json" or not os.path.isfile(file) or file.name == "transforms.json":
         raise InputError(
             f"{path} says not which frames are given and which are the target; add --protocol, as "
             "in --protocol n-10."
@@ -206,7 +208,9 @@ def parse_shard(text: str | None) -> tuple[int, int]:
         return 0, 1
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if match is None:
-        raise InputError(f"--shard is {text!r}; give it as i/n, as in 0/4 for the first of four.")
+        raise InputError(
+            f"--shard is '{quoted(text)}'; give it as i/n, as in 0/4 for the first of four."
+        )
     return int(match[1]), int(match[2])
 
 

@@ -46,7 +46,8 @@ class CompleteOptions:
     """Fill what the photographs never saw, as seen from the targets, and write the scene."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Folder of posed photographs with a nerfstudio transforms.json."""
+    """Posed photographs: a folder with a nerfstudio transforms.json, a chunk of pixelSplat with
+    one scene in it, or a camera file of RealEstate10K beside its frames."""
     context: tuple[int, ...]
     """Numbers of the frames to start from, in the order of the sorted file paths."""
     target: tuple[str, ...]
@@ -54,6 +55,9 @@ class CompleteOptions:
     completed one after the other into one scene."""
     out: Path
     """Folder for completed.ply, context.ply, images/ and summary.json."""
+    format: str | None = None
+    """What SCENE is: transforms, chunks or real-estate-10k. Found by what lies there if not
+    given."""
     scene: Path | None = None
     """A .ply of Gaussians to complete, in the frame of the photographs. It is kept as it is.
     Without it the context is reconstructed from the photographs."""

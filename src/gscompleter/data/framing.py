@@ -9,7 +9,8 @@ from jaxtyping import Shaped
 from PIL import Image
 
 from gscompleter.data.lens import Pinhole
-from gscompleter.errors import InputError
+from gscompleter.data.limits import MAX_SIDE
+from gscompleter.errors import InputError, quoted
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,22 @@ class Framing:
 
 
 def covering(width: int, height: int, resolution: tuple[int, int] | None) -> Framing:
-    """How an image is resized to cover `resolution` (height, width) and cropped in its centre."""
+    """How an image is resized to cover `resolution` (height, width) and cropped in its centre.
+
+    Raises:
+        InputError: where the resolution is impossible, or a strip would become too long.
+    """
+    check_resolution(resolution)
     if resolution is None:
         return Framing((width, height), (0, 0), (width, height))
     scale = max(resolution[0] / height, resolution[1] / width)
     new_width = max(round(width * scale), resolution[1])
     new_height = max(round(height * scale), resolution[0])
+    if max(new_width, new_height) > MAX_SIDE:
+        raise InputError(
+            f"An image of {width} × {height} pixels that covers {resolution[1]} × {resolution[0]} "
+            f"has a side above {MAX_SIDE}; choose a smaller resolution, or crop the image."
+        )
     corner = (new_width - resolution[1]) // 2, (new_height - resolution[0]) // 2
     return Framing((new_width, new_height), corner, (resolution[1], resolution[0]))
 
@@ -55,9 +66,9 @@ def resize(
 
 
 def check_resolution(resolution: tuple[int, int] | None) -> None:
-    """Raise an InputError where a height or width is not positive."""
-    if resolution is not None and min(resolution) <= 0:
+    """Raise an InputError where a height or width is not within 1 to `MAX_SIDE`."""
+    if resolution is not None and not all(1 <= side <= MAX_SIDE for side in resolution):
         raise InputError(
-            f"The resolution {resolution[0]} × {resolution[1]} is impossible; height and width "
-            "have to be positive."
+            f"The resolution {' × '.join(map(quoted, resolution))} is impossible; height and "
+            f"width have to be positive, and at most {MAX_SIDE}."
         )

@@ -7,6 +7,7 @@ Pixels are ours throughout: the centre of the top-left one is (0.5, 0.5). OpenCV
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -90,6 +91,7 @@ def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[
     )
 
 
+@lru_cache(maxsize=16)
 def undistorted(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
     """The pinhole camera of the undistorted photograph, of the same size.
 
@@ -111,10 +113,14 @@ def undistorted(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
     return None if zoom is None else pinhole.zoomed(zoom)
 
 
+@lru_cache(maxsize=1)
 def undistortion_map(
     pinhole: Pinhole, distortion: Distortion, new: Pinhole
 ) -> Float[np.ndarray, "h w 2"]:
-    """For each pixel of the undistorted image, where the photograph shows it, for `remap`."""
+    """For each pixel of the undistorted image, where the photograph shows it, for `remap`.
+
+    The last one stays in memory, for the frames of one lens.
+    """
     x, y = np.meshgrid(np.arange(new.width) + 0.5, np.arange(new.height) + 0.5)
     pixels = _pixels(pinhole, distort(_plane_points(new, x, y), distortion))
     return (pixels - 0.5).astype(np.float32)

@@ -1,41 +1,20 @@
-"""Posed photographs and cameras, in nerfstudio's `transforms.json` layout."""
+"""Views and cameras of one scene, and cameras in nerfstudio's `transforms.json` layout."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
-import torch
-from jaxtyping import Float
-from PIL import Image
 
-from gscompleter.data.framing import check_resolution, covering, resize
-from gscompleter.data.lens import Distortion, Pinhole, remap, undistorted, undistortion_map
-from gscompleter.data.transforms import (
-    OPENCV_FROM_OPENGL,
-    Frame,
-    SceneIndex,
-    as_tensor,
-    read_frames,
-    read_index,
-)
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.limits import check_planes
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.transforms import OPENCV_FROM_OPENGL, read_frames
 from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
-from gscompleter.io.image import as_image, read_depth, read_pixels
 from gscompleter.types import Camera, View
-
-__all__ = [
-    "SceneIndex",
-    "load_camera",
-    "load_cameras",
-    "load_views",
-    "read_index",
-    "write_cameras",
-]
 
 
 def load_views(
@@ -47,11 +26,13 @@ def load_views(
 ) -> list[View]:
     """The photographs of a scene with their cameras, and with true depth where it is there.
 
-    Lens distortion is removed: the undistorted image has the size of the photograph and no
-    empty pixel, and the intrinsics follow (`lens.undistorted` says how).
+    Lens distortion is removed, as `PosedPhotographs.views` says. Where coordinates are
+    so large that float32 would lose the baselines, cameras are told from a local origin,
+    `open_photographs(scene).origin`.
 
     Args:
-        scene: A folder with nerfstudio's `transforms.json`, or the path of that file.
+        scene: A folder with nerfstudio's `transforms.json`, the path of that file, or what
+            else `open_photographs` opens.
         frames: Numbers of the frames, which are numbered in the order of their sorted
             `file_path`; all frames if left out. Only these are read.
         resolution: Height and width in pixels: images are resized to cover it, then their
@@ -62,15 +43,8 @@ def load_views(
     Raises:
         InputError: where the scene, one of the frames or an image is missing or impossible.
     """
-    _check_arguments(resolution, near, far)
-    index = read_index(scene)
-    numbers = range(len(index)) if frames is None else frames
-    chosen = [index.frame(number) for number in numbers]
-    maps: dict[tuple[Pinhole, Distortion], Float[np.ndarray, "h w 2"]] = {}
-    return [
-        _load_view(frame, number, resolution, near, far, maps)
-        for number, frame in zip(numbers, chosen, strict=True)
-    ]
+    photographs = open_photographs(scene, near=near, far=far)
+    return photographs.views(range(len(photographs)) if frames is None else frames, resolution)
 
 
 def load_camera(
@@ -85,7 +59,7 @@ def load_camera(
     Its photograph need not exist where `w` and `h` say how large it is.
 
     Args:
-        scene: A folder with a `transforms.json`, or the path of a JSON file of that form.
+        scene: As in `load_views`.
         frame: Number of the frame; may be left out where there is one only.
         resolution: Height and width in pixels, as in `load_views`.
         near: Smallest z-depth of the scene, in scene units, where known.
@@ -95,13 +69,13 @@ def load_camera(
         InputError: where the scene or the frame is missing or impossible, and where there are
             several frames and none is chosen.
     """
-    _check_arguments(resolution, near, far)
-    index = read_index(scene)
-    if frame is None and len(index) > 1:
+    photographs = open_photographs(scene, near=near, far=far)
+    if frame is None and len(photographs) > 1:
         raise InputError(
-            f"{index.path} has {len(index)} frames; choose one, from 0 to {len(index) - 1}."
+            f"{photographs.title} has {len(photographs)} frames; choose one, from 0 to "
+            f"{len(photographs) - 1}."
         )
-    return _camera(index.frame(frame or 0), resolution, near, far)
+    return photographs.camera(frame or 0, resolution)
 
 
 def load_cameras(
@@ -109,6 +83,7 @@ def load_cameras(
     resolution: tuple[int, int] | None = None,
     near: float | None = None,
     far: float | None = None,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Camera]:
     """All cameras of a JSON file of the form of `transforms.json`, in its order.
 
@@ -119,12 +94,16 @@ def load_cameras(
         resolution: Height and width in pixels, as in `load_views`.
         near: Smallest z-depth of the scene, in scene units, where known.
         far: Largest z-depth of the scene, in scene units, where known.
+        origin: Where the coordinates of the scene are counted from, which is
+            `open_photographs(scene).origin`, in scene units.
 
     Raises:
         InputError: where the file or one of its cameras is missing or impossible.
     """
-    _check_arguments(resolution, near, far)
-    return [_camera(frame, resolution, near, far) for frame in read_frames(path)]
+    check_planes(near, far)
+    zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_frames(Path(path)))
+    cameras = Photographs(Path(path).stem, str(path), frames, zero, near, far)
+    return [cameras.camera(number, resolution) for number in range(len(cameras))]
 
 
 def write_cameras(
@@ -166,76 +145,3 @@ def _entry(camera: Camera) -> dict[str, object]:
         "h": camera.height,
         "transform_matrix": c2w.tolist(),
     }
-
-
-def _camera(
-    frame: Frame, resolution: tuple[int, int] | None, near: float | None, far: float | None
-) -> Camera:
-    width, height = frame.size()
-    pinhole = _undistorted(frame, frame.intrinsics.at(width, height))
-    final = covering(width, height, resolution).camera(pinhole)
-    return Camera(as_tensor(frame.c2w), final.K, final.width, final.height, near, far)
-
-
-def _undistorted(frame: Frame, pinhole: Pinhole) -> Pinhole:
-    new = undistorted(pinhole, frame.intrinsics.distortion)
-    if new is None:
-        raise InputError(
-            f"The distortion coefficients of {frame.name} fold the image over itself; correct "
-            "them, or undistort the images first."
-        )
-    return new
-
-
-def _load_view(
-    frame: Frame,
-    number: int,
-    resolution: tuple[int, int] | None,
-    near: float | None,
-    far: float | None,
-    maps: dict[tuple[Pinhole, Distortion], Float[np.ndarray, "h w 2"]],
-) -> View:
-    """Read one frame; `maps` keeps the undistortion that frames of one lens share."""
-    photograph = frame.photograph
-    if photograph is None:
-        raise InputError(
-            f"The image of {frame.name} is missing; restore it, or choose another frame."
-        )
-    pixels = read_pixels(photograph)
-    height, width = pixels.shape[:2]
-    depth = None if frame.depth_path is None else read_depth(frame.depth_path, frame.depth_unit)
-    if depth is not None:
-        depth = resize(depth, (width, height), Image.Resampling.NEAREST)
-
-    distortion = frame.intrinsics.distortion
-    if distortion:
-        lens = frame.intrinsics.at(width, height), distortion
-        if lens not in maps:
-            maps[lens] = undistortion_map(*lens, _undistorted(frame, lens[0]))
-        pixels = remap(pixels, maps[lens], cv2.INTER_CUBIC)
-        depth = None if depth is None else remap(depth, maps[lens], cv2.INTER_NEAREST)
-
-    framing = covering(width, height, resolution)
-    image = as_image(framing.image(pixels, Image.Resampling.LANCZOS))
-    if depth is not None:
-        depth = framing.image(depth, Image.Resampling.NEAREST)
-    return View(
-        image,
-        _camera(frame, resolution, near, far),
-        number,
-        None if depth is None else torch.from_numpy(depth),
-    )
-
-
-def _check_arguments(
-    resolution: tuple[int, int] | None, near: float | None, far: float | None
-) -> None:
-    check_resolution(resolution)
-    for name, value in (("near", near), ("far", far)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise InputError(
-                f"The {name} plane at {value} is impossible; give a positive z-depth in scene "
-                "units."
-            )
-    if near is not None and far is not None and near >= far:
-        raise InputError(f"The near plane at {near} is not before the far plane at {far}.")

@@ -5,10 +5,13 @@ A reconstructor is anything callable with views. The table of names serves the c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
+
+from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.types import Reconstruction, View
@@ -20,10 +23,39 @@ class Reconstructor(Protocol):
     """Ψ of the paper.
 
     The views' cameras carry `near` and `far` in scene units when `GSCompleter` calls it. The
-    Gaussians it returns lie in the world frame of the cameras and have its unit.
+    Gaussians it returns lie in the world frame of the cameras and have its unit. All tensors it
+    returns lie on the device of the views' images.
     """
 
     def __call__(self, views: Sequence[View]) -> Reconstruction: ...
+
+
+def reconstructed(reconstructor: Reconstructor, views: Sequence[View]) -> Reconstruction:
+    """What Ψ makes of `views`, once all of it is seen to lie on the device of their images.
+
+    Raises:
+        ValueError: where a tensor lies elsewhere; the sentence names it.
+    """
+    found, device = reconstructor(views), views[0].image.device
+    for name, tensor in tensors_in(found, "the reconstruction"):
+        if tensor.device != device:
+            raise ValueError(
+                f"the reconstructor returned {name} on {tensor.device}, and its views lie on "
+                f"{device}; it must return all tensors on the device of the views' images"
+            )
+    return found
+
+
+def tensors_in(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
+    """All tensors that a frozen value holds, each with the expression that leads to it."""
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, tuple):
+        for i, item in enumerate(value):
+            yield from tensors_in(item, f"{name}[{i}]")
+    elif is_dataclass(value):
+        for field in fields(value):
+            yield from tensors_in(getattr(value, field.name), f"{name}.{field.name}")
 
 
 def _plane_sweep(weights: Path | None, device: str) -> Reconstructor:

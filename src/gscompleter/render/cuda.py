@@ -1,22 +1,36 @@
 """Draws on a GPU through gsplat >= 1.5.
 
 Not verified: this file was written without a GPU at hand and has never been run. Its tests carry
-the marker `gpu` and compare it with the reference renderer; run `pytest -m gpu` on a machine that
-has a GPU and gsplat before relying on it.
+the marker `gpu` and compare it with the reference renderer; `make gpu` runs them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.render import OpacityRender
-from gscompleter.types import Camera, Gaussians, Render, merge
+from gscompleter.render.spherical_harmonics import colours_from
+from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
+
+
+@runtime_checkable
+class Drawing(Protocol):
+    """What a frozen view asks of a renderer."""
+
+    def render(self, gaussians: Gaussians, camera: Camera) -> Render: ...
+
+    def visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
+        """Which of the Gaussians can reach the image, whatever stands before them."""
+
+    def plan(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
+        """Renders `gaussians` with opacities [n] that are no larger than their own."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +53,62 @@ class CudaRenderer:
             ) from error
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
-        from gsplat import rasterization
-
         if len(gaussians) == 0:
             empty = torch.zeros(camera.height, camera.width, device=gaussians.means.device)
             return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
+        colour_and_depth, alpha, _ = self.rasterized(gaussians, camera)
+        return Render(colour_and_depth[0, ..., :3], colour_and_depth[0, ..., 3], alpha[0, ..., 0])
+
+    def freeze(self, context: Gaussians, camera: Camera) -> CudaView:
+        return CudaView(self, context, camera)
+
+    @torch.no_grad()
+    def visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
+        """Those whose box touches the image; gsplat gives the others no radius and skips them."""
+        if len(gaussians) == 0:
+            return torch.zeros_like(gaussians.generated, dtype=torch.bool)
+        radii = self.rasterized(gaussians, camera)[2]["radii"]
+        return (radii.reshape(len(gaussians), -1) > 0).all(dim=1)
+
+    def plan(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
+        """Project, sort and bin once. The box of a fainter Gaussian lies within its own.
+
+        A fainter one draws the same in the larger box: what alpha 1/255 drops there is what the
+        smaller box leaves out.
+        """
+        from gsplat import rasterize_to_pixels
+
+        with torch.no_grad():
+            _, _, seen = self.rasterized(gaussians, camera)
+            center = camera.center.to(gaussians.means.device)
+            colours = colours_from(gaussians.sh, gaussians.means, center)
+            values = torch.cat([colours[None], seen["depths"][..., None]], dim=-1)
+
+        def render(opacities: Float[Tensor, "n"]) -> Render:
+            sums, alphas = rasterize_to_pixels(
+                seen["means2d"],
+                seen["conics"],
+                values,
+                opacities[None],
+                camera.width,
+                camera.height,
+                seen["tile_size"],
+                seen["isect_offsets"],
+                seen["flatten_ids"],
+            )
+            alpha = alphas[0, ..., 0]
+            return Render(sums[0, ..., :3], sums[0, ..., 3] / alpha.clamp_min(1e-10), alpha)
+
+        return render
+
+    def rasterized(
+        self, gaussians: Gaussians, camera: Camera
+    ) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"], dict[str, Any]]:
+        """Colour and depth, alpha, and what gsplat found on the way there, of at least one."""
+        from gsplat import rasterization
+
         camera = camera.to(gaussians.means.device)
-        colour_and_depth, alpha, _ = rasterization(
+        colour_and_depth, alpha, found = rasterization(
             means=gaussians.means,
             quats=gaussians.quats,
             scales=gaussians.scales,
@@ -62,17 +125,18 @@ class CudaRenderer:
             render_mode="RGB+ED",  # the depth is already divided by alpha
             rasterize_mode="classic",
         )
-        return Render(colour_and_depth[0, ..., :3], colour_and_depth[0, ..., 3], alpha[0, ..., 0])
-
-    def freeze(self, context: Gaussians, camera: Camera) -> CudaView:
-        return CudaView(self, context, camera)
+        return colour_and_depth, alpha, found
 
 
 @dataclass(frozen=True)
 class CudaView:
-    """A frozen view that draws everything anew each time."""
+    """A frozen view that carries on only what its camera sees of the context.
 
-    renderer: CudaRenderer
+    Each composite still projects and sorts what is left: new Gaussians may stand before the
+    context or within it, so that no part of its picture can be kept.
+    """
+
+    drawing: Drawing
     scene: Gaussians
     camera: Camera
 
@@ -80,16 +144,22 @@ class CudaView:
     def context(self) -> Render:
         """The context alone."""
         with torch.no_grad():
-            return self.renderer.render(self.scene, self.camera)
+            return self.drawing.render(self.scene, self.camera)
+
+    @cached_property
+    def seen(self) -> Gaussians:
+        """What of the context reaches the image, in the colours that this camera sees."""
+        kept = self.scene[self.drawing.visible(self.scene, self.camera)]
+        center = self.camera.center.to(kept.means.device)
+        colours = colours_from(kept.sh, kept.means, center)
+        return replace(kept, sh=sh_from_rgb(colours), encoded=None)
 
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together."""
-        return self.renderer.render(merge([self.scene, new]), self.camera)
+        return self.drawing.render(merge([self.seen, new]), self.camera)
 
     def plan(self, new: Gaussians) -> OpacityRender:
-        """Context and `new` with other opacities."""
-
-        def render(opacities: Float[Tensor, "n"]) -> Render:
-            return self.composite(replace(new, opacities=opacities))
-
-        return render
+        """Context and `new` with other opacities, in boxes that hold for every opacity."""
+        opaque = replace(new, opacities=torch.ones_like(new.opacities))
+        render = self.drawing.plan(merge([self.seen, opaque]), self.camera)
+        return lambda opacities: render(torch.cat([self.seen.opacities, opacities]))

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from gscompleter.geometry import rotations_from
-from gscompleter.render import OpacityRender
+from gscompleter.render import OpacityRender, Renderer
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -59,9 +59,9 @@ class ReferenceRenderer:
 
 @dataclass(frozen=True)
 class ReferenceView:
-    """Renders context and new Gaussians together, every time from scratch."""
+    """Renders context and new Gaussians together, every time from scratch, with any renderer."""
 
-    renderer: ReferenceRenderer
+    renderer: Renderer
     scene: Gaussians
     camera: Camera
 

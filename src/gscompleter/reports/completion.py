@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -70,6 +71,7 @@ def summarize(
     settings: Mapping[str, Any],
     seed: int,
     device: str,
+    frame: Float[np.ndarray, "4 4"],
 ) -> dict[str, Any]:
     """The content of `summary.json`."""
     return {
@@ -77,6 +79,7 @@ def summarize(
         "settings": dict(settings),
         "seed": seed,
         "device": device,
+        "frame": {"method": "given", "transform": frame.tolist()},
         "context": [
             {"frame": view.frame, **images.scores()}
             for view, images in zip(views, context_images, strict=True)
@@ -119,8 +122,11 @@ def write_report(
     settings: Mapping[str, Any],
     seed: int,
     device: str,
+    frame: Float[np.ndarray, "4 4"],
 ) -> dict[str, Any]:
     """Write `context.ply`, `completed.ply`, `images/` and `summary.json`; returns the summary.
+
+    `frame` takes points of the photographs' own frame to that of the scene.
 
     Raises:
         InputError: where a file cannot be written.
@@ -128,7 +134,7 @@ def write_report(
     context_images = [compare(completion, v.camera, v.image, renderer) for v in views]
     target_images = [compare(completion, t.camera, t.photograph, renderer) for t in targets]
     summary = summarize(
-        completion, views, targets, context_images, target_images, settings, seed, device
+        completion, views, targets, context_images, target_images, settings, seed, device, frame
     )
     save_ply(folder / "context.ply", completion.context)
     save_ply(folder / "completed.ply", completion.scene, provenance=True)

@@ -12,7 +12,7 @@ from gscompleter.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.completer import Clock, GSCompleter
 from gscompleter.config import ABLATIONS, named_config
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.generators import Generator
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render import Renderer
@@ -138,7 +138,7 @@ BASELINES: dict[str, Method] = {
     "distill": optimized_with(OptimizationConfig(iterations=800, density_rounds=0)),
     "reggs": registered_by_similarity,
 }
-"""Methods that are not ours. They run on a CPU."""
+"""Methods that are not ours."""
 
 SCENE_CHANGING = ("densify-100", "densify-800", "distill")
 """Methods that change the scene that is there, so that their steps cannot be compared."""
@@ -195,8 +195,8 @@ def check_methods(names: Sequence[str], steps: int = 1) -> None:
     for name in names:
         if name not in METHODS:
             raise InputError(
-                f"There is no method {name!r}; choose of {known} (paper/no-sa for an ablation of "
-                "the paper's settings)."
+                f"There is no method '{quoted(name)}'; choose of {known} (paper/no-sa for an "
+                "ablation of the paper's settings)."
             )
         if steps > 1 and name in SCENE_CHANGING:
             raise InputError(

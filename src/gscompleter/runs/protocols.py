@@ -9,6 +9,7 @@ completed one after the other.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,8 +17,8 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from gscompleter.completer import MAX_TARGETS
-from gscompleter.data.clips import Clip
-from gscompleter.errors import InputError
+from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
 from gscompleter.io.json_file import read_json
 
@@ -46,7 +47,7 @@ class EvaluationProtocol(Protocol):
     def name(self) -> str:
         """What `parse_protocol` or a table calls it."""
 
-    def splits(self, clip: Clip) -> tuple[Split, ...]:
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """The splits of a clip; none where it is skipped."""
 
 
@@ -69,7 +70,7 @@ class Extrapolation:
     def name(self) -> str:
         return f"n-{self.k}" + ("" if self.stride is None else f"-stride-{self.stride}")
 
-    def splits(self, clip: Clip) -> tuple[Split, ...]:
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         k, stride = self.k, self.stride or 2 * self.k + 1
         return tuple(
             split
@@ -84,7 +85,7 @@ class StressTest:
 
     name: str = "stress"
 
-    def splits(self, clip: Clip) -> tuple[Split, ...]:
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         split = Split((0, 30), (99,))
         return (split,) if len(clip) > max(split.targets) else ()
 
@@ -99,7 +100,7 @@ class EvaluationIndex:
     skipped: tuple[str, ...] = ()
     """Scenes with no split: null in a published file, clips that are too short in ours."""
 
-    def splits(self, clip: Clip) -> tuple[Split, ...]:
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """The splits of a clip; none where the index skips or lacks its scene."""
         return self.scenes.get(clip.name, ())
 
@@ -126,11 +127,11 @@ class ViewByView:
     def name(self) -> str:
         return f"sequence-{self.k}" + ("" if self.steps is None else f"-steps-{self.steps}")
 
-    def splits(self, clip: Clip) -> tuple[Split, ...]:
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         targets = tuple(range(2 * self.k, len(clip), self.k))[: self.steps or MAX_TARGETS]
         return (Split((0, self.k), targets, in_sequence=True),) if targets else ()
 
-    def reason_to_skip(self, clip: Clip) -> str | None:
+    def reason_to_skip(self, clip: PosedPhotographs) -> str | None:
         """Why a clip has no split; None where it has one."""
         needed = 2 * self.k + 1
         short = f"it has {len(clip)} frames, and {self.name} needs {needed}"
@@ -152,15 +153,15 @@ def parse_protocol(text: str) -> EvaluationProtocol:
         return ViewByView(int(match[1]), None if match[2] is None else int(match[2]))
     if text == "stress":
         return StressTest()
-    if Path(text).is_file():
+    if os.path.isfile(text):
         return read_evaluation_index(text)
     raise InputError(
-        f"There is no protocol {text!r}; give n-K for a number of frames K (as n-10), stress, "
-        "sequence-K (as sequence-4), or the path of an evaluation index."
+        f"There is no protocol '{quoted(text)}'; give n-K for a number of frames K (as n-10), "
+        "stress, sequence-K (as sequence-4), or the path of an evaluation index."
     )
 
 
-def index_of(protocol: EvaluationProtocol, clips: Iterable[Clip]) -> EvaluationIndex:
+def index_of(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) -> EvaluationIndex:
     """What a protocol chooses in each of `clips`, written down.
 
     Raises:
@@ -180,15 +181,6 @@ def index_of(protocol: EvaluationProtocol, clips: Iterable[Clip]) -> EvaluationI
     return EvaluationIndex(protocol.name, chosen, tuple(n for n in scenes if not scenes[n]))
 
 
-def n_k_index(clips: Iterable[Clip], k: int, stride: int | None = None) -> EvaluationIndex:
-    """The extrapolations over k frames in each of `clips`; those too short are skipped.
-
-    Raises:
-        InputError: where k or the stride is not positive, or two clips have the same name.
-    """
-    return index_of(Extrapolation(k, stride), clips)
-
-
 def read_evaluation_index(path: Path | str) -> EvaluationIndex:
     """An evaluation index, as published or as `write_evaluation_index` writes it.
 
@@ -196,12 +188,17 @@ def read_evaluation_index(path: Path | str) -> EvaluationIndex:
         InputError: where it is missing or damaged, or from a later version.
     """
     path = Path(path)
-    content = _read_named(path)
+    content = read_json(path, "download it again")
+    if not isinstance(content, dict):
+        raise InputError(
+            f"{path} is no evaluation index: it has to map the name of each scene to its context "
+            "and target frames, or to null."
+        )
     if "version" not in content:
         return _index(path.stem, content, path)
     if content["version"] != VERSION:
         raise InputError(
-            f"{path} is of version {content['version']!r} and version {VERSION} can be read; "
+            f"{path} is of version {quoted(content['version'])} and version {VERSION} can be read; "
             "update gscompleter, or write the index again."
         )
     name, scenes = content.get("protocol"), content.get("scenes")
@@ -231,16 +228,6 @@ def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
         file.write(text.encode())
 
 
-def _read_named(path: Path) -> dict[str, Any]:
-    content = read_json(path, "download it again")
-    if not isinstance(content, dict):
-        raise InputError(
-            f"{path} is no evaluation index: it has to map the name of each scene to its context "
-            "and target frames, or to null."
-        )
-    return content
-
-
 def _index(name: str, content: Mapping[str, Any], path: Path) -> EvaluationIndex:
     scenes = {
         scene: _splits(entry, scene, path) for scene, entry in content.items() if entry is not None
@@ -253,8 +240,8 @@ def _splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
     rows = entry if isinstance(entry, list) else [entry]
     if not rows or not all(isinstance(row, dict) for row in rows):
         raise InputError(
-            f"The entry of the scene {scene} in {path} is {entry!r}; context and target, or null, "
-            "are needed."
+            f"The entry of the scene {scene} in {path} is {quoted(entry)}; context and target, "
+            "or null, are needed."
         )
     return tuple(
         Split(_frames(row, "context", scene, path), _frames(row, "target", scene, path))
@@ -270,7 +257,7 @@ def _frames(row: dict[str, Any], key: str, scene: str, path: Path) -> tuple[int,
         or not all(type(frame) is int and frame >= 0 for frame in frames)
     ):
         raise InputError(
-            f"The `{key}` of the scene {scene} in {path} is {frames!r}; a list of frame numbers, "
-            "at least one, is needed."
+            f"The `{key}` of the scene {scene} in {path} is {quoted(frames)}; a list of frame "
+            "numbers, at least one, is needed."
         )
     return tuple(frames)

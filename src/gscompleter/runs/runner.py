@@ -16,7 +16,7 @@ from gscompleter.generators import DiffusionSettings, Generator, load_generator
 from gscompleter.progress import shown_on, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.runs.methods import BASELINES, Models, check_methods
+from gscompleter.runs.methods import Models, check_methods
 from gscompleter.runs.steps import Prepared, Step, attempt, complete_task, read_back
 from gscompleter.runs.store import (
     VERSION,
@@ -145,6 +145,7 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
         OutputError: where the scene cannot be saved.
     """
     views = photographs(task, task.context, config)
+    neighbours = photographs(task, task.neighbours, config)
     targets, error = readable_targets(task, config)
     if not targets:
         raise InputError(str(error))
@@ -158,7 +159,7 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
         context.gaussians,
         tuple(map(ranged, views)),
         tuple(map(ranged, targets)),
-        tuple(map(ranged, photographs(task, task.neighbours, config))),
+        tuple(map(ranged, neighbours)),
         models,
         context.seconds,
         error,
@@ -249,9 +250,6 @@ def check_evaluation(
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
     check_shard(shard)
     check_tasks(tasks)
-    slow = [name for name in methods if name in BASELINES]
-    if slow and config.device != "cpu":
-        raise InputError(f"{', '.join(slow)} can only run on a CPU; choose the device cpu.")
     config.load_reconstructor()
     config.load_generator()
 

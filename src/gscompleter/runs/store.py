@@ -30,7 +30,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io import json_file
 from gscompleter.io.files import replacing
 from gscompleter.io.image import write_image
@@ -107,9 +107,10 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     found = settings_of(out)
     for key, value in wanted.items():
         if found.get(key) != value:
+            there, asked = quoted(repr(found.get(key))), quoted(repr(value))
             raise InputError(
-                f"{out} holds a run with {key} {found.get(key)!r}, and {value!r} is asked for; "
-                "name another folder."
+                f"{out} holds a run with {key} {there}, and {asked} is asked for; name another "
+                "folder."
             )
 
 
@@ -134,8 +135,8 @@ def settings_of(out: Path) -> dict[str, Any]:
     version = found.get("version") if isinstance(found, dict) else None
     if version != VERSION:
         raise InputError(
-            f"{out} holds a run of version {version!r}, and version {VERSION} is needed; name "
-            "another folder and run it again."
+            f"{out} holds a run of version {quoted(version)}, and version {VERSION} is needed; "
+            "name another folder and run it again."
         )
     return dict(found)
 

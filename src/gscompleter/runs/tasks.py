@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from gscompleter.data.cases import Case
-from gscompleter.data.clips import Clip
+from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.errors import InputError
 from gscompleter.runs.protocols import EvaluationProtocol, Split
 from gscompleter.types import View
@@ -45,7 +45,7 @@ def task_of(case: Case) -> Task:
 
 
 def tasks_of(
-    protocol: EvaluationProtocol, clip: Clip, resolution: tuple[int, int] | None = None
+    protocol: EvaluationProtocol, clip: PosedPhotographs, resolution: tuple[int, int] | None = None
 ) -> list[Task]:
     """The tasks of a clip: one for each target, or one for all where they depend on each other.
 
@@ -73,7 +73,7 @@ def tasks_of(
     return tasks
 
 
-def check_frames(protocol: EvaluationProtocol, split: Split, clip: Clip) -> None:
+def check_frames(protocol: EvaluationProtocol, split: Split, clip: PosedPhotographs) -> None:
     """Refuse frames that the clip does not have.
 
     Raises:

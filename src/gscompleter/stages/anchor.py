@@ -17,7 +17,7 @@ from gscompleter.generators import (
     as_generator,
 )
 from gscompleter.geometry import baseline_between, inside, project, rotation_between
-from gscompleter.reconstructors import Reconstructor
+from gscompleter.reconstructors import Reconstructor, reconstructed
 from gscompleter.types import Camera, Lift, SceneContext, View
 
 
@@ -108,7 +108,7 @@ def lift(reconstructor: Reconstructor, reference: View, anchor: View) -> Lift:
     A pixel-aligned Ψ says which Gaussians are the reference's. Of another Ψ all those are taken
     that the target camera sees.
     """
-    pair = reconstructor([reference, anchor])
+    pair = reconstructed(reconstructor, [reference, anchor])
     reference_depth, anchor_depth = pair.depths
     if pair.view_index is None or pair.pixel_index is None:
         seen = inside(*project(pair.gaussians.means, reference.camera), reference.camera)

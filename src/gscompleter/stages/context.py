@@ -8,14 +8,14 @@ from dataclasses import replace
 import torch
 
 from gscompleter.errors import InputError
-from gscompleter.reconstructors import Reconstructor
+from gscompleter.reconstructors import Reconstructor, reconstructed
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, View
 
 
 def init_context(reconstructor: Reconstructor, views: Sequence[View]) -> Gaussians:
     """`G_ctx = Ψ(views)`: the Gaussians of the observed regions (paper, Eq. 5)."""
-    return reconstructor(views).gaussians
+    return reconstructed(reconstructor, views).gaussians
 
 
 def depth_range_of_scene(

@@ -80,8 +80,8 @@ class PlaneSweep:
         return Reconstruction(
             fitted.to(device),
             tuple(depths),
-            torch.cat([torch.full((len(p),), i) for i, p in enumerate(parts)]),
-            torch.cat([torch.arange(len(p)) for p in parts]),
+            torch.cat([torch.full((len(p),), i, device=device) for i, p in enumerate(parts)]),
+            torch.cat([torch.arange(len(p), device=device) for p in parts]),
         )
 
     def depths(self, views: Sequence[View]) -> list[DepthMap]:

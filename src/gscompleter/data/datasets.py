@@ -1,0 +1,57 @@
+"""Many scenes at once, and which of them benchmarks keep."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from gscompleter.data.cases import holds_cases, open_cases
+from gscompleter.data.formats import format_of, recognised
+from gscompleter.data.photographs import Photographs, PosedPhotographs
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A scene that was left out."""
+
+    name: str
+    reason: str
+
+
+def open_clips(path: Path | str) -> Iterator[Photographs]:
+    """The scenes in a file or folder of any of `FORMATS`, a folder of such, or a `cases.json`.
+
+    What it is, is found out at once; the scenes are read one at a time.
+
+    Raises:
+        InputError: where it is none of these, and while iterating, where a scene is damaged.
+    """
+    path = Path(path)
+    if holds_cases(path):
+        return open_cases(path)
+    inside = [] if recognised(path) or not os.path.isdir(path) else sorted(path.iterdir())
+    folders = [child for child in inside if child.is_dir() and recognised(child)]
+    scenes = [(format_of(place), place) for place in folders or [path]]
+    return (clip for format, place in scenes for clip in format.open(place))
+
+
+def usable(
+    clips: Iterable[PosedPhotographs],
+    skipped: list[Skipped],
+    size: tuple[int, int] | None = None,
+) -> Iterator[PosedPhotographs]:
+    """The scenes that benchmarks keep, one at a time; the others are appended to `skipped`.
+
+    Args:
+        clips: The scenes of a data set.
+        skipped: Where those that are left out are recorded.
+        size: As in `PosedPhotographs.reason_to_skip`.
+    """
+    for clip in clips:
+        reason = clip.reason_to_skip(size)
+        if reason is None:
+            yield clip
+        else:
+            skipped.append(Skipped(clip.name, reason))

@@ -1,0 +1,109 @@
+"""The one door: posed photographs in whatever format they lie.
+
+A format is a file of this package and a line in `FORMATS`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+from gscompleter.data.chunks import holds_chunks, open_chunks
+from gscompleter.data.limits import check_planes
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.real_estate import holds_camera_files, open_camera_files
+from gscompleter.data.transforms import holds_transforms, open_transforms
+from gscompleter.errors import InputError, quoted
+
+
+@dataclass(frozen=True)
+class Format:
+    """A layout of posed photographs on disk."""
+
+    layout: str
+    """What a file or folder of it is, for error messages."""
+    holds: Callable[[Path], bool]
+    """Whether a file or folder is of it, by names and first bytes."""
+    open: Callable[[Path], Iterable[Photographs]]
+    """The scenes in such a file or folder, one at a time. It reads nothing but cameras."""
+
+
+FORMATS = {
+    "chunks": Format(
+        "chunks of pixelSplat (a .torch file, a folder of them, or one with an index.json in it or "
+        "in its folder test)",
+        holds_chunks,
+        open_chunks,
+    ),
+    "transforms": Format(
+        "a folder with nerfstudio's transforms.json", holds_transforms, open_transforms
+    ),
+    "real-estate-10k": Format(
+        "RealEstate10K camera files (.txt, with the frames of each in the folder of its name)",
+        holds_camera_files,
+        open_camera_files,
+    ),
+}
+"""By the names that `open_photographs` takes, in the order in which they are tried."""
+
+
+def open_photographs(
+    path: Path | str,
+    format: str | None = None,
+    near: float | None = None,
+    far: float | None = None,
+) -> Photographs:
+    """The photographs of one scene, with nothing read but its cameras.
+
+    Args:
+        path: A file or folder of one of `FORMATS` with a single scene in it.
+        format: Name of its format; if left out, found by what lies there.
+        near: Smallest z-depth of the scene, in scene units, where known.
+        far: Largest z-depth of the scene, in scene units, where known.
+
+    Raises:
+        InputError: where there is no scene or more than one, or its cameras cannot be read.
+    """
+    check_planes(near, far)
+    path = Path(path)
+    scenes = list(islice(format_of(path, format).open(path), 2))
+    if len(scenes) > 1:
+        raise InputError(
+            f"{quoted(str(path))} holds several scenes, such as {quoted(scenes[0].name)} and "
+            f"{quoted(scenes[1].name)}; name a file or folder with one of them."
+        )
+    return replace(scenes[0], near=near, far=far)
+
+
+def format_of(path: Path, name: str | None = None) -> Format:
+    """The format of that name, or else the one that a file or folder is of.
+
+    Raises:
+        InputError: where there is no such format, or the path is of none.
+    """
+    if name is not None and name not in FORMATS:
+        raise InputError(
+            f"There is no format '{quoted(name)}'; choose one of {', '.join(FORMATS)}."
+        )
+    if not os.path.exists(path):
+        raise InputError(f"There is no {quoted(str(path))}; name {accepted()}.")
+    found = recognised(path) if name is None else FORMATS[name]
+    if found is None:
+        raise InputError(
+            f"There are no posed photographs in {quoted(str(path))}; name {accepted()}."
+        )
+    return found
+
+
+def recognised(path: Path) -> Format | None:
+    """The first format that a file or folder is of; None where it is of none."""
+    return next((format for format in FORMATS.values() if format.holds(path)), None)
+
+
+def accepted() -> str:
+    """What can be opened, in words."""
+    *others, last = (format.layout for format in FORMATS.values())
+    return f"{', '.join(others)}, or {last}"

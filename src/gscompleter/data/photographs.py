@@ -1,0 +1,242 @@
+"""Posed photographs, whatever format they lie in.
+
+A format (one file each, listed in `formats.py`) reads cameras and says where the images lie. All
+else is here: images are read when they are asked for, lens distortion is removed, and image and
+intrinsics are brought to a resolution together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Shaped
+from PIL import Image
+from torch import Tensor
+
+from gscompleter.data.frame import Frame
+from gscompleter.data.framing import covering, resize
+from gscompleter.data.intrinsics import opening_angle
+from gscompleter.data.lens import remap, undistortion_map
+from gscompleter.data.origin import local_origin
+from gscompleter.data.poses import pose_defect
+from gscompleter.errors import InputError
+from gscompleter.io.image import as_image, read_depth, read_pixels
+from gscompleter.types import Camera, View
+
+MAX_FOV = 100.0
+"""Widest opening angle of a camera that benchmarks keep, in degrees."""
+MAX_TRANSLATION = 1e3
+"""Farthest a camera may be from the origin along an axis for benchmarks, in scene units."""
+
+
+@runtime_checkable
+class PosedPhotographs(Protocol):
+    """A named sequence of photographs with known cameras, numbered from 0."""
+
+    @property
+    def name(self) -> str:
+        """What evaluation indices call it."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each frame is called. Frames are numbered in this order."""
+
+    @property
+    def origin(self) -> Float[np.ndarray, "3"]:
+        """Where the cameras' coordinates are counted from, in those of the files (float64)."""
+
+    def __len__(self) -> int:
+        """How many frames there are."""
+
+    def has_photograph(self, frame: int) -> bool:
+        """Whether the photograph of a frame is there, or its camera only."""
+
+    def camera(self, frame: int, resolution: tuple[int, int] | None = None) -> Camera:
+        """The camera of a frame, as `views` has it.
+
+        Raises:
+            InputError: where the frame does not exist, or its camera is impossible.
+        """
+
+    def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
+        """The photographs of `frames`, with depth where there is some. Only these are read.
+
+        Lens distortion is removed: the undistorted image has the size of the photograph and no
+        empty pixel, and the intrinsics follow (`lens.undistorted` says how).
+
+        Args:
+            frames: Numbers of frames.
+            resolution: Height and width in pixels: images are resized to cover it, then their
+                centre is cropped. Their own size if left out.
+
+        Raises:
+            InputError: where a frame does not exist or cannot be read.
+        """
+
+    def mask(
+        self, frame: int, resolution: tuple[int, int] | None = None
+    ) -> Bool[Tensor, "h w"] | None:
+        """True where the photograph of a frame is to be ignored; None where nothing is.
+
+        Raises:
+            InputError: where the frame does not exist or its mask cannot be read.
+        """
+
+    def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
+        """Why benchmarks leave the photographs out; None where they keep them.
+
+        Args:
+            size: Height and width that every photograph must have before it is resized, for
+                data sets of one size; any if left out.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """`PosedPhotographs` as every format here has them: a list of frames."""
+
+    name: str
+    title: str
+    """What error messages call it."""
+    frames: tuple[Frame, ...]
+    origin: Float[np.ndarray, "3"]
+    near: float | None = None
+    """Smallest z-depth of the scene, in scene units, where known."""
+    far: float | None = None
+    """Largest z-depth of the scene, in scene units, where known."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(frame.name for frame in self.frames)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def has_photograph(self, frame: int) -> bool:
+        return self.frame(frame).stored() is not None
+
+    def camera(self, frame: int, resolution: tuple[int, int] | None = None) -> Camera:
+        """Its photograph need not exist where the file says how large it is."""
+        found = self.frame(frame)
+        return self._camera(found, found.size(), resolution)
+
+    def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
+        chosen = [self.frame(number) for number in frames]
+        return [
+            self._view(frame, number, resolution)
+            for number, frame in zip(frames, chosen, strict=True)
+        ]
+
+    def mask(
+        self, frame: int, resolution: tuple[int, int] | None = None
+    ) -> Bool[Tensor, "h w"] | None:
+        found = self.frame(frame)
+        if found.mask is None:
+            return None
+        shown = read_pixels(found.mask).max(axis=-1)
+        return torch.from_numpy(fitted(found, shown, found.size(), resolution)) == 0
+
+    def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
+        for number, frame in enumerate(self.frames):
+            reason = _oddity(frame) or (None if size is None else _size_to_skip(frame, size))
+            if reason is not None:
+                return f"frame {number}: {reason}"
+        return None
+
+    def frame(self, number: int) -> Frame:
+        """The frame of that number.
+
+        Raises:
+            InputError: where there is none.
+        """
+        if not 0 <= number < len(self):
+            raise InputError(
+                f"There is no frame {number} in {self.title}, whose frames are numbered 0 to "
+                f"{len(self) - 1}; choose one of these."
+            )
+        return self.frames[number]
+
+    def _camera(
+        self, frame: Frame, size: tuple[int, int], resolution: tuple[int, int] | None
+    ) -> Camera:
+        _, pinhole = frame.pinholes(*size)
+        final = covering(*size, resolution).camera(pinhole)
+        c2w = frame.c2w.copy()
+        c2w[:3, 3] -= self.origin  # in float64 still
+        pose = torch.from_numpy(c2w).float()
+        return Camera(pose, final.K, final.width, final.height, self.near, self.far)
+
+    def _view(self, frame: Frame, number: int, resolution: tuple[int, int] | None) -> View:
+        pixels = frame.pixels()
+        size = pixels.shape[1], pixels.shape[0]
+        camera = self._camera(frame, size, resolution)
+        depth = None
+        if frame.depth is not None:
+            depth = torch.from_numpy(fitted(frame, read_depth(*frame.depth), size, resolution))
+        return View(as_image(fitted(frame, pixels, size, resolution)), camera, number, depth)
+
+
+def photographs_of(name: str, title: str, frames: Sequence[Frame]) -> Photographs:
+    """Photographs told from zero, or where that is too far away, from a local origin."""
+    valid = [frame.c2w for frame in frames if pose_defect(frame.c2w) is None]
+    return Photographs(name, title, tuple(frames), local_origin(valid))
+
+
+def fitted(
+    frame: Frame,
+    pixels: Shaped[np.ndarray, "h w *c"],
+    size: tuple[int, int],
+    resolution: tuple[int, int] | None,
+) -> Shaped[np.ndarray, "h2 w2 *c"]:
+    """An image of a frame without lens distortion and at a resolution.
+
+    Colours (uint8, [h, w, 3]) are blended; the values of depth maps and masks never are.
+
+    Args:
+        frame: The frame.
+        pixels: Its photograph, or a map of depth or of what is ignored, of any size.
+        size: Width and height of the photograph.
+        resolution: Height and width; those of the photograph if None.
+
+    Raises:
+        InputError: where the camera is impossible.
+    """
+    colours = pixels.ndim == 3
+    if not colours:
+        pixels = resize(pixels, size, Image.Resampling.NEAREST)
+    if frame.intrinsics.distortion:
+        pinhole, new = frame.pinholes(*size)
+        source = undistortion_map(pinhole, frame.intrinsics.distortion, new)
+        pixels = remap(pixels, source, cv2.INTER_CUBIC if colours else cv2.INTER_NEAREST)
+    filtering = Image.Resampling.LANCZOS if colours else Image.Resampling.NEAREST
+    return covering(*size, resolution).image(pixels, filtering)
+
+
+def _oddity(frame: Frame) -> str | None:
+    """What makes benchmarks leave a frame's clip out; None where they keep it."""
+    size = frame.intrinsics.size or frame.size()
+    defect = frame.defect(*size)
+    if defect is not None:
+        return defect
+    fov = opening_angle(frame.pinholes(*size)[1])
+    if fov > MAX_FOV:
+        return f"its opening angle of {fov:.1f}° is above {MAX_FOV:g}°"
+    farthest = float(np.abs(frame.c2w[:3, 3]).max())
+    if farthest > MAX_TRANSLATION:
+        return f"its translation of {farthest:g} is above {MAX_TRANSLATION:g}"
+    return None
+
+
+def _size_to_skip(frame: Frame, needed: tuple[int, int]) -> str | None:
+    """Why the stored photograph is not `needed` (height, width); None if it is."""
+    found = frame.stored_size()
+    if found is None:
+        return "its image is missing"
+    if found == (needed[1], needed[0]):
+        return None
+    return f"its image is {found[1]} × {found[0]} and not {needed[0]} × {needed[1]}"

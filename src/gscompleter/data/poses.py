@@ -1,0 +1,54 @@
+"""Poses in float64, and what makes one invalid.
+
+Poses are camera-to-world transforms in OpenCV axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.limits import MAX_COORDINATE
+
+MAX_RIGID_ERROR = 1e-3
+"""Largest entry of RᵀR - I that still counts as rounding of a rotation R."""
+FLOAT_NOISE = 1e-6
+"""Rotations this close to exact are taken as they are."""
+
+
+def pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
+    """What makes a pose invalid; None for a rigid transform within the limits."""
+    if not np.isfinite(pose).all():
+        return "its pose holds NaN or infinity"
+    if np.abs(pose).max() > MAX_COORDINATE:
+        return f"its pose holds {np.abs(pose).max():g}, which is above {MAX_COORDINATE:g}"
+    if _rigid_error(pose) > MAX_RIGID_ERROR:
+        return "its pose is not a rigid transform but scaled, sheared or projective"
+    if np.linalg.det(pose[:3, :3]) < 0:
+        return "its pose is a reflection (its determinant is negative)"
+    return None
+
+
+def made_rigid(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """A valid pose with the nearest rotation, unless it is exact up to `FLOAT_NOISE`."""
+    rotation = pose[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > FLOAT_NOISE:
+        u, _, v = np.linalg.svd(rotation)
+        rotation = u @ v
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = rotation, pose[:3, 3]
+    return rigid
+
+
+def c2w_of(viewmat: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The inverse of a world-to-camera transform.
+
+    An invalid one may have none. It stays as it is, for its defect to be found in it.
+    """
+    return viewmat if pose_defect(viewmat) is not None else np.linalg.inv(viewmat)
+
+
+def _rigid_error(pose: Float[np.ndarray, "4 4"]) -> float:
+    rotation = pose[:3, :3]
+    errors = (rotation.T @ rotation - np.eye(3), pose[3] - [0, 0, 0, 1])
+    return float(max(np.abs(error).max() for error in errors))

@@ -1,0 +1,105 @@
+"""RealEstate10K camera files, and cameras as they and pixelSplat's chunks hold them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.frame import Frame
+from gscompleter.data.intrinsics import FRACTIONS, Intrinsics
+from gscompleter.data.photographs import Photographs, photographs_of
+from gscompleter.data.poses import c2w_of
+from gscompleter.errors import InputError
+
+
+def holds_camera_files(path: Path) -> bool:
+    """Whether `path` is a text file or a folder with RealEstate10K camera files."""
+    if os.path.isdir(path):
+        return bool(_camera_files(path))
+    return path.suffix == ".txt" and os.path.isfile(path)
+
+
+def open_camera_files(path: Path) -> Iterator[Photographs]:
+    """The photographs of each camera file that `path` is or holds, in the order of their names.
+
+    Raises:
+        InputError: as `read_camera_file`.
+    """
+    files = _camera_files(path) if os.path.isdir(path) else [path]
+    return (read_camera_file(file) for file in files)
+
+
+def read_camera_file(path: Path) -> Photographs:
+    """The photographs of a RealEstate10K camera file, called by the name of the file.
+
+    Its first line is the address of the video. Each of the others is a frame: timestamp, fx,
+    fy, cx, cy in image widths and heights, two unused numbers, and the upper three rows of the
+    world-to-camera transform. The image of a frame is named for its timestamp and lies in a
+    folder beside the file that has its name, or beside the file itself. Frames are numbered in
+    the order of the file.
+
+    Raises:
+        InputError: where it is missing or no such file.
+    """
+    lines = [line for line in _read_text(path).splitlines()[1:] if line.strip()]
+    if not lines:
+        raise InputError(
+            f"{path} lists no frames; below the line with the address, one line a frame is needed."
+        )
+    frames = [_frame(line, number, path) for number, line in enumerate(lines)]
+    return photographs_of(path.stem, str(path), frames)
+
+
+def intrinsics_and_pose(
+    numbers: Float[np.ndarray, "18"],
+) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:
+    """Of fx, fy, cx, cy, two unused numbers, and the upper rows of world-to-camera.
+
+    The pose is camera-to-world, or where that does not exist, the transform as it is.
+    """
+    fx, fy, cx, cy = numbers[:4].tolist()
+    viewmat = np.vstack([numbers[6:].reshape(3, 4), [0, 0, 0, 1]])
+    return Intrinsics(FRACTIONS, (fx, fy), (cx, cy)), c2w_of(viewmat)
+
+
+def _frame(line: str, number: int, path: Path) -> Frame:
+    timestamp, *words = line.split()
+    try:
+        if not (timestamp.isascii() and timestamp.isdigit() and len(words) == 18):
+            raise ValueError
+        numbers = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise InputError(
+            f"Frame {number} of {path} is not a line of RealEstate10K, which has 19 numbers: "
+            "timestamp, fx fy cx cy, 0 0, and 3 × 4 of world-to-camera; download it again."
+        ) from error
+    folder = path.with_suffix("")
+    folder = folder if os.path.isdir(folder) else path.parent
+    intrinsics, c2w = intrinsics_and_pose(numbers)
+    title = f"frame {number} of {path}"
+    return Frame(timestamp, title, c2w, intrinsics, folder / timestamp)
+
+
+def _camera_files(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.glob("*.txt") if _is_camera_file(file))
+
+
+def _is_camera_file(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(4) == b"http"
+    except OSError:
+        return False
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; correct the path.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file; name a camera file.") from error

@@ -1,0 +1,113 @@
+"""What `render/cuda.py` asks of gsplat 1.5, answered by the reference renderer on a CPU.
+
+Names, shapes and what is returned beside the picture are gsplat's, as far as they are used. So it
+tests how gsplat is called, and says nothing of gsplat itself.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gscompleter.geometry import inside
+from gscompleter.render.reference import Splats, composite, project
+from gscompleter.types import Camera, observed
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    eps2d: float,
+    sh_degree: int,
+    packed: bool,
+    render_mode: str,
+    rasterize_mode: str,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """One camera, harmonics, colour and expected depth; the rows stay in their order."""
+    assert (eps2d, packed, render_mode, rasterize_mode) == (0.3, False, "RGB+ED", "classic")
+    assert colors.shape == (len(means), (sh_degree + 1) ** 2, 3)
+    assert viewmats.shape == (1, 4, 4)
+    camera = Camera(torch.linalg.inv(viewmats[0]), Ks[0], width, height, near=100 * near_plane)
+    gaussians = observed(means, quats, scales, opacities, colors)
+    n = len(means)
+    found = {
+        "radii": torch.zeros(1, n, 2, dtype=torch.int32),
+        "means2d": torch.full((1, n, 2), torch.nan),
+        "conics": torch.full((1, n, 3), torch.nan),
+        "depths": torch.full((1, n), torch.nan),
+        "tile_size": 16,
+        "isect_offsets": torch.zeros(1, -(-height // 16), -(-width // 16), dtype=torch.int32),
+    }
+    values = torch.zeros(1, n, 4)
+    for i in range(n):
+        own = project(gaussians[i : i + 1], camera)
+        if len(own.depths) == 0 or not touches(own, camera):
+            continue
+        found["radii"][0, i] = 1
+        found["means2d"][0, i], found["depths"][0, i] = own.centers[0], own.depths[0]
+        found["conics"][0, i] = own.precisions[0].flatten()[[0, 1, 3]]
+        values[0, i] = torch.cat([own.colours[0], own.depths])
+    found["flatten_ids"] = found["radii"][0, :, 0].nonzero()[:, 0].to(torch.int32)
+    tiles = (found["tile_size"], found["isect_offsets"], found["flatten_ids"])
+    places = found["means2d"], found["conics"]
+    sums, alphas = rasterize_to_pixels(*places, values, opacities[None], width, height, *tiles)
+    depth = sums[..., 3:] / alphas.clamp_min(1e-10)
+    return torch.cat([sums[..., :3], depth], dim=-1), alphas, found
+
+
+def touches(splats: Splats, camera: Camera) -> bool:
+    """Whether the box of a single splat reaches the image."""
+    covariance = torch.linalg.inv(splats.precisions[0])
+    reach = 3.33 * covariance.diagonal().sqrt()
+    size = torch.tensor([camera.width, camera.height])
+    nearest = splats.centers.clamp(min=torch.zeros(2), max=size - 0.5)
+    assert inside(nearest, splats.depths, camera).all()
+    return bool(((splats.centers[0] - nearest[0]).abs() < reach).all())
+
+
+def rasterize_to_pixels(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Sums of four channels by weight, and of the weights, of the Gaussians in `flatten_ids`."""
+    n = means2d.shape[1]
+    assert means2d.shape == (1, n, 2)
+    assert conics.shape == (1, n, 3)
+    assert colors.shape == (1, n, 4)
+    assert opacities.shape == (1, n)
+    assert isect_offsets.shape == (1, -(-image_height // tile_size), -(-image_width // tile_size))
+    ids = flatten_ids.long()
+    order = ids[colors[0, ids, 3].argsort(stable=True)]
+    precisions = conics[0, order][:, [0, 1, 1, 2]].view(-1, 2, 2)
+    values = colors[0, order]
+    splats = Splats(means2d[0, order], precisions, values[:, 3], opacities[0, order], values[:, :3])
+    x, y = torch.arange(image_width) + 0.5, torch.arange(image_height) + 0.5
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+    colour, depth, alpha = composite(splats, pixels)
+    size = (1, image_height, image_width)
+    return torch.cat([colour, depth[:, None]], dim=-1).view(*size, 4), alpha.view(*size, 1)
+
+
+def module() -> ModuleType:
+    """It, under the name of gsplat."""
+    made = ModuleType("gsplat")
+    made.rasterization, made.rasterize_to_pixels = rasterization, rasterize_to_pixels
+    return made

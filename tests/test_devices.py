@@ -1,0 +1,177 @@
+"""Everything works where its tensors lie: nothing brings in a tensor of another device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+
+from elsewhere import DEVICE, Elsewhere, MixedError, There, without_autocast
+from gscompleter import GSCompleter, load_reconstructor, load_renderer
+from gscompleter.baselines.optimization import OptimizationConfig, optimize
+from gscompleter.baselines.reggs import RegGSConfig, register_by_similarity
+from gscompleter.config import CompleterConfig
+from gscompleter.generators.agreement import AgreementConfig, compare
+from gscompleter.generators.diffusion.position_ids import source_ids
+from gscompleter.generators.diffusion.source_depth import context_depth, from_disparity, rescaled
+from gscompleter.metrics.scores import Outcome, Truth, score
+from gscompleter.reconstructors import reconstructed, tensors_in
+from gscompleter.reconstructors.feed_forward import (
+    DepthSplat,
+    FeedForward,
+    MVSplat,
+    VolSplat,
+    VolSplatConfig,
+)
+from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
+from gscompleter.reconstructors.feed_forward.depthsplat import VARIANTS
+from gscompleter.stages.anchor import lift
+from gscompleter.stages.context import depth_range_of_scene, init_context
+from gscompleter.stages.integration import keep_in_holes
+from gscompleter.types import Lift, Reconstruction, View
+from scenes import Room, camera_at, gaussians_of, view_of
+
+REFERENCE = load_renderer("reference")
+SWEEP = load_reconstructor("plane-sweep")
+SIZE = 20
+VIEWS = [view_of(Room(), camera_at(x, size=SIZE), i) for i, x in enumerate((-0.3, 0.1))]
+TARGET = camera_at(0.5, yaw=10, size=SIZE)
+
+
+@pytest.fixture
+def elsewhere(monkeypatch) -> Iterator[None]:
+    without_autocast(monkeypatch)
+    with Elsewhere():
+        yield
+
+
+@pytest.fixture
+def views(elsewhere) -> list[View]:
+    return [view.to(DEVICE) for view in VIEWS]
+
+
+def check_there(value: object) -> None:
+    """All tensors of a frozen value lie elsewhere, and there are some."""
+    found = dict(tensors_in(value, "it"))
+    assert found
+    assert [name for name, tensor in found.items() if not isinstance(tensor, There)] == []
+
+
+def few_steps(config: CompleterConfig) -> CompleterConfig:
+    """The same stages in less time."""
+    registration = replace(config.registration, iterations=2)
+    return replace(config, registration=registration, refine=replace(config.refine, iterations=2))
+
+
+@pytest.mark.parametrize("config", [CompleterConfig(), CompleterConfig.paper()])
+def test_a_completion_stays_on_the_device_of_its_views_and_is_that_of_the_cpu(views, config):
+    complete = GSCompleter(renderer=REFERENCE, config=few_steps(config))
+    done, plain = complete(views, TARGET.to(DEVICE)), complete(VIEWS, TARGET)
+    check_there(done)
+    assert len(done.added) > 0
+    assert torch.equal(done.scene.means.cpu(), plain.scene.means)
+    assert torch.equal(done.scene.opacities.cpu(), plain.scene.opacities)
+
+
+@pytest.mark.parametrize("ψ", ["mvsplat", "depthsplat", "volsplat"])
+def test_networks_reconstruct_where_the_views_lie_and_run_where_they_lie_themselves(elsewhere, ψ):
+    torch.manual_seed(0)
+    depth = DepthConfig("vits", 1, 4, 4)
+    network = {
+        "mvsplat": MVSplat,
+        "depthsplat": lambda: DepthSplat(VARIANTS["small-re10k-256x256"]),
+        "volsplat": lambda: VolSplat(VolSplatConfig(depth, voxel_resolution=0.02)),
+    }[ψ]().eval()
+    pair = [view_of(Room(), camera_at(x, size=64), i) for i, x in enumerate((-0.3, 0.1))]
+    network.requires_grad_(False)
+    there = [view.to(DEVICE) for view in pair]
+    check_there(reconstructed(FeedForward(network), there))
+    moved = FeedForward(network.to(DEVICE))
+    check_there(lift(moved, *there))
+    assert not any(
+        isinstance(tensor, There) for _, tensor in tensors_in(reconstructed(moved, pair), "it")
+    )
+
+
+def test_a_given_scene_tells_its_depth_range_anywhere(views):
+    scene = gaussians_of(VIEWS[0]).to(DEVICE)
+    near, far = depth_range_of_scene(scene, [view.camera for view in views], REFERENCE)
+    assert 0 < near < far
+
+
+def test_baselines_fit_on_any_device(views):
+    scene = gaussians_of(VIEWS[0]).to(DEVICE)
+    steps = OptimizationConfig(iterations=3, density_rounds=1, gradient_threshold=0.0)
+    fitted = optimize(scene, views, REFERENCE, config=steps)
+    check_there(fitted)
+    plain = optimize(gaussians_of(VIEWS[0]), VIEWS, REFERENCE, config=steps)
+    assert torch.allclose(fitted.gaussians.means.cpu(), plain.gaussians.means)
+    found = register_by_similarity(
+        gaussians_of(VIEWS[1]).to(DEVICE),
+        scene,
+        views[1],
+        REFERENCE,
+        config=RegGSConfig(iterations=2, components=20),
+    )
+    check_there(found.gaussians)
+
+
+def test_scores_are_those_of_the_cpu(views):
+    def scores(views: list[View], device: str | torch.device):
+        scene, added = (gaussians_of(view).to(device) for view in VIEWS)
+        hole = REFERENCE.render(scene, TARGET.to(device)).alpha < 0.5
+        target = view_of(Room(), TARGET).to(device)
+        outcome = Outcome(scene, added, added, hole, {})
+        return score(outcome, Truth(tuple(views), target, tuple(views)), REFERENCE)[0]
+
+    assert scores(views, DEVICE) == scores(VIEWS, "cpu")
+
+
+def test_what_diffusion_is_told_is_made_on_any_device(views):
+    render = REFERENCE.render(gaussians_of(VIEWS[0]).to(DEVICE), views[0].camera)
+    depth = context_depth(views[0], render)
+    guess = (2 / depth.clamp_min(0.1)).detach()
+    check_there((depth, rescaled(guess, render), from_disparity(guess, render)))
+    check_there(source_ids(depth, views[0].camera, TARGET.to(DEVICE), (8, 8), (8, 8)))
+    known = render.alpha > 0.5
+    check_there(compare(views[0].image, views[1].image, known, AgreementConfig(min_pixels=10)))
+
+
+@pytest.mark.parametrize("name", ["view_index", "pixel_index", "gaussians", "depths"])
+def test_a_model_that_leaves_a_tensor_on_the_cpu_is_named_with_it(views, name):
+    def careless(given: list[View]) -> Reconstruction:
+        whole = SWEEP(given)
+        part = getattr(whole, name)
+        left = (
+            tuple(replace(d, valid=d.valid.cpu()) for d in part)
+            if name == "depths"
+            else (part.to("cpu"))
+        )
+        return replace(whole, **{name: left})
+
+    for stage in (lambda: init_context(careless, views), lambda: lift(careless, *views)):
+        with pytest.raises(ValueError, match=f"returned the reconstruction.{name}.* on cpu"):
+            stage()
+
+
+def test_a_mixture_of_devices_is_an_error_as_on_a_gpu(views):
+    found = lift(SWEEP, views[0], views[1])
+    mask = torch.ones(SIZE, SIZE, dtype=torch.bool, device=DEVICE)
+    assert isinstance(found, Lift)
+    with pytest.raises(MixedError):
+        keep_in_holes(found.gaussians, found.pixel_index.cpu(), mask, views[0].camera)
+    there = views[0].image
+    for mixed in (
+        lambda: there + VIEWS[0].image,
+        lambda: VIEWS[0].image * there.mean(),
+        lambda: torch.stack([there.mean(), torch.tensor(1.0)]),
+        lambda: torch.rand(3, device=DEVICE, generator=torch.Generator()),
+    ):
+        with pytest.raises(MixedError):
+            mixed()
+    with pytest.raises(RuntimeError, match="numpy"):
+        there.numpy()
+    assert isinstance(there + torch.tensor(1.0), There)
+    assert there.new_tensor([1.0, 2.0]).tolist() == [1.0, 2.0]

@@ -1,0 +1,177 @@
+"""`make gpu` without a GPU: its parts run small on the CPU, and one that fails is a row."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+import gpu
+from gpu_report import Found, Row, page
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+SMALL = gpu.Bench("cpu", ((64, 64), (64, 80)), ("plane-sweep", "mvsplat-re10k"), ("float32",), 1)
+
+SCRIPT = """
+import sys, time, subprocess
+sys.path.append({benchmarks!r})
+from gpu_report import Part, Row, main, tried
+
+def good():
+    yield Row("speed", 12.5, "ms", "twice as fast")
+
+def failing():
+    yield Row("first", 1.0)
+    raise ValueError("no | such kernel\\nlog of a compiler")
+
+def endless():
+    yield Row("before", 2.0)
+    subprocess.run([sys.executable, "-c", "import time; time.sleep(600)"])
+
+def several():
+    yield from tried("this one", failing)
+    yield from tried("that one", good)
+
+parts = {{
+    "failing": Part("Fails", 60, failing),
+    "needy": Part("Needs it", 60, good, needs="failing"),
+    "endless": Part("Never ends", 3, endless),
+    "crash": Part("Crashes", 60, lambda: __import__("os").abort()),
+    "several": Part("Several", 60, several),
+    "good": Part("Works", 60, good),
+}}
+main(parts, lambda: {{"device": "a test"}}, "Parts.")
+"""
+
+
+def call(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """The script as a person calls it, writing into `folder`."""
+    script = folder / "script.py"
+    script.write_text(SCRIPT.format(benchmarks=str(BENCHMARKS)))
+    command = [sys.executable, str(script), "--out", str(folder), *options]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_a_part_that_fails_or_never_ends_is_a_row_and_the_rest_goes_on(tmp_path):
+    start = time.monotonic()
+    done = call(tmp_path)
+    assert done.returncode == 1, done.stderr
+    assert time.monotonic() - start < 60
+    parts = json.loads((tmp_path / "gpu.json").read_text())["parts"]
+    assert list(parts) == ["failing", "needy", "endless", "crash", "several", "good"]
+    rows = {name: part["rows"] for name, part in parts.items()}
+    first, reason = rows["failing"]
+    assert (first["what"], first["value"], first["failed"]) == ("first", 1.0, False)
+    assert reason["failed"]
+    assert reason["note"] == "ValueError: no / such kernel"
+    assert [row["note"] for row in rows["needy"]] == ["left out, for 'Fails' failed"]
+    assert [row["value"] for row in rows["endless"]] == [2.0, None]
+    assert rows["endless"][1]["note"] == "stopped after 3 s"
+    assert rows["crash"][0]["failed"]
+    assert [row["failed"] for row in rows["several"]] == [False, True, False]
+    assert rows["several"][1]["note"] == "ValueError: no / such kernel log of a compiler"
+    assert not any(row["failed"] for row in rows["good"])
+
+
+def test_the_page_names_the_device_and_every_row(tmp_path):
+    assert call(tmp_path, "--only", "good").returncode == 0
+    text = (tmp_path / "gpu.md").read_text()
+    assert "| device | a test |" in text
+    assert "## Works" in text
+    assert "| speed | 12.5 ms; twice as fast |" in text
+    assert "Fails" not in text
+    failed = page({}, {"it": Found("It", 1.0, (Row("x", note="why", failed=True),))})
+    assert "| x | **failed**: why |" in failed
+
+
+def test_all_parts_together_keep_to_their_time(tmp_path):
+    assert call(tmp_path, "--seconds", "0", "--only", "good", "several").returncode == 1
+    parts = json.loads((tmp_path / "gpu.json").read_text())["parts"]
+    for part in parts.values():
+        assert [row["note"] for row in part["rows"]] == [
+            "left out, for the 0 s of all parts were over"
+        ]
+
+
+def test_a_part_that_is_none_is_refused(tmp_path):
+    done = call(tmp_path, "--only", "speed")
+    assert done.returncode != 0
+    assert "no part 'speed'; choose of failing, needy" in done.stderr
+    assert not (tmp_path / "gpu.json").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_one_sentence_says_so_and_nothing_is_written(tmp_path):
+    command = [sys.executable, str(BENCHMARKS / "gpu.py"), "--out", str(tmp_path)]
+    paths = [str(BENCHMARKS.parent / name) for name in ("src", "tests")]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env={"PYTHONPATH": ":".join(paths)}
+    )
+    assert done.returncode == 2
+    assert done.stderr.strip().count("\n") == 0
+    assert "needs a CUDA device" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_limits_leave_time_for_what_comes_after_the_build():
+    assert all(part.limit <= 270 for part in gpu.PARTS.values())
+    assert {part.needs for part in gpu.PARTS.values()} == {"build", None}
+
+
+@pytest.mark.parametrize("part", ["built", "agreement", "renderer", "stages", "models"])
+def test_every_part_gives_rows(part):
+    rows = list(getattr(gpu, part)(SMALL))
+    assert rows
+    assert [row for row in rows if row.failed or row.value is None] == []
+    if part == "agreement":
+        assert max(row.value for row in rows if "image" in row.what) < 1e-2
+        assert max(row.value for row in rows if "slopes in sh" in row.what) < 1e-2
+
+
+def test_every_reconstructor_completes_a_room_and_one_that_fails_is_a_row(monkeypatch):
+    rows = list(gpu.completions(SMALL))
+    assert [row.what for row in rows if not row.failed] == list(SMALL.models)
+    known = gpu.model
+    monkeypatch.setattr(gpu, "model", lambda name, *a: known(name, *a) if "-" in name else 1 / 0)
+    broken = gpu.Bench("cpu", SMALL.sizes, ("none", "plane-sweep"), repetitions=1)
+    failed, fine = gpu.completions(broken)
+    assert failed.failed
+    assert failed.note.startswith("ZeroDivisionError")
+    assert not fine.failed
+
+
+def test_the_tests_count_where_they_passed_and_only_there(tmp_path):
+    (tmp_path / "test_it.py").write_text("def test_good(): pass\ndef test_bad(): assert 0\n")
+    path = str(tmp_path / "test_it.py")
+    (passed,) = gpu.tested(path, "-k", "good", "-c", "/dev/null")
+    assert not passed.failed
+    assert "1 passed" in passed.note
+    named, whole = gpu.tested(path, "-c", "/dev/null")
+    assert named.failed
+    assert "test_bad" in named.note
+    assert whole.failed
+    (nothing,) = gpu.tested(path, "-k", "no_such", "-c", "/dev/null")
+    assert nothing.failed
+
+
+def test_pe_field_paints_with_any_model_of_its_kind():
+    pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
+    pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
+    import tiny_diffusion
+    from gscompleter.generators.diffusion.kontext import Kontext, Prompt
+    from gscompleter.generators.diffusion.rotary import with_per_head_positions
+
+    def tiny(device: str) -> Kontext:
+        pipeline = tiny_diffusion.kontext_pipeline()
+        with_per_head_positions(pipeline.transformer)
+        prompt = Prompt(torch.zeros(1, 4, 32), torch.zeros(1, 24))
+        return Kontext(pipeline, prompt, device, torch.float32)
+
+    (row,) = gpu.pe_field(SMALL, tiny)
+    assert row.what == "64x80, 4 steps"
+    assert row.value > 0
