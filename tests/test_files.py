@@ -120,7 +120,7 @@ def test_checking_leaves_nothing_behind_and_does_not_touch_what_is_there(tmp_pat
 
 
 def test_a_folder_that_cannot_take_results_is_refused_before_any_computing(tmp_path, results):
-    with pytest.raises(InputError, match="is not empty; .* --overwrite"):
+    with pytest.raises(InputError, match="is not empty; .* overwrite"):
         check_output(results)
     with pytest.raises(InputError, match="is a file, and a folder is needed"):
         check_output(results / "mine.txt", overwrite=True)

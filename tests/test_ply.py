@@ -221,7 +221,7 @@ def test_damaged_gaussians_are_counted_and_dropped_if_asked(tmp_path, name, valu
     gaussians = random_gaussians(20)
     getattr(gaussians, name)[:3].fill_(value)
     path = saved(tmp_path, gaussians)
-    refused(path, "3 of 20 Gaussians .* --drop-nonfinite")
+    refused(path, "3 of 20 Gaussians .* drop what is not finite")
     assert len(load_ply(path, drop_nonfinite=True)) == 17
 
 

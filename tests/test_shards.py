@@ -11,8 +11,8 @@ import pytest
 
 from gscompleter import InputError
 from gscompleter.commands import evaluate as command
+from gscompleter.config.generators import PEFieldSettings
 from gscompleter.data.cases import read_cases
-from gscompleter.generators import DiffusionSettings
 from gscompleter.reports.tables import tables
 from gscompleter.runs import store
 from gscompleter.runs.runner import RowCounts, RunConfig, deciding, evaluate
@@ -108,12 +108,14 @@ def test_a_folder_of_another_version_is_refused(tmp_path):
 
 def test_a_folder_remembers_what_its_generator_was_told(tmp_path):
     def config(**settings) -> RunConfig:
-        return RunConfig(generator="pe-field", generator_settings=DiffusionSettings(**settings))
+        return RunConfig(generator="pe-field", generator_settings=PEFieldSettings(**settings))
 
     claim(tmp_path, deciding(config(steps=4)))
     claim(tmp_path, deciding(config(steps=4, offload=True)))  # which changes no number
     with pytest.raises(InputError, match="holds a run with generator_steps 4, and 8 is asked for"):
         claim(tmp_path, deciding(config(steps=8)))
+    with pytest.raises(InputError, match=r"run with generator_\w+ \d, and None is asked"):
+        claim(tmp_path, deciding(RunConfig(generator="pe-field")))
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(InputError, match=r"run.json is not JSON .* name another folder"):
         claim(tmp_path, deciding(config(steps=4)))

@@ -11,6 +11,12 @@ class InputError(ValueError):
     line prints it without a traceback and exits with code 2.
     """
 
+    def __init__(self, message: str, argument: str | None = None) -> None:
+        """The `argument` of the function, or the name of the setting, that the user can mend. The
+        command line names its option of that name."""
+        super().__init__(message)
+        self.argument = argument
+
 
 def quoted(value: object, length: int = LONGEST_QUOTE) -> str:
     """What was given as a sentence can hold it: on one line, its middle left out if it is long.

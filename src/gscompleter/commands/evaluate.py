@@ -13,7 +13,6 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.complete import generator_settings
 from gscompleter.commands.options import EvaluateOptions, IndexOptions, TablesOptions
 from gscompleter.data.cases import read_cases
 from gscompleter.data.datasets import Skipped, open_clips, usable
@@ -47,8 +46,6 @@ def run_evaluation(options: EvaluateOptions) -> None:
     console = Console(stderr=True, quiet=options.quiet)
     methods = methods_named(options.methods)
     shard = parse_shard(options.shard)
-    if options.limit is not None and options.limit < 1:
-        raise InputError(f"--limit is {options.limit}, and at least one case is needed.")
     check_resolution(options.resolution)
     skipped: list[Skipped] = []
     tasks = chosen_tasks(options, skipped)
@@ -57,8 +54,8 @@ def run_evaluation(options: EvaluateOptions) -> None:
     config = RunConfig(
         reconstructor=options.reconstructor,
         weights=None if options.weights is None else str(options.weights),
-        generator=options.synthesis.generator,
-        generator_settings=generator_settings(options.synthesis),
+        generator=options.synthesis.name,
+        generator_settings=options.synthesis.settings(),
         device=choose_device(options.device),
         seed=options.seed,
         source=source_of(options),

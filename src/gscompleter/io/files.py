@@ -186,8 +186,9 @@ def _check_free(path: Path, target: Path, overwrite: bool) -> None:
         raise InputError(_cannot_write(path, error)) from error
     if not overwrite and any(not name.startswith(_MARK) for name in entries):
         raise InputError(
-            f"The output folder {path} is not empty; name another one, or use --overwrite to "
-            "replace the results in it."
+            f"The output folder {path} is not empty; name another one, or overwrite the "
+            "results in it.",
+            "overwrite",
         )
 
 

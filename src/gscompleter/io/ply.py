@@ -325,7 +325,8 @@ def _whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
     if not drop_nonfinite:
         raise InputError(
             f"{path} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a rotation of "
-            "zeros; mend it, or go on without them by --drop-nonfinite."
+            "zeros; mend it, or drop what is not finite.",
+            "drop_nonfinite",
         )
     if bad == len(good):
         raise InputError(f"{path} holds no Gaussian without NaN or infinity; write it anew.")

@@ -11,8 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
-from gscompleter.generators import DiffusionSettings, Generator, load_generator
+from gscompleter.generators import Generator, load_generator
 from gscompleter.progress import shown_on, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
@@ -42,8 +43,8 @@ class RunConfig:
     weights: str | None = None
     """The file of the reconstructor's weights; None takes the published ones."""
     generator: str = "warp-inpaint"
-    generator_settings: DiffusionSettings = DiffusionSettings()
-    """What a generator with weights is told."""
+    generator_settings: GeneratorSettings | None = None
+    """What the generator is told; None leaves all as it is."""
     device: Literal["cpu", "cuda"] = "cpu"
     seed: int = 0
     """Of everything random."""
@@ -294,6 +295,6 @@ def deciding(config: RunConfig) -> dict[str, Any]:
     Where the parts of a generator wait is not among it.
     """
     values = asdict(config)
-    settings = values.pop("generator_settings")
-    del settings["offload"]
+    settings = values.pop("generator_settings") or {}
+    settings.pop("offload", None)
     return {**values, **{f"generator_{name}": value for name, value in settings.items()}}

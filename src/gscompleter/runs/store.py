@@ -105,9 +105,9 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
             raise InputError(f"{out} holds something other than a run; name another folder.")
         create_json(out / RUN, wanted)
     found = settings_of(out)
-    for key, value in wanted.items():
-        if found.get(key) != value:
-            there, asked = quoted(repr(found.get(key))), quoted(repr(value))
+    for key in {**wanted, **found}:
+        if found.get(key) != wanted.get(key):
+            there, asked = quoted(repr(found.get(key))), quoted(repr(wanted.get(key)))
             raise InputError(
                 f"{out} holds a run with {key} {there}, and {asked} is asked for; name another "
                 "folder."
