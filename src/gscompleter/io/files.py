@@ -41,15 +41,20 @@ _REASONS = {
     errno.ENAMETOOLONG: "that name is too long; choose a shorter one",
 }
 
+_NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 
 
 @contextlib.contextmanager
-def replacing(path: Path | str) -> Iterator[BinaryIO]:
+def replacing(path: Path | str, first_stays: bool = False) -> Iterator[BinaryIO]:
     """A file to write into that takes the name `path` once everything is on the disk.
 
     It lies beside `path` under a temporary name until then, so that a reader never sees half a
     file and an existing one survives every failure.
+
+    Args:
+        path: The file.
+        first_stays: Leave the file that another process made of that name meanwhile.
 
     Raises:
         InputError: where the file cannot be written: no permission, no space, a folder.
@@ -66,13 +71,30 @@ def replacing(path: Path | str) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            os.replace(temporary, target)
+            if not (first_stays and _linked(temporary, target)):
+                os.replace(temporary, target)
     except OSError as error:
         raise InputError(_cannot_write(path, error)) from error
     finally:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
+
+
+def _linked(temporary: Path, target: Path) -> bool:
+    """Whether the file has the name `target` too, or another had it first.
+
+    False where the file system has no hard links, and so no name that only one can take.
+    """
+    try:
+        os.link(temporary, target)
+    except FileExistsError:
+        return True
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        return False
+    return True
 
 
 def check_output(path: Path | str, overwrite: bool = False) -> None:
