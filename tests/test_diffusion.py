@@ -333,7 +333,7 @@ def test_a_smoke_test_of_an_evaluation_with_random_weights(inpaint_folder, tmp_p
     remembered = json.loads((tmp_path / "out" / "run.json").read_text())
     assert remembered["generator_steps"] == 2
     assert remembered["generator_path"] == str(inpaint_folder)
-    (row,) = (tmp_path / "out" / "cases").glob("*/full.json")
+    (row,) = (tmp_path / "out" / "tasks").glob("*/full.json")
     assert json.loads(row.read_text())["error"] is None
 
 
