@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from gscompleter.geometry import quats_from, quats_product, rotations_from
 from gscompleter.reconstructors.feed_forward.cameras import Cameras
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
+from parity import relative_error
 
 STORED = Path(__file__).parent / "fixtures" / "feed_forward"
 EVERY = 97
@@ -95,34 +96,30 @@ class Case:
             "scales": predicted.scales,
         }
         errors = {
-            name: error(value.flatten(1, 3)[:, ::step], self.tensor(f"out_{name}"))
+            name: relative_error(value.flatten(1, 3)[:, ::step], self.tensor(f"out_{name}"))
             for name, value in values.items()
         }
         quats = self.tensor("out_rotations_xyzw_cam").roll(1, -1)
         ours = in_camera.flatten(1, 3)[:, ::step]
         same_sign = (ours * quats).sum(-1, keepdim=True).sign()  # q and -q are one rotation
-        errors["quats"] = error(same_sign * ours, quats)
-        errors["depth"] = error(predicted.depth, self.tensor("out_depth"))
+        errors["quats"] = relative_error(same_sign * ours, quats)
+        errors["depth"] = relative_error(predicted.depth, self.tensor("out_depth"))
         harmonics = self.tensor("out_harmonics").transpose(-1, -2)
         ours = predicted.sh.flatten(1, 3)[:, ::step]
         for degree in range(round(ours.shape[-2] ** 0.5)):
             part = slice(degree**2, (degree + 1) ** 2)
-            errors[f"harmonics{degree}"] = error(ours[..., part, :], harmonics[..., part, :])
+            errors[f"harmonics{degree}"] = relative_error(
+                ours[..., part, :], harmonics[..., part, :]
+            )
         return errors
 
     def intermediate_errors(self, between: dict[str, Tensor]) -> dict[str, float]:
         """Likewise of the values between the layers, all that are stored."""
         names = [name[4:] for name in self.values if name.startswith("mid_")]
         return {
-            name: error(between[name].flatten()[::EVERY], self.tensor(f"mid_{name}"))
+            name: relative_error(between[name].flatten()[::EVERY], self.tensor(f"mid_{name}"))
             for name in names
         }
-
-
-def error(ours: Tensor, expected: Tensor) -> float:
-    """Largest difference over the largest expected value."""
-    assert ours.shape == expected.shape, (ours.shape, expected.shape)
-    return ((ours - expected).abs().max() / expected.abs().max()).item()
 
 
 @dataclass

@@ -6,7 +6,7 @@ import torch
 
 from gscompleter import InputError
 from gscompleter.generators import Synthesis, as_generator
-from gscompleter.generators.agreement import AgreementConfig, checked, compare
+from gscompleter.generators.agreement import checked, compare
 from gscompleter.generators.warp import Warped
 from gscompleter.generators.warp_inpaint import WarpInpaint
 from gscompleter.stages.anchor import synthesize
@@ -97,18 +97,16 @@ def test_of_images_that_all_disagree_the_nearest_is_kept():
     assert not any(one.agrees for one in found.values())
     best = min(found, key=lambda seed: found[seed].residual)
     assert len({one.residual for one in found.values()}) == 3
-    image, _ = told(lambda seed: images[seed], 7, observed(), AgreementConfig(retries=2))
+    image, _ = told(lambda seed: images[seed], 7, observed(), 2)
     assert torch.equal(image, images[best])
 
 
 def test_a_seed_that_gives_nan_is_passed_over_and_nothing_but_nan_is_refused():
     broken = torch.full_like(TRUTH, float("nan"))
-    image, _ = told(
-        lambda seed: broken if seed == 0 else TRUTH, 0, observed(), AgreementConfig(retries=1)
-    )
+    image, _ = told(lambda seed: broken if seed == 0 else TRUTH, 0, observed(), 1)
     assert (image - TRUTH).abs().max() < 1e-3
     with pytest.raises(InputError, match=r"no finite image \(2 seed"):
-        checked(lambda seed: broken, 0, observed(), AgreementConfig(retries=1))
+        checked(lambda seed: broken, 0, observed(), 1)
 
 
 def test_in_fog_anything_agrees():
@@ -123,12 +121,12 @@ def test_further_seeds_are_tried_where_asked_and_only_until_one_agrees():
         tried.append(seed)
         return SHIFTED if seed == 9 else NOISE
 
-    image, notes = told(paint, 7, observed(), AgreementConfig(retries=5))
+    image, notes = told(paint, 7, observed(), 5)
     assert tried == [7, 8, 9]
     assert (image - TRUTH).abs().max() < 0.01
     assert notes[-1].startswith("3 seeds were tried")
     tried.clear()
-    _, notes = told(paint, 0, observed(), AgreementConfig(retries=1))
+    _, notes = told(paint, 0, observed(), 1)
     assert tried == [0, 1]
     assert "best of 2 seeds" in notes[0]
 

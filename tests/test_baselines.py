@@ -34,6 +34,7 @@ from gscompleter.baselines.reggs import (
 )
 from gscompleter.metrics.image import psnr
 from gscompleter.types import Gaussians, View, merge
+from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 
 FIXTURE = Path(__file__).parent / "fixtures" / "reggs_mw2.npz"
@@ -53,20 +54,20 @@ def mixtures(upstream: dict[str, torch.Tensor]) -> tuple[Mixture, Mixture]:
 
 def test_reduced_mixtures_equal_upstreams(upstream):
     for mixture, name in zip(mixtures(upstream), "ab", strict=True):
-        assert torch.allclose(mixture.means, upstream[f"{name}_mu"], atol=1e-5)
-        assert torch.allclose(mixture.covariances, upstream[f"{name}_cov"], atol=1e-5)
-        assert torch.allclose(mixture.weights, upstream[f"{name}_w"], atol=1e-6)
+        assert_close(mixture.means, upstream[f"{name}_mu"], "mu")
+        assert_close(mixture.covariances, upstream[f"{name}_cov"], "cov")
+        assert_close(mixture.weights, upstream[f"{name}_w"], "w")
 
 
 def test_costs_loss_and_gradient_equal_upstreams(upstream):
     a, b = mixtures(upstream)
-    assert torch.allclose(pairwise_costs(a, b), upstream["cost"], rtol=1e-4, atol=1e-4)
+    assert_close(pairwise_costs(a, b), upstream["cost"], "cost")
     scale = torch.tensor(upstream["scale"].item(), dtype=torch.float32, requires_grad=True)
     larger = Mixture(a.means * scale, a.covariances * scale**2, a.weights)
     loss = mixture_wasserstein(larger, b)
     (slope,) = torch.autograd.grad(loss, scale)
-    assert loss.item() == pytest.approx(upstream["loss"].item(), rel=1e-4)
-    assert slope.item() == pytest.approx(upstream["grad_scale"].item(), rel=1e-4)
+    assert_close(loss, upstream["loss"], "loss")
+    assert_close(slope, upstream["grad_scale"], "grad_scale")
 
 
 def test_the_root_squared_is_the_matrix():

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,14 @@ import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
+from gscompleter.cli import parsed
+from gscompleter.config import CompleterConfig
+from gscompleter.config.generators import (
+    GENERATORS,
+    DiffusersInpaintSettings,
+    PEFieldSettings,
+    WarpInpaintSettings,
+)
 from gscompleter.data.scene import write_cameras
 from scenes import camera_at, photographed
 
@@ -159,6 +168,15 @@ def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
         ({"target": (-1,)}, "-1"),
         ({"target": ()}, "at least one"),
         ({"target": ("nowhere.json",)}, "nowhere.json"),
+        ({"target": ("²",)}, "²"),
+        ({"target": ("--2",)}, "--2"),
+        ({"target": ("9" * 5000,)}, "no frame 999"),
+        ({"target": ("x" * 5000,)}, "xxx"),
+        ({"context": ("0,1",)}, "'0,1'"),
+        ({"context": ("²", 1)}, "'²'"),
+        ({"context": (-1, 0)}, "context must be greater than or equal to 0, got -1 (--context)."),
+        ({"context": ("9" * 5000, 0)}, "--context"),
+        ({"context": (10**12, 0)}, "context must be less than 1000000000"),
     ],
 )
 def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, sentence):
@@ -179,6 +197,25 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--generator", "dall-e"), "no generator 'dall-e'"),
         (("--reconstructor", "nerf"), "no reconstructor 'nerf'"),
         (("--scene", "nowhere.ply"), "nowhere.ply"),
+        (("--seed", -1), "seed must be greater than or equal to 0, got -1 (--seed)."),
+        (("--seed", 2**64), "seed must be less than 4611686018427387904"),
+        (("--seed", 1.5), "'1.5'; give --seed INT (see gscompleter complete --help)."),
+        (("--sed", 1), "Unrecognized options: --sed, 1 (see gscompleter complete --help)."),
+        (("--device", "tpu"), "invalid choice 'tpu' for argument '--device'."),
+        (("--near", "a" * 5000), "aaa…aaa"),
+        (("--config",), "Missing value for argument '--config'."),
+        (("--config", "c" * 5000), "no config 'ccc"),
+        (("--config", "nowhere.yaml"), "nowhere.yaml"),
+        (("--config.margin", 1e9), "got 1000000000.0 (--config.margin)."),
+        (("--config.margin", "nan"), "config.margin must be a finite number"),
+        (("--config.registration.beta1", 1), "config.registration.beta1 must be less than 1"),
+        (("--config.registration.iterations", 10**12), "(--config.registration.iterations)."),
+        (("--config.registration.iterations", "many"), "'many'"),
+        (("--config.registration.speed", 1), "--config.registration.speed"),
+        (("--config.registration.footprint", "round"), "'round'"),
+        (("--generator-steps", 8, "--generator", "oracle"), "choose pe-field or diffusers-inp"),
+        (("--generator-steps", 0, "--generator", "pe-field"), "got 0 (--generator-steps)."),
+        (("--generator-steps", "few"), "'few'"),
     ],
 )
 def test_wrong_options_are_refused(scene, tmp_path, monkeypatch, capsys, more, sentence):
@@ -186,10 +223,80 @@ def test_wrong_options_are_refused(scene, tmp_path, monkeypatch, capsys, more, s
     refused(monkeypatch, capsys, out, complete(scene, out, *more), sentence)
 
 
+@pytest.mark.parametrize("words", [(), ("compleat",), ("complete",), ("models", "--all"), ("--x",)])
+def test_what_is_no_command_gets_a_sentence_too(monkeypatch, capsys, words):
+    assert run(monkeypatch, *words) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("gscompleter: ")
+    assert said.err.count("\n") == 1
+    assert "--help)." in said.err
+    assert said.out == ""
+
+
+def config_of(scene, tmp_path, monkeypatch, *more) -> CompleterConfig:
+    """The settings that a command leads to."""
+    words = [str(word) for word in complete(scene, tmp_path / "out", *more)]
+    return parsed(words).config
+
+
+def test_single_settings_are_applied_over_those_that_are_named(scene, tmp_path, monkeypatch):
+    assert config_of(scene, tmp_path, monkeypatch) == CompleterConfig()
+    one = ("--config.registration.iterations", 7)
+    config = config_of(scene, tmp_path, monkeypatch, *one)
+    assert config == replace(
+        CompleterConfig(), registration=replace(CompleterConfig().registration, iterations=7)
+    )
+    paper = CompleterConfig.paper()
+    config = config_of(scene, tmp_path, monkeypatch, *one, "--config", "paper")
+    assert config == replace(paper, registration=replace(paper.registration, iterations=7))
+    file = tmp_path / "mine.yaml"
+    file.write_text("base: paper\nmargin: 0.1\n")
+    changes = ("--config.harm.tolerance", 0.5, "--config.registration.mask_occluded", "True")
+    config = config_of(scene, tmp_path, monkeypatch, f"--config={file}", *changes)
+    assert (config.margin, config.harm.tolerance) == (0.1, 0.5)
+    assert config.registration == replace(paper.registration, mask_occluded=True)
+
+
+def test_a_single_setting_reaches_the_completion_and_its_summary(scene, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    more = ("--config", "no-da", "--config.registration.iterations", 3, "--quiet")
+    assert run(monkeypatch, *complete(scene, out, *more)) == 0
+    config = json.loads((out / "summary.json").read_text())["settings"]["config"]
+    assert config["registration"]["iterations"] == 3
+    assert config["registration"]["affine"]["bridge"] == "none"
+
+
+def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
+    words = ("--generator", "pe-field", "--generator-path", "a/b", "--generator-steps", 8)
+    words += ("--generator-retries", 2, "--generator-depth", "monocular", "--generator-at-once", 3)
+    options = parsed([str(w) for w in complete(scene, tmp_path, *words, "--generator-offload")])
+    assert options.synthesis.settings() == PEFieldSettings("a/b", 2, True, 8, "monocular", 3)
+    words = ("--generator", "diffusers-inpaint", "--generator-prompt", "a quiet street")
+    options = parsed([str(word) for word in complete(scene, tmp_path, *words)])
+    assert options.synthesis.settings() == DiffusersInpaintSettings(prompt="a quiet street")
+    options = parsed([str(word) for word in complete(scene, tmp_path)])
+    assert options.synthesis.settings() == WarpInpaintSettings()
+
+
+def test_help_knows_every_setting(monkeypatch, capsys):
+    assert run(monkeypatch, "complete", "--help") == 0
+    said = capsys.readouterr().out
+    for kind in GENERATORS.values():
+        assert all(f"--generator-{f.name.replace('_', '-')}" in said for f in fields(kind))
+    assert "--config.registration.affine.min-agreement" in said
+    assert "How many further seeds are tried" in said
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_refused(scene, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
-    refused(monkeypatch, capsys, out, complete(scene, out, "--device", "cuda"), "--device cpu")
+    refused(
+        monkeypatch,
+        capsys,
+        out,
+        complete(scene, out, "--device", "cuda"),
+        "choose the device cpu (--device)",
+    )
 
 
 def test_a_missing_folder_is_refused(tmp_path, monkeypatch, capsys):
@@ -304,7 +411,7 @@ def test_help_does_not_wait_for_torch():
         "from gscompleter.cli import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
-        "heavy = {'torch', 'numba', 'cv2', 'skimage', 'numpy'} & set(sys.modules)\n"
+        "heavy = {'torch', 'numba', 'cv2', 'skimage', 'numpy', 'pydantic'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -313,11 +420,13 @@ def test_help_does_not_wait_for_torch():
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills with a POSIX signal")
-@pytest.mark.parametrize("delay", [1.0, 2.5, 4.0, 5.5])
-def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, delay):
+@pytest.mark.parametrize("written", [2, 4, 8])
+def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
+    """The process is killed once it has begun to write so many files and folders."""
     out = tmp_path / "out"
     process = gscompleter(*complete(scene, out, "--quiet"))
-    time.sleep(delay)
+    while process.poll() is None and len(list(tmp_path.rglob("*.*"))) < written:
+        time.sleep(0.001)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     for name in ("completed.ply", "context.ply"):

@@ -20,6 +20,7 @@ from gscompleter.stages.anchor import lift
 from gscompleter.stages.integration import hole_mask
 from gscompleter.stages.registration import apply_affine
 from gscompleter.types import Camera, DepthMap, Gaussians, Reconstruction, View, merge
+from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 
 SIZE = 64
@@ -188,9 +189,9 @@ def test_targets_are_synthesized_together_where_the_generator_can():
             nearest, wide, context = request.nearest, request.target, request.context
             assert wide.width > SIZE  # with its margin
             assert nearest is context.views[1]
-            assert torch.equal(context.at_target.alpha, renderer.render(scene, wide).alpha)
+            assert_close(context.at_target.alpha, renderer.render(scene, wide).alpha, "alpha")
             for view, seen in zip(context.views, context.at_views, strict=True):
-                assert torch.equal(seen.alpha, renderer.render(scene, view.camera).alpha)
+                assert_close(seen.alpha, renderer.render(scene, view.camera).alpha, "alpha")
     assert [result.notes[:1] for result in together.targets] == [
         ("One of 1.",),
         ("The target is a context view: nothing to complete.",),

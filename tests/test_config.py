@@ -1,8 +1,19 @@
 """Settings by name and from YAML."""
 
+from pathlib import Path
+
 import pytest
 
-from gscompleter.config import ABLATIONS, CompleterConfig, load_config, named_config
+from gscompleter.config import (
+    ABLATIONS,
+    AffineConfig,
+    CompleterConfig,
+    HoleConfig,
+    RefineConfig,
+    load_config,
+    named_config,
+)
+from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 
 
@@ -34,31 +45,111 @@ def test_without_anything_is_without_each():
 
 def test_a_yaml_file_names_only_what_differs(tmp_path):
     file = tmp_path / "mine.yaml"
-    file.write_text("base: paper\nholes: {dilation: 5}\nregistration: {affine: {max_trials: 64}}\n")
+    file.write_text("base: paper\nholes: {dilation: 5}\nregistration: {affine: {bridge: none}}\n")
     config = load_config(str(file))
-    assert config.holes.dilation == 5
-    assert config.registration.affine.max_trials == 64
+    assert config.holes == HoleConfig(dilation=5, neighbourhood=None)
+    assert config.registration.affine == AffineConfig(bridge="none", min_agreement=None)
     assert config.registration.step == "literal"
+
+
+def test_a_whole_number_is_a_float_and_an_empty_file_changes_nothing(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("margin: 1")
+    assert load_config(str(file)).margin == 1.0
+    file.write_text("")
+    assert load_config(str(file)) == CompleterConfig()
+
+
+def refused(path: Path, text: str, sentence: str) -> None:
+    """The file is refused at once, in a sentence of a readable length."""
+    path.write_text(text)
+    with pytest.raises(InputError, match=sentence) as told:
+        load_config(str(path))
+    assert len(str(told.value)) < 250 + len(str(path))
+    assert "\n" not in str(told.value)
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("holes: {dilatation: 5}", "no setting 'dilatation'; choose one of max_alpha, dilation"),
-        ("holes: {dilation: many}", "dilation must be int, got 'many'"),
-        ("holes: 3", "holes holds settings of its own"),
-        ("registration: {step: tiny}", "step must be one of relative, literal"),
-        ("harm: {tolerance: true}", "tolerance must be float or null"),
+        ("holes: {dilatation: 5}", "no setting 'holes.dilatation'; choose one of max_alpha, dil"),
+        ("holes: {dilation: many}", "holes.dilation must be a valid integer, got 'many'"),
+        ("holes: {dilation: '5'}", "holes.dilation must be a valid integer, got '5'"),
+        ("holes: {dilation: 2.5}", "holes.dilation must be a valid integer, got 2.5"),
+        ("holes: {dilation: -1}", "holes.dilation must be greater than or equal to 0, got -1"),
+        ("holes: {dilation: [1, 2]}", r"holes.dilation must be a valid integer, got \[1, 2\]"),
+        ("holes: 3", "holes holds settings of its own, got 3"),
+        ("holes: [1]", r"holes holds settings of its own, got \[1\]"),
+        ("holes:", "holes holds settings of its own, got None"),
+        ("registration: {step: tiny}", "registration.step must be 'relative' or 'literal', got 't"),
+        ("registration: {beta1: 1}", "registration.beta1 must be less than 1, got 1"),
+        ("registration: {iterations: 1000000000000}", "iterations must be less than or equal to"),
+        ("registration: {learning_rate: 0}", "learning_rate must be greater than 0, got 0"),
+        ("harm: {tolerance: true}", "harm.tolerance must be a valid number, got True"),
+        ("harm: {max_trials: 0}", "no setting 'harm.max_trials'; choose one of tolerance"),
+        ("margin: .nan", "margin must be a finite number, got nan"),
+        ("margin: .inf", "margin must be a finite number, got inf"),
+        ("margin: -0.5", "margin must be greater than or equal to 0, got -0.5"),
+        ("margin: 1e9", "margin must be a valid number, got '1e9'"),  # no number in YAML 1.1
+        ("margin: 1.0e+9", "margin must be less than or equal to 4, got 1000000000.0"),
+        ("margin: 2024-01-31", "margin must be a valid number, got '2024-01-31'"),
+        ("1: 2", "no setting '1'"),
+        ("2024-01-31: 2", "is not YAML"),
+        ("margin: 2024-13-45", "is not YAML: month must be in 1..12"),
         ("- 1", "must map settings to values"),
+        ("0", "must map settings to values"),
         ("a: [", "is not YAML"),
+        ("a: \x07", "is not YAML"),
+        ("a: !!python/object/apply:os.getcwd []", "is not YAML: could not determine a constructor"),
         ("base: papper", "no config 'papper'"),
+        ("base: [paper]", "no config"),
     ],
 )
 def test_a_wrong_setting_gets_a_sentence(tmp_path, text, sentence):
-    file = tmp_path / "mine.yaml"
-    file.write_text(text)
-    with pytest.raises(InputError, match=sentence):
-        load_config(str(file))
+    refused(tmp_path / "mine.yaml", text, sentence)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("margin: " + "9" * 400, "margin must be a finite number"),
+        ("margin: " + "9" * 5000, "is not YAML: Exceeds the limit"),
+        ("margin: 0x" + "f" * 9000, "is not YAML: Exceeds the limit"),
+        ("margin: " + "[" * 20000 + "]" * 20000, "nested too deeply"),
+        ("a: " * 2000 + "1", "is not YAML"),
+        ("margin: " + "x" * 10**6, "has more than 65,536 characters"),
+        ("x" * 1000 + ": 1", "There is no setting 'xxx"),
+        ("margin: " + "x" * 60000, "margin must be a valid number, got 'xxx"),
+        ("\n".join(f"a{i}: &a{i} [{f'*a{i - 1},' * 9 if i else 1}]" for i in range(20)), "aliases"),
+    ],
+    ids=["400 digits", "5000", "hex", "deep", "keys", "long", "name", "value", "aliases"],
+)
+def test_a_hostile_file_is_refused_at_once(tmp_path, text, sentence):
+    refused(tmp_path / "mine.yaml", text, sentence)
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path):
+    (tmp_path / "mine.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="is not YAML"):
+        load_config(str(tmp_path / "mine.yaml"))
+
+
+@pytest.mark.parametrize("name", ["default", "paper", *ABLATIONS])
+def test_every_named_config_is_within_its_ranges(name):
+    assert checked(named_config(name)) == named_config(name)
+
+
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [
+        (CompleterConfig(margin=float("nan")), "margin"),
+        (CompleterConfig(refine=RefineConfig(iterations=-1)), "refine.iterations"),
+    ],
+)
+def test_python_is_checked_alike_and_the_argument_is_named(config, name):
+    with pytest.raises(InputError, match=name) as told:
+        checked(config, "config.")
+    assert told.value.argument == f"config.{name}"
 
 
 def test_an_unknown_name_or_missing_file_gets_a_sentence():

@@ -22,8 +22,8 @@ from safetensors.torch import load_file, save_file
 import tiny_diffusion
 from command import run
 from gscompleter import InputError, load_generator, load_renderer
-from gscompleter.generators import DiffusionSettings, Request
-from gscompleter.generators.agreement import AgreementConfig
+from gscompleter.config.generators import DiffusersInpaintSettings, PEFieldSettings, settings_class
+from gscompleter.generators import Request
 from gscompleter.generators.diffusion.inpaint import (
     DiffusersInpaint,
     completed_warp,
@@ -34,6 +34,7 @@ from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
 from gscompleter.generators.diffusion.pe_field import PEField, grouped
 from gscompleter.generators.diffusion.source_depth import MonocularDepth, context_depth
 from gscompleter.types import Gaussians, SceneContext, merge
+from parity import assert_close
 from scenes import Room, answer, camera_at, gaussians_of, photographed, view_of
 from test_generators import TARGET, known_room
 from test_source_depth import tiny_model
@@ -101,7 +102,7 @@ def test_with_plain_positions_our_loop_is_the_pipeline_of_diffusers(kontext_fold
     ).images[0]
     assert model.grid(size) == grid
     assert found.std() > 0.01
-    assert (found - expected.permute(1, 2, 0)).abs().max() < 1e-5
+    assert_close(found, expected.permute(1, 2, 0), "image")
 
 
 def test_the_text_encoders_leave_memory_and_the_model_is_loaded_once(kontext_folder):
@@ -145,18 +146,18 @@ def test_images_made_together_are_those_made_alone(kontext_folder):
     together = [found.image for found in generator.synthesize(calls)]
     alone = [generator.synthesize([call])[0].image for call in calls]
     for image, expected in zip(together, alone, strict=True):
-        assert (image - expected).abs().max() < 1e-5
+        assert_close(image, expected, "image", 1e-5)
     assert (together[0] - together[1]).abs().max() > 1e-4
 
 
 def test_further_seeds_are_tried_and_the_best_is_kept(kontext_folder):
     context = known_room()
     generator = load_generator(
-        "pe-field", 7, settings=DiffusionSettings(str(kontext_folder), steps=1, retries=2)
+        "pe-field", 7, settings=PEFieldSettings(str(kontext_folder), steps=1, retries=2)
     )
     best = answer(generator, context.views[1], TARGET, context)
     assert "best of 3 seeds" in best.notes[0]
-    single = replace(generator, agreement=AgreementConfig())
+    single = replace(generator, retries=0)
     seeds = [
         answer(replace(single, seed=7 + i), context.views[1], TARGET, context).image
         for i in range(3)
@@ -165,23 +166,25 @@ def test_further_seeds_are_tried_and_the_best_is_kept(kontext_folder):
 
 
 def test_settings_reach_the_generators(kontext_folder, inpaint_folder, tmp_path):
-    asked = DiffusionSettings(str(kontext_folder), steps=3, retries=2, at_once=1)
+    asked = PEFieldSettings(str(kontext_folder), steps=3, retries=2, at_once=1)
     generator = load_generator("pe-field", 5, settings=asked)
-    assert (generator.seed, generator.steps, generator.agreement.retries) == (5, 3, 2)
+    assert (generator.seed, generator.steps, generator.retries) == (5, 3, 2)
     assert generator.at_once == 1
     assert generator.depth is context_depth
-    assert load_generator("pe-field", settings=DiffusionSettings(asked.path)).steps == 4
+    assert load_generator("pe-field", settings=PEFieldSettings(asked.path)).steps == 4
     network = tiny_model(tmp_path)
     with_depth = load_generator("pe-field", settings=replace(asked, depth=str(network)))
     assert isinstance(with_depth.depth, MonocularDepth)
-    asked = DiffusionSettings(str(inpaint_folder), steps=3, retries=1, prompt="a quiet street")
+    asked = DiffusersInpaintSettings(
+        str(inpaint_folder), steps=3, retries=1, prompt="a quiet street"
+    )
     painter = load_generator("diffusers-inpaint", settings=asked).function
-    assert (painter.prompt, painter.steps, painter.agreement.retries) == ("a quiet street", 3, 1)
+    assert (painter.prompt, painter.steps, painter.retries) == ("a quiet street", 3, 1)
 
 
 def test_an_inpainter_reads_its_prompt(inpaint_folder):
     context = known_room()
-    asked = DiffusionSettings(str(inpaint_folder), steps=2, prompt="a quiet street")
+    asked = DiffusersInpaintSettings(str(inpaint_folder), steps=2, prompt="a quiet street")
     painter = load_generator("diffusers-inpaint", settings=asked).function
     other = replace(painter, prompt="a b c")
     images = [one(context.views[1], TARGET, context).image for one in (painter, other)]
@@ -239,13 +242,13 @@ def test_the_size_follows_the_pipeline_and_the_aspect(inpaint_folder):
 def test_a_pipeline_of_another_kind_is_refused(tmp_path, kontext_folder):
     with pytest.raises(InputError, match="has 12 heads"):
         folder = tiny_diffusion.saved(tiny_diffusion.kontext_pipeline(heads=12), tmp_path / "few")
-        load_generator("pe-field", settings=DiffusionSettings(path=str(folder)))
+        load_generator("pe-field", settings=PEFieldSettings(path=str(folder)))
     (tmp_path / "empty").mkdir()
-    empty = DiffusionSettings(path=str(tmp_path / "empty"))
+    empty = str(tmp_path / "empty")
     with pytest.raises(InputError, match="neither a model_index.json"):
-        load_generator("pe-field", settings=empty)
+        load_generator("pe-field", settings=PEFieldSettings(path=empty))
     with pytest.raises(InputError, match="Could not load"):
-        load_generator("diffusers-inpaint", settings=empty)
+        load_generator("diffusers-inpaint", settings=DiffusersInpaintSettings(path=empty))
 
 
 def test_a_checker_of_images_is_no_exception(tmp_path):
@@ -254,7 +257,7 @@ def test_a_checker_of_images_is_no_exception(tmp_path):
     index = json.loads((folder / "model_index.json").read_text())
     index["feature_extractor"] = ["transformers", "CLIPFeatureExtractor"]
     (folder / "model_index.json").write_text(json.dumps(index))
-    generator = load_generator("diffusers-inpaint", settings=DiffusionSettings(str(folder)))
+    generator = load_generator("diffusers-inpaint", settings=DiffusersInpaintSettings(str(folder)))
     assert generator.function.painter.pipeline.safety_checker is not None
     broken = tmp_path / "broken"
     shutil.copytree(folder, broken)
@@ -263,7 +266,7 @@ def test_a_checker_of_images_is_no_exception(tmp_path):
     weights.pop(next(name for name in sorted(weights) if "mlp.fc2.weight" in name))
     save_file(weights, file, metadata={"format": "pt"})
     with pytest.raises(InputError, match="its safety_checker lacks the tensor"):
-        load_generator("diffusers-inpaint", settings=DiffusionSettings(str(broken)))
+        load_generator("diffusers-inpaint", settings=DiffusersInpaintSettings(str(broken)))
 
 
 @pytest.mark.parametrize(
@@ -286,7 +289,7 @@ def test_weights_that_lack_a_tensor_are_refused_and_never_made_up(
     weights.pop(sorted(weights)[len(weights) // 2])
     save_file(weights, file, metadata={"format": "pt"})
     with pytest.raises(InputError, match=f"its {part} lacks the tensor"):
-        load_generator(name, settings=DiffusionSettings(str(folder)))
+        load_generator(name, settings=settings_class(name)(str(folder)))
 
 
 def completed(tmp_path, monkeypatch, *model) -> dict:
@@ -330,7 +333,7 @@ def test_a_smoke_test_of_an_evaluation_with_random_weights(inpaint_folder, tmp_p
     remembered = json.loads((tmp_path / "out" / "run.json").read_text())
     assert remembered["generator_steps"] == 2
     assert remembered["generator_path"] == str(inpaint_folder)
-    (row,) = (tmp_path / "out" / "cases").glob("*/full.json")
+    (row,) = (tmp_path / "out" / "tasks").glob("*/full.json")
     assert json.loads(row.read_text())["error"] is None
 
 

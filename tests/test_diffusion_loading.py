@@ -4,7 +4,8 @@ import pytest
 
 from command import run
 from gscompleter import InputError, load_generator
-from gscompleter.generators import DiffusionSettings
+from gscompleter.commands.generator_options import GeneratorOptions
+from gscompleter.config.generators import PEFieldSettings, settings_class
 from gscompleter.generators.diffusion import published
 from gscompleter.generators.diffusion.loading import sources
 from gscompleter.generators.diffusion.published import (
@@ -23,7 +24,7 @@ from scenes import camera_at, photographed
 def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatch):
     monkeypatch.setattr(published, "PACKAGES", ("a_package_nobody_has", "torch"))
     with pytest.raises(InputError) as told:
-        load_generator(name, settings=DiffusionSettings(path="somebody/something"))
+        load_generator(name, settings=settings_class(name)(path="somebody/something"))
     message = str(told.value)
     assert "a_package_nobody_has" in message
     assert "torch" not in message
@@ -42,40 +43,49 @@ def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatc
 def test_a_setting_that_a_generator_does_not_know_is_refused(name, setting, way_out):
     ((key, value),) = setting.items()
     with pytest.raises(InputError) as told:
-        load_generator(name, settings=DiffusionSettings(**setting))
-    assert f"{name!r} knows no --generator-{key} ({value})" in str(told.value)
+        GeneratorOptions(name, setting).settings()
+    assert f"{name!r} knows no {key} ({value})" in str(told.value)
     assert way_out in str(told.value)
+    assert told.value.argument == f"generator_{key}"
+
+
+def test_the_settings_of_another_generator_are_refused():
+    with pytest.raises(InputError, match="'oracle' takes OracleSettings, got PEFieldSettings"):
+        load_generator("oracle", settings=PEFieldSettings())
 
 
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("steps", 0, "--generator-steps is 0; at least 1"),
-        ("steps", -1, "--generator-steps is -1"),
-        ("retries", -1, "--generator-retries is -1; at least 0"),
-        ("at_once", 0, "--generator-at-once is 0; at least 1"),
-        ("path", "", "--generator-path is empty"),
-        ("depth", "", "--generator-depth is empty"),
-        ("offload", True, "--generator-offload keeps parts .* and it runs on the CPU"),
+        ("steps", 0, "steps must be greater than or equal to 1, got 0"),
+        ("steps", 10**9, "steps must be less than or equal to 1000"),
+        ("retries", -1, "retries must be greater than or equal to 0"),
+        ("at_once", 0, "at_once must be greater than or equal to 1"),
+        ("path", "", "path must have at least 1 character"),
+        ("depth", "", "depth must have at least 1 character"),
+        ("offload", True, "offload keeps parts .* and it runs on the CPU"),
     ],
 )
 def test_values_that_mean_nothing_are_refused(key, value, message):
-    with pytest.raises(InputError, match=message):
-        load_generator("pe-field", settings=DiffusionSettings(**{key: value}))
+    with pytest.raises(InputError, match=message) as told:
+        load_generator("pe-field", settings=PEFieldSettings(**{key: value}))
+    assert told.value.argument == f"generator_{key}"
 
 
 def test_the_command_refuses_them_too_and_writes_nothing(tmp_path, capsys, monkeypatch):
     cameras = [camera_at(x, size=32) for x in (-0.3, 0.1, 0.6)]
     photographed(tmp_path, cameras)
     words = ["complete", tmp_path, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]
-    assert run(monkeypatch, *words, "--generator-steps", 8) == 2
-    assert "'warp-inpaint' knows no --generator-steps (8)" in capsys.readouterr().err
+    assert run(monkeypatch, *words, "--generator-at-once", 8) == 2
+    said = capsys.readouterr().err
+    assert "'warp-inpaint' knows no at_once (8); leave that out, or choose pe-field" in said
+    assert "(--generator-at-once)." in said
     assert not (tmp_path / "out").exists()
 
 
 def test_an_inpainter_must_be_named(monkeypatch):
     monkeypatch.setattr(published, "PACKAGES", ())
-    with pytest.raises(InputError, match="name one with --generator-path"):
+    with pytest.raises(InputError, match="needs the path of a model"):
         load_generator("diffusers-inpaint")
 
 
@@ -114,8 +124,8 @@ def test_what_is_read_twice_is_announced_once(capsys):
 
 
 def test_the_sentence_names_what_did_not_load_and_how_to_mend_it(tmp_path):
-    def said(source: Source, error: Exception, option: str = "--generator-path") -> str:
-        return str(cannot_load(source, error, option))
+    def said(source: Source, error: Exception, setting: str = "path") -> str:
+        return str(cannot_load(source, error, setting))
 
     lost = IncompleteWeightsError("vae", ["a", "b", "c"])
     assert "its vae lacks the tensor a and 2 more" in said(PE_FIELD, lost)
@@ -123,7 +133,7 @@ def test_the_sentence_names_what_did_not_load_and_how_to_mend_it(tmp_path):
     assert "yunpeng1998/PE-Field" in said(PE_FIELD, lost)
     assert "accepted its terms at https://huggingface.co/black" in said(KONTEXT, OSError("gated"))
     depth = source_of("somebody/depth", "transformers")
-    assert "give a folder by --generator-depth" in said(depth, OSError("?"), "--generator-depth")
+    assert "give a folder as its depth" in said(depth, OSError("?"), "depth")
     assert "see that it is complete" in said(source_of(str(tmp_path)), OSError("no config.json"))
     with pytest.raises(InputError, match="a folder that transformers saved"):
         source_of("nothing", "transformers")

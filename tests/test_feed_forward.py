@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from feed_forward_fixtures import STORED, Case, Pass, error, published_shapes, with_rule_v1
+from feed_forward_fixtures import STORED, Case, Pass, published_shapes, with_rule_v1
 from gscompleter import GSCompleter, InputError
 from gscompleter.geometry import project, rotations_from, widened
 from gscompleter.reconstructors.feed_forward import (
@@ -33,10 +33,9 @@ from gscompleter.reconstructors.feed_forward.spherical_harmonics import (
     rotation_of_degree,
 )
 from gscompleter.types import View
+from parity import assert_close, assert_within, relative_error
 from scenes import Room, camera_at, view_of
 
-TOLERANCE = 5e-5
-"""Of each array's largest value."""
 ARCHITECTURES = {
     "small-s1-u4-l4": "small-re10k-256x256",
     "base-s2-u2-l4": "base-re10k-256x256",
@@ -73,11 +72,10 @@ def check(path: Path, name: str) -> None:
     case = Case.load(path)
     run = Pass.through(network(name), case.images, case.cameras)
     between = run.of_mvsplat() if name == "mvsplat" else run.of_depthsplat()
-    errors = case.output_errors(run.predicted)
-    assert max(errors.values()) < TOLERANCE, errors
+    assert_within(case.output_errors(run.predicted))
     errors = case.intermediate_errors(between)
     assert len(errors) >= 9
-    assert max(errors.values()) < TOLERANCE, errors
+    assert_within(errors)
 
 
 # The authors' code
@@ -158,7 +156,7 @@ def random_rotations(count: int) -> Tensor:
 def test_harmonics_turn_with_the_matrices_of_e3nn(degree):
     case = Case.load(STORED / "sh" / "wigner.npz")
     ours = rotation_of_degree(degree, case.tensor("R"))
-    assert error(ours, case.tensor(f"D{degree}")) < TOLERANCE
+    assert_close(ours, case.tensor(f"D{degree}"), f"D{degree}")
 
 
 @pytest.mark.parametrize("degree", range(1, 5))
@@ -212,7 +210,7 @@ def test_the_size_of_the_chunks_changes_nothing():
     assert whole.abs().max() > 0.1
     for size in (1, 7):
         parts = cost_volume(features, camera_pair(), sources, candidates, size)
-        assert torch.allclose(parts, whole, atol=1e-6)
+        assert_close(parts, whole, "costs")
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -226,7 +224,7 @@ def test_the_size_of_the_chunks_does_not_change_the_gaussians(name):
     with torch.no_grad():
         ours = network(name)(images, camera_pair())
         whole = changed(name, other)(images, camera_pair())
-    assert error(ours.means, whole.means) < TOLERANCE
+    assert_close(ours.means, whole.means, "means")
 
 
 def test_finer_candidates_lie_around_the_coarse_estimate():
@@ -336,7 +334,7 @@ def test_quats_and_scales_stand_for_the_camera_covariance_turned_into_the_world(
     spread = own * scales[..., None, :]
     expected = c2w @ spread @ spread.transpose(-1, -2) @ c2w.transpose(-1, -2)
     axes = rotations_from(gaussians.quats) * gaussians.scales[..., None, :]
-    assert error(axes @ axes.transpose(-1, -2), expected) < 1e-5
+    assert_close(axes @ axes.transpose(-1, -2), expected, "covariances")
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -351,7 +349,7 @@ def test_scenes_of_a_batch_do_not_know_of_each_other(name):
         alone = [network(name)(images[i : i + 1], c) for i, c in enumerate((first, second))]
     for field in ("depth", "means", "quats", "scales", "opacities", "sh"):
         expected = torch.cat([getattr(one, field) for one in alone])
-        assert error(getattr(together, field), expected) < TOLERANCE, field
+        assert_close(getattr(together, field), expected, field)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -364,8 +362,8 @@ def test_gaussians_move_with_the_cameras(name):
     with torch.no_grad():
         before = network(name)(stereo_images(), here)
         after = network(name)(stereo_images(), replace(here, c2w=move @ here.c2w))
-    assert error(after.means, before.means @ turned.T + move[:3, 3]) < 1e-3
-    assert error(after.scales, before.scales) < 1e-3
+    assert relative_error(after.means, before.means @ turned.T + move[:3, 3]) < 1e-3
+    assert relative_error(after.scales, before.scales) < 1e-3
     rotations = turned @ rotations_from(before.quats)
     assert (rotations_from(after.quats) - rotations).abs().quantile(0.99) < 1e-2
 
@@ -472,11 +470,11 @@ def test_of_a_wider_view_the_network_sees_what_it_sees_of_the_others():
     wide = view_of(Room(), camera)
     model = FeedForward(network("mvsplat"))
     narrow, mixed = model(views), model([wide, views[1]])
-    assert error(mixed.gaussians.means, narrow.gaussians.means) < 1e-3
+    assert relative_error(mixed.gaussians.means, narrow.gaussians.means) < 1e-3
     rows, columns = slice(top, top + 64), slice(left, left + 64)
     assert mixed.depths[0].valid[rows, columns].all()
     assert mixed.depths[0].valid.sum() == 64 * 64
-    assert error(mixed.depths[0].depth[rows, columns], narrow.depths[0].depth) < 1e-3
+    assert relative_error(mixed.depths[0].depth[rows, columns], narrow.depths[0].depth) < 1e-3
 
 
 def test_wrong_views_are_refused_with_a_sentence():

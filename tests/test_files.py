@@ -1,10 +1,12 @@
 """Writing happens completely or leaves things as they were, whatever stops it."""
 
+import contextlib
 import errno
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -50,13 +52,12 @@ def test_overwriting_replaces_our_entries_and_leaves_those_of_the_user(results):
 def test_the_summary_leaves_first_and_arrives_last(results, monkeypatch):
     moved = []
     rename = os.rename
-    monkeypatch.setattr(
-        os, "rename", lambda a, b: (moved.append(Path(a).relative_to(results)), rename(a, b))
-    )
+    monkeypatch.setattr(os, "rename", lambda a, b: (moved.append(Path(a)), rename(a, b)))
     with output_folder(results, overwrite=True) as folder:
         write_results(folder)
+    moved = moved[1:]  # the draft itself, into the folder
     assert len(moved) == 6
-    assert moved[0] == Path("summary.json")
+    assert moved[0] == results / "summary.json"
     assert moved[-1].name == "summary.json"
 
 
@@ -70,7 +71,7 @@ def test_whatever_stops_a_run_leaves_the_results_as_they_were(results, stop):
     assert len(os.listdir(results)) == 4
 
 
-@pytest.mark.parametrize("failing", [1, 2, 3, 4, 5, 6])
+@pytest.mark.parametrize("failing", [1, 2, 3, 4, 5, 6, 7])
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES])
 def test_a_rename_that_fails_takes_all_others_back(results, monkeypatch, failing, code):
     before = tree(results)
@@ -120,7 +121,7 @@ def test_checking_leaves_nothing_behind_and_does_not_touch_what_is_there(tmp_pat
 
 
 def test_a_folder_that_cannot_take_results_is_refused_before_any_computing(tmp_path, results):
-    with pytest.raises(InputError, match="is not empty; .* --overwrite"):
+    with pytest.raises(InputError, match="is not empty; .* overwrite"):
         check_output(results)
     with pytest.raises(InputError, match="is a file, and a folder is needed"):
         check_output(results / "mine.txt", overwrite=True)
@@ -130,6 +131,63 @@ def test_a_folder_that_cannot_take_results_is_refused_before_any_computing(tmp_p
         check_output(tmp_path / ("a" * 300))
     with pytest.raises(InputError, match="Cannot write /proc/"):
         check_output("/proc/gscompleter")
+
+
+def test_a_folder_of_results_alone_is_replaced_in_one_step(results, monkeypatch):
+    (results / "mine.txt").unlink()
+    monkeypatch.setattr(os, "rename", lambda *_: pytest.fail("nothing is moved by itself"))
+    with output_folder(results, overwrite=True) as folder:
+        write_results(folder)
+    assert tree(results) == {"completed.ply": "new", "images/new.png": "new", "summary.json": "new"}
+    assert os.listdir(results.parent) == ["out"]
+
+
+def test_where_folders_cannot_change_places_the_entries_are_renamed(results, monkeypatch):
+    def cannot(one, other):
+        raise OSError(errno.ENOSYS, "cannot")
+
+    (results / "mine.txt").unlink()
+    monkeypatch.setattr("gscompleter.io.files._exchange", cannot)
+    with output_folder(results, overwrite=True) as folder:
+        write_results(folder)
+    assert tree(results) == {"completed.ply": "new", "images/new.png": "new", "summary.json": "new"}
+    assert os.listdir(results.parent) == ["out"]
+
+
+def test_the_working_directory_stays_the_folder_it_is(results, monkeypatch):
+    (results / "mine.txt").unlink()
+    monkeypatch.chdir(results)
+    inode = results.stat().st_ino
+    with output_folder(".", overwrite=True) as folder:
+        write_results(folder)
+    assert results.stat().st_ino == inode
+    assert Path("summary.json").read_text() == "new"
+
+
+def test_what_cannot_be_put_back_is_not_thrown_away(results, monkeypatch):
+    rename, calls = os.rename, []
+
+    def fails_from_the_fourth_on(a, b):
+        calls.append(a)
+        if len(calls) >= 4:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        rename(a, b)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "rename", fails_from_the_fourth_on)
+        with (
+            pytest.raises(InputError, match="Cannot write"),
+            output_folder(results, overwrite=True) as folder,
+        ):
+            write_results(folder)
+    check_output(results, overwrite=True)
+    assert tree(results) == {
+        "completed.ply": "new",
+        "images/new.png": "new",
+        "mine.txt": "old",
+        "summary.json": "new",
+    }
+    assert len(os.listdir(results)) == 4
 
 
 def test_what_a_killed_run_left_does_not_make_a_folder_occupied(tmp_path):
@@ -148,24 +206,107 @@ def test_a_linked_folder_stays_a_link(tmp_path):
     assert tree(tmp_path / "real") == {"summary.json": "new"}
 
 
-def test_a_killed_process_leaves_nothing_under_the_final_names(tmp_path):
-    code = (
-        "import sys, time\n"
-        "from gscompleter.io.files import output_folder, replacing\n"
-        "with output_folder(sys.argv[1]) as folder, replacing(folder / 'completed.ply') as file:\n"
-        "    file.write(b'half'); file.flush(); print('writing', flush=True); time.sleep(60)\n"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, str(tmp_path / "out")], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    with process.stdout:
-        assert process.stdout.readline() == "writing\n"
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    assert not (tmp_path / "out").exists()
-    assert not list(tmp_path.rglob("completed.ply"))
+WRITES = """
+import os, sys, time
+from gscompleter.interrupts import treat_stops_alike
+from gscompleter.io.files import output_folder, replacing
+
+treat_stops_alike()
+out, renames = sys.argv[1], int(sys.argv[2])
+rename = os.rename
+def waits(a, b):
+    global renames
+    if renames == 0:
+        print("ready", flush=True)
+        time.sleep(60)
+    renames -= 1
+    rename(a, b)
+os.rename = waits
+with output_folder(out, overwrite=True) as folder:
+    os.mkdir(folder / "images")
+    for name in ("completed.ply", "images/new.png", "summary.json"):
+        (folder / name).write_text("new")
+    if renames < 0:
+        with replacing(folder / "scene.ply") as file:
+            file.write(b"half"); file.flush(); print("ready", flush=True); time.sleep(60)
+"""
+
+
+@contextlib.contextmanager
+def writing(out: Path, renames: int = -1) -> Iterator[subprocess.Popen]:
+    """A process that writes to `out` and waits: before it publishes, or after so many renames."""
+    command = [sys.executable, "-c", WRITES, str(out), str(renames)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield process
+        process.kill()
+
+
+def stopped(process: subprocess.Popen, number: int) -> None:
+    process.send_signal(number)
+    process.wait()
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_killed_process_leaves_nothing_under_the_final_names(tmp_path, results, exists):
+    out, before = results if exists else tmp_path / "new", tree(results)
+    with writing(out) as process:
+        stopped(process, signal.SIGKILL)
+    assert any(name.startswith(".gscompleter-") for name in os.listdir(tmp_path))
+    assert out.exists() == exists
+    check_output(out, overwrite=True)
+    assert os.listdir(tmp_path) == ["out"]
+    assert tree(results) == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, number):
+    before = tree(results)
+    for out in (results, tmp_path / "new" / "folder"):
+        with writing(out) as process:
+            stopped(process, number)
+    assert os.listdir(tmp_path) == ["out"]
+    assert tree(results) == before
+
+
+def test_the_draft_of_a_living_process_is_left_alone(tmp_path):
+    with writing(tmp_path / "out"):
+        check_output(tmp_path / "out")
+        with replacing(tmp_path / "other") as file:
+            file.write(b"done")
+        assert len([p for p in tmp_path.iterdir() if p.name.startswith(".gscompleter-")]) == 1
     check_output(tmp_path / "out")
+    assert os.listdir(tmp_path) == ["other"]
+
+
+@pytest.mark.parametrize("renames", range(1, 7))
+def test_what_was_killed_between_its_renames_is_finished_by_the_next_run(results, renames):
+    with writing(results, renames) as process:
+        stopped(process, signal.SIGKILL)
+    with pytest.raises(InputError, match="is not empty"):
+        check_output(results)
+    assert tree(results) == {
+        "completed.ply": "new",
+        "images/new.png": "new",
+        "mine.txt": "old",
+        "summary.json": "new",
+    }
+    assert len(os.listdir(results)) == 4
+
+
+def test_a_file_that_a_killed_process_left_is_removed_by_the_next(tmp_path):
+    code = (
+        "import os, signal, sys\nfrom gscompleter.io.files import replacing\n"
+        "with replacing(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "a")], check=False)
+    assert len(os.listdir(tmp_path)) == 1
+    with replacing(tmp_path / "b") as file:
+        file.write(b"done")
+    assert os.listdir(tmp_path) == ["b"]
 
 
 def test_a_file_written_in_place_of_another_keeps_it_until_the_end(tmp_path):

@@ -242,7 +242,7 @@ def test_copies_of_other_folders_are_no_photographs_of_this_one(tmp_path):
         {"cases": [{"scene": 3, "context": [0, 1], "target": 2}]},
         {"cases": [{"scene": "p", "context": "01", "target": 2}]},
         {"cases": [{"scene": "p", "context": [0, 1], "target": "2"}]},
-        {"cases": [{"scene": "p", "context": [0, 1], "target": 2, "near": 10**400}]},
+        {"cases": [{"scene": "p", "context": [0, 1], "target": 2, "near": "a"}]},
         {"cases": "x" * 100_000},
     ],
 )

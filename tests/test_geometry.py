@@ -21,7 +21,7 @@ from scenes import Room, camera_at, cast
 
 def test_a_point_behind_a_pixel_projects_to_that_pixels_centre():
     camera = camera_at(0.4, -0.2, 0.1, yaw=20, size=16)
-    depth = torch.rand(16, 16) + 2
+    depth = torch.rand(16, 16, generator=torch.Generator().manual_seed(0)) + 2
     pixels, z = project(unproject(depth, camera), camera)
     centre = torch.arange(16) + 0.5
     assert torch.allclose(pixels[..., 0], centre.expand(16, 16), atol=1e-4)
@@ -65,7 +65,7 @@ def test_the_same_camera_is_recognised_in_any_unit():
 
 
 def test_sampling_at_pixel_centres_returns_the_pixels():
-    values = torch.rand(3, 5, 2)
+    values = torch.rand(3, 5, 2, generator=torch.Generator().manual_seed(0))
     x, y = torch.meshgrid(torch.arange(5) + 0.5, torch.arange(3) + 0.5, indexing="xy")
     assert torch.allclose(sample(values, torch.stack([x, y], dim=-1)), values, atol=1e-6)
 

@@ -31,13 +31,12 @@ from gscompleter.generators.diffusion.rotary import (
 from gscompleter.generators.diffusion.splat import forward_splat
 from gscompleter.metrics.image import psnr
 from gscompleter.types import Camera
+from parity import assert_close
 from scenes import Room, view_of
 from test_generators import TARGET, known_room
 
 STORED = Path(__file__).parent / "fixtures" / "pefield"
 SIZE, GRID = (96, 128), (6, 8)
-FLOAT_ROUNDING = 5e-6
-"""Largest difference of a position, in tokens: a few roundings of float32 of pixel positions."""
 
 
 def stored(name: str) -> dict[str, torch.Tensor]:
@@ -64,7 +63,7 @@ def authors_cameras() -> tuple[Camera, Camera]:
 
 def test_the_target_positions_are_the_authors():
     found = target_ids(SIZE, GRID, torch.float32)
-    assert (found - levels_of(IDS, "target_ids_{}")).abs().max() <= 1e-6
+    assert_close(found, levels_of(IDS, "target_ids_{}"), "target_ids")
 
 
 def test_the_target_positions_rounded_to_bfloat16_are_the_authors_exactly():
@@ -73,13 +72,13 @@ def test_the_target_positions_rounded_to_bfloat16_are_the_authors_exactly():
 
 def test_the_target_positions_at_1024_pixels_are_the_authors():
     found = target_ids((1024, 1024), (64, 64), torch.float32)[::61]
-    assert (found - levels_of(IDS, "target_ids_1024_{}_stride")).abs().max() <= 1e-6
+    assert_close(found, levels_of(IDS, "target_ids_1024_{}_stride"), "target_ids_1024")
 
 
 def test_the_source_positions_are_the_authors():
     source, target = authors_cameras()
     found = source_ids(IDS["depth"], source, target, GRID, GRID)
-    assert (found - levels_of(IDS, "source_ids_{}")).abs().max() < FLOAT_ROUNDING
+    assert_close(found, levels_of(IDS, "source_ids_{}"), "source_ids")
 
 
 def test_the_target_positions_are_rounded_on_level_2_alone():
@@ -94,8 +93,8 @@ def test_the_target_positions_are_rounded_on_level_2_alone():
 def test_pixels_and_depths_in_the_target_are_the_authors():
     source, target = authors_cameras()
     pixels, z = seen_from(IDS["depth"], source, target)
-    assert (pixels - IDS["uv"][0]).abs().max() < 5e-5
-    assert (z - IDS["z"][0]).abs().max() < 2e-6
+    assert_close(pixels, IDS["uv"][0], "uv")
+    assert_close(z, IDS["z"][0], "z")
 
 
 def plain_ids() -> torch.Tensor:
@@ -113,8 +112,8 @@ def centred_camera() -> Camera:
 def test_equal_cameras_and_one_depth_give_the_plain_grid_and_the_documented_offset(unit):
     camera, depth = centred_camera(), torch.full(SIZE, 2.0 * unit)
     found = source_ids(depth, camera, camera, GRID, GRID)[:, :3]
-    assert torch.equal(found[:, 0], torch.full((48,), 1.01))
-    assert (found[:, 1:] - (plain_ids() + 7.5 / 16)).abs().max() < 1e-6
+    expected = torch.cat([torch.full((48, 1), 1.01), plain_ids() + 7.5 / 16], dim=1)
+    assert_close(found, expected, "positions")
     assert torch.equal(target_ids(SIZE, GRID)[:, 1:3], plain_ids())
 
 
@@ -123,10 +122,9 @@ def test_a_camera_that_moves_by_one_token_moves_the_positions_by_one_token():
     camera, depth = centred_camera(), torch.full(SIZE, 2.0)
     c2w = torch.eye(4)
     c2w[0, 3] = 16 * 2.0 / 110
-    still = source_ids(depth, camera, camera, GRID, GRID)
-    moved = source_ids(depth, camera, replace(camera, c2w=c2w), GRID, GRID)
-    step = (moved - still).reshape(48, 21, 3)
-    assert (step - torch.tensor([0.0, 0.0, -1.0])).abs().max() < 1e-5
+    still = source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
+    moved = source_ids(depth, camera, replace(camera, c2w=c2w), GRID, GRID).reshape(48, 21, 3)
+    assert_close(moved, still + torch.tensor([0.0, 0.0, -1.0]), "positions")
 
 
 def test_the_number_of_pixels_of_the_target_does_not_matter():
@@ -140,7 +138,7 @@ def test_the_number_of_pixels_of_the_target_does_not_matter():
     )
     once = source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
     twice = source_ids(depth, camera, finer, GRID, GRID).reshape(48, 21, 3)
-    assert (twice - once - torch.tensor([0, 0.25 / 16, 0.25 / 16])).abs().max() < 1e-5
+    assert_close(twice, once + torch.tensor([0, 0.25 / 16, 0.25 / 16]), "positions")
 
 
 def test_a_target_that_sees_farther_to_the_left_counts_from_there():
@@ -151,7 +149,7 @@ def test_a_target_that_sees_farther_to_the_left_counts_from_there():
     wider = replace(camera, K=K, width=camera.width + 32)
     once = source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
     moved = source_ids(depth, camera, wider, GRID, (6, 10)).reshape(48, 21, 3)
-    assert (moved - once - torch.tensor([0.0, 0.0, 2.0])).abs().max() < 1e-5
+    assert_close(moved, once + torch.tensor([0.0, 0.0, 2.0]), "positions")
 
 
 def test_what_lies_behind_the_target_is_finite_and_far_outside_of_its_image():
@@ -180,14 +178,14 @@ def test_every_position_of_a_token_is_used_and_the_token_itself_by_each_group():
 def test_the_rotary_tables_are_the_authors():
     cosines, sines = PerHeadRotary((4, 6, 6))(levels_of(TINY, "source_ids_{}"))
     assert len(cosines) == len(sines) == 1
-    assert (cosines[0].flatten(1) - TINY["source_cos"]).abs().max() < 1e-6
-    assert (sines[0].flatten(1) - TINY["source_sin"]).abs().max() < 1e-6
+    assert_close(cosines[0].flatten(1), TINY["source_cos"], "source_cos")
+    assert_close(sines[0].flatten(1), TINY["source_sin"], "source_sin")
 
 
 def test_the_picture_of_the_positions_is_the_photograph_where_the_cameras_are_equal():
     context = known_room()
     view = context.views[1]
-    assert (preview(view, view.camera, context) - view.image).abs().max() < 1e-5
+    assert_close(preview(view, view.camera, context), view.image, "preview")
     from_aside = preview(view, TARGET, context)
     empty = from_aside.sum(dim=-1) == 0
     assert 0.1 < empty.float().mean() < 0.9
@@ -199,15 +197,15 @@ def test_each_image_of_a_batch_has_tables_of_its_own():
     ids, rotary = levels_of(TINY, "source_ids_{}"), PerHeadRotary((4, 6, 6))
     together = rotary(torch.cat([ids, ids + 3], dim=-1))
     for table, alone, shifted in zip(together, rotary(ids), rotary(ids + 3), strict=True):
-        assert torch.equal(table, torch.cat([alone, shifted]))
-        assert not torch.equal(alone, shifted)
+        assert_close(table, torch.cat([alone, shifted]), "table")
+        assert (alone - shifted).abs().max() > 0.1
 
 
 def test_the_picture_of_the_positions_is_the_authors():
     splat = stored("splat")
     image, expected = (splat[key][0].permute(1, 2, 0) for key in ("image", "warped"))
     found = forward_splat(image, splat["uv"].reshape(*SIZE, 2), SIZE)
-    assert (found - expected).abs().max() < 1e-6
+    assert_close(found, expected, "warped")
     assert (found.sum(dim=-1) == 0).any()
 
 
@@ -254,7 +252,7 @@ def test_the_transformer_gives_the_authors_numbers(tiny_transformer, name):
             txt_ids=torch.zeros(512, 63),
             return_dict=False,
         )
-    assert (found - TINY[name]).abs().max() < 1e-5
+    assert_close(found, TINY[name], name)
 
 
 def test_every_published_tensor_fits_the_transformer_of_diffusers():

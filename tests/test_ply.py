@@ -221,7 +221,7 @@ def test_damaged_gaussians_are_counted_and_dropped_if_asked(tmp_path, name, valu
     gaussians = random_gaussians(20)
     getattr(gaussians, name)[:3].fill_(value)
     path = saved(tmp_path, gaussians)
-    refused(path, "3 of 20 Gaussians .* --drop-nonfinite")
+    refused(path, "3 of 20 Gaussians .* drop what is not finite")
     assert len(load_ply(path, drop_nonfinite=True)) == 17
 
 
@@ -300,7 +300,7 @@ def test_an_infinite_scale_is_written_as_a_finite_one(tmp_path):
     gaussians = random_gaussians(2)
     gaussians.scales[0] = float("inf")
     assert load_ply(saved(tmp_path, gaussians)).scales[0].tolist() == pytest.approx(
-        [1e38] * 3, rel=1e-5
+        [1e38] * 3, rel=1e-4
     )
 
 

@@ -17,14 +17,12 @@ from gscompleter.runs.protocols import (
     Extrapolation,
     Split,
     StressTest,
-    cases_of,
     index_of,
-    n_k_index,
-    neighbours,
     parse_protocol,
     read_evaluation_index,
     write_evaluation_index,
 )
+from gscompleter.runs.tasks import neighbours, tasks_of
 from gscompleter.types import View
 
 
@@ -47,7 +45,9 @@ class Frames(PosedPhotographs):
 
 
 def test_two_frames_are_extrapolated_to_a_third_in_both_directions():
-    index = n_k_index([Frames("a", 24), Frames("b", 21), Frames("c", 20)], 10, stride=2)
+    index = index_of(
+        Extrapolation(10, stride=2), [Frames("a", 24), Frames("b", 21), Frames("c", 20)]
+    )
     there = [((n, n + 10), (n + 20,)) for n in (0, 2)]
     back = [((n + 20, n + 10), (n,)) for n in (0, 2)]
     found = [(split.context, split.targets) for split in index.scenes["a"]]
@@ -95,18 +95,19 @@ def test_neighbours_exist_and_are_not_context():
 
 def test_a_case_has_one_target_and_loads_its_views():
     index = EvaluationIndex("x", {"a": (Split((0, 2), (3, 4)),)})
-    first, second = cases_of(index, Frames("a", 5))
-    assert (first.scene, first.name, first.target, first.neighbours) == ("a", "a 0+2>3", 3, (4,))
-    assert (second.target, second.neighbours) == (4, (3,))
+    first, second = tasks_of(index, Frames("a", 5))
+    assert (first.scene, first.name, first.targets) == ("a", "a 0+2>3", (3,))
+    assert (first.neighbours, second.neighbours) == ((4,), (3,))
+    assert second.targets == (4,)
     assert first.load(first.context) == [VIEWS[0], VIEWS[2]]
-    assert cases_of(index, Frames("b", 5)) == []
+    assert tasks_of(index, Frames("b", 5)) == []
     with pytest.raises(InputError, match="The protocol x asks for frame 4 of a, which has 4"):
-        cases_of(index, Frames("a", 4))
+        tasks_of(index, Frames("a", 4))
 
 
 def test_an_index_is_read_back_as_it_was_written(tmp_path):
     clips = [Frames("a", 64), Frames('odd "ü" name', 30), Frames("short", 3)]
-    index = n_k_index(clips, 10, 4)
+    index = index_of(Extrapolation(10, 4), clips)
     write_evaluation_index(tmp_path / "index.json", index)
     assert read_evaluation_index(tmp_path / "index.json") == index
     assert parse_protocol(str(tmp_path / "index.json")) == index
@@ -119,14 +120,14 @@ def test_an_index_is_read_back_as_it_was_written(tmp_path):
 
 
 def test_an_index_of_no_clips_is_an_index(tmp_path):
-    index = n_k_index([], 10)
+    index = index_of(Extrapolation(10), [])
     write_evaluation_index(tmp_path / "index.json", index)
     assert read_evaluation_index(tmp_path / "index.json") == index
 
 
 def test_two_clips_of_one_name_are_refused():
     with pytest.raises(InputError, match="Two clips are called a"):
-        n_k_index([Frames("a", 30), Frames("a", 30)], 10)
+        index_of(Extrapolation(10), [Frames("a", 30), Frames("a", 30)])
 
 
 @pytest.mark.parametrize(
@@ -159,9 +160,9 @@ def test_an_evaluation_index_that_is_missing_is_named(tmp_path):
 
 def test_cases_of_a_chunk_load_photographs_at_a_resolution(tmp_path):
     (clip,) = open_chunks(save_chunk(tmp_path / "000000.torch", example()))
-    there, back = cases_of(parse_protocol("n-2"), clip, (32, 32))
+    there, back = tasks_of(parse_protocol("n-2"), clip, (32, 32))
     assert (there.name, back.name) == ("room 0+2>4", "room 4+2>0")
-    (target,) = back.load([back.target])
+    (target,) = back.load(back.targets)
     assert target.image.shape == (32, 32, 3)
 
 
@@ -189,5 +190,5 @@ def test_the_scenes_of_the_development_cases_are_clips(shared):
     clip = next(clip for clip in clips if clip.name == "re10k_0d4de33c")
     assert len(clip) == len(open_photographs(shared / "data" / "re10k_0d4de33c"))
     assert clip.reason_to_skip() is None
-    (case, *_) = cases_of(parse_protocol("n-4"), clip, (64, 64))
+    (case, *_) = tasks_of(parse_protocol("n-4"), clip, (64, 64))
     assert [view.frame for view in case.load(case.context)] == [0, 4]

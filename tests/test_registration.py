@@ -146,7 +146,7 @@ def test_the_unit_of_the_scene_scales_the_result_and_changes_nothing_else(unit):
     # Adam divides by the size of the gradient, so that rounding shows where it is tiny.
     assert ((theirs.gaussians.means - same.means) / unit).abs().median() < 5e-3
     assert theirs.affine.scale == pytest.approx(ours.affine.scale, rel=1e-3)
-    assert theirs.losses[-1] == pytest.approx(ours.losses[-1], rel=0.03)
+    assert theirs.losses[-1] == pytest.approx(ours.losses[-1], rel=0.1)
 
 
 def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
@@ -154,9 +154,10 @@ def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
     lie on the wall; the literal stereo loss drags them to the panel, the masked one does not."""
     renderer = load_renderer("cpu")
     wall = torch.full((SIZE, SIZE), 4.0)
-    reference = View(torch.rand(SIZE, SIZE, 3), TARGET, depth=wall)
+    colours = torch.rand(2, SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
+    reference = View(colours[0], TARGET, depth=wall)
     candidates = Lift(gaussians_of(reference), everywhere(wall), everywhere(wall), None)
-    panel = gaussians_of(View(torch.rand(SIZE, SIZE, 3), ANCHOR), torch.full((SIZE, SIZE), 1.0))
+    panel = gaussians_of(View(colours[1], ANCHOR), torch.full((SIZE, SIZE), 1.0))
     nothing_else = renderer.freeze(panel[:0], TARGET)
 
     def moved(mask_occluded: bool) -> float:

@@ -13,11 +13,15 @@ from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.cuda import CudaView
 from gscompleter.render.reference import ReferenceRenderer, ReferenceView
 from gscompleter.types import observed, sh_from_rgb
+from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, random_gaussians, scaled, view_of
 
 CAMERA = camera_at(size=48)
 CPU, REFERENCE = load_renderer("cpu"), load_renderer("reference")
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+ROUNDING = 1e-5
+"""Largest difference of drawings and of gradients, of the largest value. At most 5.1e-6 was
+measured, and 6.4e-6 with kernels compiled without fused multiplications."""
 
 
 def in_dtype(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
@@ -31,15 +35,18 @@ def strange(sh_degree: int = 0) -> Gaussians:
     gaussians.means[5:10, 2] = 0.003
     gaussians.means[10:15, 0] += 3.0
     gaussians.opacities[15:20] = 0.0
-    gaussians.scales[20:24] = 4.0
+    gaussians.scales[20:24] = torch.tensor([4.0, 3.0, 2.0])
     gaussians.scales[24:29] = 1e-7
     gaussians.quats[30:40] *= 37.0
     return gaussians
 
 
-def muted(gaussians: Gaussians) -> Gaussians:
-    """Without the blackest black, where the colour has a kink and no gradient to compare."""
-    return replace(gaussians, sh=0.9 * gaussians.sh)
+def smooth(gaussians: Gaussians) -> Gaussians:
+    """Without what has no gradient to compare: round Gaussians, which turn into themselves, and
+    the blackest black, where the colour has a kink."""
+    flat = gaussians.scales * torch.tensor([1.2, 1.0, 0.5])
+    turned = gaussians.quats + torch.tensor([0.0, 0.3, -0.2, 0.4])
+    return replace(gaussians, sh=0.9 * gaussians.sh, scales=flat, quats=turned)
 
 
 SCENES = {
@@ -47,24 +54,33 @@ SCENES = {
     "harmonics": random_gaussians(200, seed=1, sh_degree=3),
     "strange": strange(),
     "strange-harmonics": strange(sh_degree=2),
-    "room": muted(gaussians_of(view_of(Room(), camera_at(0.2, size=24)))),
+    "room": smooth(gaussians_of(view_of(Room(), camera_at(0.2, size=24)))),
 }
 
 
-def outliers(a: torch.Tensor, b: torch.Tensor, tolerance: float) -> float:
-    """Share of the values that differ by more; a few decisions flip by rounding."""
-    return ((a.double() - b.double()).abs() > tolerance).double().mean().item()
+def assert_same_drawing(ours: Render, truth: Render) -> None:
+    """In every pixel, but for the depth of those that show next to nothing."""
+    covered = truth.alpha > 0.01
+    assert_close(ours.image, truth.image, "image", ROUNDING)
+    assert_close(ours.alpha, truth.alpha, "alpha", ROUNDING)
+    assert_close(ours.depth * covered, truth.depth * covered, "depth", ROUNDING)
+
+
+def assert_same_slopes(
+    ours: dict[str, torch.Tensor], truth: dict[str, torch.Tensor], bound: float = ROUNDING
+) -> None:
+    """Of every Gaussian; each parameter has a gradient that is no rounding itself."""
+    for name, expected in truth.items():
+        rows = expected.flatten(1) if expected.dim() > 1 else expected[:, None]
+        assert (rows.abs().amax(dim=1) > 1e-3).float().mean() > 0.2, name
+        assert_close(ours[name], expected, f"gradient of {name}", bound)
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_cpu_and_reference_draw_the_same(name):
     ours = CPU.render(SCENES[name], CAMERA)
     truth = REFERENCE.render(in_dtype(SCENES[name], torch.float64), CAMERA)
-    assert outliers(ours.image, truth.image, 1e-4) < 1e-3
-    assert outliers(ours.alpha, truth.alpha, 1e-4) < 1e-3
-    near_enough = 1e-4 * truth.depth.max().clamp_min(1).item()
-    covered = truth.alpha > 0.01
-    assert outliers(ours.depth[covered], truth.depth[covered], near_enough) < 1e-3
+    assert_same_drawing(ours, truth)
     assert truth.alpha.max() > 0.5
 
 
@@ -82,16 +98,8 @@ def gradients(renderer, gaussians: Gaussians, camera=CAMERA) -> dict[str, torch.
 
 @pytest.mark.parametrize("name", SCENES)
 def test_cpu_and_reference_have_the_same_gradients(name):
-    # The reference runs on the float32 values: a flip of a threshold would be no error of ours.
-    ours = gradients(CPU, SCENES[name])
     truth = gradients(REFERENCE, in_dtype(SCENES[name], torch.float64))
-    for parameter in PARAMETERS:
-        a, b = ours[parameter].double(), truth[parameter].double()
-        assert a.isfinite().all(), parameter
-        # A splat that flips a threshold differs; the thousandth of Gaussians that did is set aside.
-        error = (a - b).flatten(1).norm(dim=1) if a.dim() > 1 else (a - b).abs()
-        kept = error.argsort()[: len(error) - max(1, len(error) // 100)]
-        assert (a - b)[kept].norm() <= 1e-3 * b[kept].norm() + 1e-5, parameter
+    assert_same_slopes(gradients(CPU, SCENES[name]), truth)
 
 
 def one(mean, opacity=0.8, scale=0.05, colour=(1.0, 0.5, 0.25)) -> Gaussians:
@@ -142,12 +150,13 @@ def test_nothing_is_black(renderer):
 @pytest.mark.parametrize("size", [(1, 1), (17, 31), (64, 16), (5, 200)])
 def test_any_image_size_is_drawn(size):
     height, width = size
-    K = torch.tensor([[40.0, 0, width / 2], [0, 40.0, height / 2], [0, 0, 1]])
+    focal = 0.6 * max(size)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     camera = replace(CAMERA, K=K, width=width, height=height)
     scene = SCENES["random"]
-    ours, truth = CPU.render(scene, camera), REFERENCE.render(scene, camera)
+    ours = CPU.render(scene, camera)
     assert ours.image.shape == (height, width, 3)
-    assert outliers(ours.image, truth.image, 2e-4) < 2e-3 + 1 / (height * width * 3)
+    assert_same_drawing(ours, REFERENCE.render(in_dtype(scene, torch.float64), camera))
 
 
 def context_and_new() -> tuple[Gaussians, Gaussians]:
@@ -159,14 +168,13 @@ def test_a_composite_is_the_render_of_both_together(renderer):
     context, new = context_and_new()
     whole = renderer.render(merge([context, new]), CAMERA)
     parts = renderer.freeze(context, CAMERA).composite(new)
-    for name in ("image", "depth", "alpha"):
-        assert outliers(getattr(parts, name), getattr(whole, name), 1e-5) < 1e-3, name
+    assert_same_drawing(parts, whole)
 
 
 def test_what_is_frozen_alone_is_its_own_render():
     context, _ = context_and_new()
     frozen, alone = CPU.freeze(context, CAMERA).context, CPU.render(context, CAMERA)
-    assert outliers(frozen.image, alone.image, 1e-6) == 0
+    assert_same_drawing(frozen, alone)
 
 
 def opacity_gradient(function, opacities: torch.Tensor) -> tuple[Render, torch.Tensor]:
@@ -187,8 +195,8 @@ def test_a_plan_is_the_composite_with_other_opacities(renderer):
         truth, expected = opacity_gradient(
             lambda values: frozen.composite(replace(new, opacities=values)), opacities
         )
-        assert outliers(planned.image, truth.image, 1e-5) < 1e-3
-        assert (slope - expected).norm() <= 1e-3 * expected.norm()
+        assert_same_drawing(planned, truth)
+        assert_same_slopes({"opacities": slope}, {"opacities": expected})
 
 
 def test_composites_have_the_gradients_of_the_render_of_both():
@@ -202,9 +210,7 @@ def test_composites_have_the_gradients_of_the_render_of_both():
         def render(self, gaussians, camera):
             return CPU.render(merge([context, gaussians]), camera)
 
-    ours, truth = gradients(Composites(), new), gradients(Together(), new)
-    for name in PARAMETERS:
-        assert (ours[name] - truth[name]).norm() <= 1e-3 * truth[name].norm() + 1e-9, name
+    assert_same_slopes(gradients(Composites(), new), gradients(Together(), new))
 
 
 @pytest.mark.parametrize("unit", [0.001, 1000.0])
@@ -213,8 +219,7 @@ def test_the_unit_of_the_scene_changes_no_image(renderer, unit):
     scene = SCENES["harmonics"]
     ours = renderer.render(scene, camera_at(size=32))
     theirs = renderer.render(scaled(scene, unit), camera_at(size=32, unit=unit))
-    assert outliers(ours.image, theirs.image, 1e-4) < 2e-3
-    assert outliers(ours.depth, theirs.depth / unit, 1e-3) < 2e-3
+    assert_same_drawing(replace(theirs, depth=theirs.depth / unit), ours)
 
 
 def test_the_same_input_gives_the_same_bytes_on_any_number_of_threads():
@@ -317,8 +322,8 @@ def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name
     beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
     context, new = merge([SCENES[name], beside]), random_gaussians(40, seed=5, sh_degree=1)
     ours, truth = cuda.render(context, CAMERA), REFERENCE.render(context, CAMERA)
-    assert outliers(ours.depth, truth.depth, 1e-5) == 0
-    assert outliers(ours.image, truth.image, 1e-5) == 0
+    assert_close(ours.depth, truth.depth, "depth", 1e-5)
+    assert_close(ours.image, truth.image, "image", 1e-5)
     view = cuda.freeze(context, CAMERA)
     assert 0 < len(view.seen) < len(context)
     check_frozen(view, REFERENCE.freeze(context, CAMERA), new, 1e-4)
@@ -336,7 +341,9 @@ def test_cuda_and_reference_draw_the_same_with_the_same_gradients(name):
     pytest.importorskip("gsplat", reason="gsplat is not installed")
     cuda, scene = load_renderer("cuda"), SCENES[name].to("cuda")
     ours, truth = cuda.render(scene, CAMERA.to("cuda")), REFERENCE.render(SCENES[name], CAMERA)
-    assert outliers(ours.image.cpu(), truth.image, 1e-3) < 5e-3
+    # Gsplat decides otherwise which splats reach a pixel with less than 1/255.
+    differs = (ours.image.cpu() - truth.image).abs() > 1e-3
+    assert differs.float().mean() < 5e-3
     a = gradients(cuda, scene, CAMERA.to("cuda"))
     b = gradients(REFERENCE, SCENES[name])
     for parameter in PARAMETERS:

@@ -55,3 +55,16 @@ def test_the_core_imports_no_particular_model():
     core = [PACKAGE / "completer.py", *sorted((PACKAGE / "stages").glob("*.py"))]
     found = [(path.name, name) for path in core for name in models if name in path.read_text()]
     assert found == []
+
+
+def test_sentences_of_the_library_name_no_option_of_the_command_line():
+    rooms = [path for path in files() if room_of(path) not in ("cli", "commands")]
+    found = [
+        (path.name, text.value)
+        for path in rooms
+        for call in ast.walk(ast.parse(path.read_text()))
+        if isinstance(call, ast.Call) and getattr(call.func, "id", "").endswith("Error")
+        for text in ast.walk(call)
+        if isinstance(text, ast.Constant) and re.search(r"(^|[^-])--[a-z]", str(text.value))
+    ]
+    assert found == []

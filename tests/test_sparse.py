@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from feed_forward_fixtures import error, rule_v1
+from feed_forward_fixtures import rule_v1
 from gscompleter import InputError
 from gscompleter.reconstructors.feed_forward.sparse import (
     OFFSETS,
@@ -20,6 +20,7 @@ from gscompleter.reconstructors.feed_forward.sparse import (
 from gscompleter.reconstructors.feed_forward.sparse_unet import SparseUNet
 from gscompleter.reconstructors.feed_forward.volsplat import GaussianHead
 from gscompleter.reconstructors.feed_forward.voxels import voxelize
+from parity import assert_close
 from volsplat_fixtures import FIXTURES, with_sparse_rule
 
 LOW, SIDE = -6, 12
@@ -215,11 +216,11 @@ def test_single_convolutions_agree_with_minkowski_engine(small):
     assert sorted(order) == list(range(len(place)))
     kernel = rule_v1("conv.kernel", torch.Size((27, 8, 6)))
     down = convolve(small["feats"], kernel, table)
-    assert error(down, small["conv_s2_out"][order]) < 1e-6
+    assert_close(down, small["conv_s2_out"][order], "conv_s2")
     kernel = rule_v1("up.kernel", torch.Size((27, 6, 4)))
     up = convolve(down, kernel, table.transposed())
     assert torch.equal(grid.coordinates, small["up_coords"].long())
-    assert error(up, small["up_out"]) < 1e-6
+    assert_close(up, small["up_out"], "up")
 
 
 def test_the_u_net_agrees_with_minkowski_engine(small):
@@ -230,7 +231,7 @@ def test_the_u_net_agrees_with_minkowski_engine(small):
     }
     with torch.inference_mode():
         found = network(small["feats"], Grid(small["coords"].long()))
-    assert error(found, small["unet_out"]) < 5e-6
+    assert_close(found, small["unet_out"], "unet")
 
 
 def test_two_convolutions_over_one_table_agree_with_minkowski_engine(small):
@@ -238,7 +239,7 @@ def test_two_convolutions_over_one_table_agree_with_minkowski_engine(small):
     head = with_sparse_rule(GaussianHead(8, 5))
     with torch.inference_mode():
         found = head(small["unet_out"], Grid(small["coords"].long()))
-    assert error(found, small["head_out"]) < 5e-6
+    assert_close(found, small["head_out"], "head")
 
 
 def test_the_u_net_gives_the_same_bits_twice(small):

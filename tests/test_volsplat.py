@@ -16,10 +16,10 @@ from gscompleter.reconstructors.feed_forward.inputs import batch_of
 from gscompleter.reconstructors.feed_forward.volsplat import REACH, VoxelGaussians
 from gscompleter.stages.anchor import lift
 from gscompleter.types import SH_C0, View
+from parity import assert_within
 from scenes import Room, camera_at, view_of
 from volsplat_fixtures import FIXTURES, VoxelPass, with_sparse_rule
 
-TOLERANCE = 5e-5
 SMALL = VolSplatConfig(DepthConfig("vits", 1, 4, 4), voxel_resolution=0.02)
 """A smaller network than the published one, for tests of what does not depend on its size."""
 
@@ -51,16 +51,17 @@ def check(case: Case) -> None:
     """Every stored array, for the voxels that lie in the same place.
 
     A point that lies on the border of two voxels falls to one side or the other by the last bit
-    of its depth.
+    of its depth, so that a few voxels are ours or the authors' alone.
     """
     network = published()
     network.config = VolSplatConfig(voxel_resolution=float(case.values["voxel_resolution"]))
     run = VoxelPass.through(network, case)
-    assert len(run.predicted.means) == int(case.values["num_voxels"])
-    assert (run.rows_of(case) < 0).float().mean() < 5e-4
+    ours, theirs = len(run.predicted.means), int(case.values["num_voxels"])
+    shared = int((run.rows_of(case) >= 0).sum())
+    assert ours + theirs - 2 * shared < 1e-3 * theirs
     errors = run.errors(case)
     assert len(errors) == 10
-    assert {name: e for name, e in errors.items() if not e < TOLERANCE} == {}
+    assert_within(errors)
 
 
 def test_voxels_with_neighbours_agree_with_the_authors_code():

@@ -10,9 +10,10 @@ from math import prod
 import torch
 from torch import Tensor, nn
 
-from feed_forward_fixtures import EVERY, STORED, Case, error, rule_v1
+from feed_forward_fixtures import EVERY, STORED, Case, rule_v1
 from gscompleter.geometry import rotations_from
 from gscompleter.reconstructors.feed_forward.volsplat import VoxelGaussians
+from parity import relative_error
 
 FIXTURES = STORED / "volsplat"
 
@@ -80,17 +81,19 @@ class VoxelPass:
         Harmonics are compared degree by degree: the higher ones are small beside the constant.
         """
         rows = self.rows_of(case)
-        errors = {"depth": error(self.predicted.depth[None], case.tensor("out_depth"))}
+        errors = {"depth": relative_error(self.predicted.depth[None], case.tensor("out_depth"))}
         step = int(case.values["stride"])
         for name, value in self.outputs().items():
             part = rows[::step]
-            errors[name] = error(value[part[part >= 0]], expected_of(name, case)[part >= 0])
+            errors[name] = relative_error(
+                value[part[part >= 0]], expected_of(name, case)[part >= 0]
+            )
         for name, value in self.between.items():
             flat = torch.arange(0, len(rows) * value.shape[1], EVERY)
             place, channel = rows[flat // value.shape[1]], flat % value.shape[1]
             shared = place >= 0
             ours = value[place[shared], channel[shared]]
-            errors[name] = error(ours, case.tensor(f"mid_{name}")[shared])
+            errors[name] = relative_error(ours, case.tensor(f"mid_{name}")[shared])
         return errors
 
     def outputs(self) -> dict[str, Tensor]:

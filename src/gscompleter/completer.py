@@ -13,6 +13,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
+from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import same_camera, widened
@@ -102,6 +103,10 @@ class GSCompleter:
     """Settings of the stages."""
     seed: int = 0
     """Of the random samples that RANSAC draws."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError where a setting is out of its range."""
+        checked(self.config, "config.")
 
     def __call__(
         self,

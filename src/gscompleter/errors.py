@@ -1,7 +1,11 @@
 """What the user is told when the input is wrong."""
 
+import os
+
 LONGEST_QUOTE = 100
 """Characters of the input that a sentence quotes at most."""
+LONGEST_PATH = 250
+"""The same of a path, which one may want to copy."""
 
 
 class InputError(ValueError):
@@ -11,17 +15,25 @@ class InputError(ValueError):
     line prints it without a traceback and exits with code 2.
     """
 
+    def __init__(self, message: str, argument: str | None = None) -> None:
+        """The `argument` of the function, or the name of the setting, that the user can mend. The
+        command line names its option of that name."""
+        super().__init__(message)
+        self.argument = argument
 
-def quoted(value: object, length: int = LONGEST_QUOTE) -> str:
+
+def quoted(value: object, length: int | None = None) -> str:
     """What was given as a sentence can hold it: on one line, its middle left out if it is long.
 
     A string stands in it without quotation marks; write `f"'{quoted(word)}'"` where it needs some.
 
     Args:
-        value: Anything; a string as it is, other values as Python writes them.
-        length: Most characters that are returned.
+        value: Anything; strings and paths as they are, other values as Python writes them.
+        length: Most characters that are returned; if left out, as many as such a value gets.
     """
-    text = value if isinstance(value, str) else _written(value, length)
+    if length is None:
+        length = LONGEST_PATH if isinstance(value, os.PathLike) else LONGEST_QUOTE
+    text = str(value) if isinstance(value, (str, os.PathLike)) else _written(value)
     # Twice as many characters as are wanted at either end are enough, whatever is left out.
     ends = text if len(text) <= 4 * length else text[: 2 * length] + text[-2 * length :]
     line = "".join(c if c.isprintable() else " " for c in ends)
@@ -31,9 +43,9 @@ def quoted(value: object, length: int = LONGEST_QUOTE) -> str:
     return f"{line[:half]}…{line[-half:]}"
 
 
-def _written(value: object, length: int) -> str:
+def _written(value: object) -> str:
     """`repr`, which refuses integers of more than 4,300 digits."""
-    if isinstance(value, int) and value.bit_length() > 4 * length:
+    if isinstance(value, int) and value.bit_length() > 4 * LONGEST_QUOTE:
         return f"an integer of about {value.bit_length() * 0.30103:,.0f} digits"
     try:
         return repr(value)

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.options import CompleteOptions, GeneratorOptions
+from gscompleter.commands.options import CompleteOptions
 from gscompleter.completer import GSCompleter
-from gscompleter.config import CompleterConfig, load_config
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.origin import frame_from_photographs, told_from
 from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sparse_points import with_depth_range
-from gscompleter.errors import InputError
-from gscompleter.generators import DiffusionSettings, load_generator
+from gscompleter.errors import InputError, quoted
+from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.ply import load_ply
+from gscompleter.memory import check_memory
 from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
@@ -30,6 +31,8 @@ from gscompleter.types import Camera, Completion, View
 
 MIN_SIZE = 16
 """Shorter side of an image, in pixels, under which there is nothing to match and to score."""
+MAX_DIGITS = 9
+"""Characters of the longest number of a frame."""
 
 
 def run_completion(options: CompleteOptions) -> None:
@@ -51,61 +54,55 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     """
     console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, options.overwrite)
-    device = choose_device(options.device)
-    renderer = load_renderer(device)
-    config = load_config(options.config)
     check_context(options)
+    device = choose_device(options.device)
     given = open_photographs(options.folder, options.format, options.near, options.far)
     given = with_depth_range(given, options.context, options.resolution)
     for note in given.notes:
         console.print(note, highlight=False, soft_wrap=True)
-    views = [view.to(device) for view in read_views(given, options.context, options)]
     targets = read_targets(given, options)
+    cameras = [given.camera(frame, options.resolution) for frame in options.context]
+    cameras += [target.camera for target in targets]
+    check_sizes(cameras)
+    views = [view.to(device) for view in given.views(options.context, options.resolution)]
+    targets = [with_photograph(target, given, options) for target in targets]
     scene = None
     if options.scene is not None:
-        cameras = [view.camera for view in views] + [target.camera for target in targets]
         scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite)
         scene = told_from(given.origin, scene, cameras).to(device)
+    completer = completer_for(options, targets, device)
+    frame = frame_from_photographs(given.origin)
+    said = {
+        "settings": settings_of(options),
+        "seed": options.seed,
+        "device": device,
+        "frame": {"method": "given", "transform": frame.tolist()},
+    }
+    with output_folder(options.out, options.overwrite) as folder:
+        with shown_on(None if options.quiet else console):
+            completion = completer(views, [t.camera.to(device) for t in targets], scene)
+        summary = write_report(folder, completion, targets, completer.renderer, said)
+    return summary, completion
 
+
+def completer_for(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
+    """The models that the options name, and the settings of the stages.
+
+    Raises:
+        InputError: where a name is unknown, or weights or packages are missing.
+    """
     photographs = [
         View(target.photograph, target.camera, target.frame)
         for target in targets
         if target.photograph is not None
     ]
-    completer = GSCompleter(
+    generator = options.synthesis
+    return GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
-        load_generator(
-            options.synthesis.generator,
-            options.seed,
-            photographs,
-            device,
-            generator_settings(options.synthesis),
-        ),
-        renderer,
-        config,
+        load_generator(generator.name, options.seed, photographs, device, generator.settings()),
+        load_renderer(device),
+        options.config,
         options.seed,
-    )
-    with output_folder(options.out, options.overwrite) as folder:
-        with shown_on(None if options.quiet else console):
-            completion = completer(views, [t.camera.to(device) for t in targets], scene)
-        settings = settings_of(options, config)
-        frame = frame_from_photographs(given.origin)
-        summary = write_report(
-            folder, completion, views, targets, renderer, settings, options.seed, device, frame
-        )
-    return summary, completion
-
-
-def generator_settings(options: GeneratorOptions) -> DiffusionSettings:
-    """What the generator is told."""
-    return DiffusionSettings(
-        path=options.generator_path,
-        steps=options.generator_steps,
-        retries=options.generator_retries,
-        prompt=options.generator_prompt,
-        depth=options.generator_depth,
-        at_once=options.generator_at_once,
-        offload=options.generator_offload,
     )
 
 
@@ -126,48 +123,60 @@ def check_context(options: CompleteOptions) -> None:
         raise InputError("--target names no frame; name at least one, as in --target 8.")
 
 
-def read_views(
-    photographs: PosedPhotographs, frames: Sequence[int], options: CompleteOptions
-) -> list[View]:
-    """The photographs of `frames` as the options want them."""
-    for frame in frames:
-        check_size(photographs.camera(frame, options.resolution), f"Frame {frame}")
-    return photographs.views(frames, options.resolution)
-
-
 def read_targets(photographs: PosedPhotographs, options: CompleteOptions) -> list[Target]:
-    """The target cameras in the order of the command line, with photographs where there are any."""
+    """The target cameras in the order of the command line."""
     targets = []
     for word in options.target:
-        if not is_whole_number(word):
+        frame = frame_number(word)
+        if frame is None:
             cameras = load_cameras(
                 word, options.resolution, options.near, options.far, photographs.origin.tolist()
             )
             targets += [Target(camera) for camera in cameras]
-        elif photographs.has_photograph(int(word)):
-            (view,) = read_views(photographs, [int(word)], options)
-            targets.append(Target(view.camera, view.frame, view.image))
         else:
-            targets.append(Target(photographs.camera(int(word), options.resolution), int(word)))
-    for number, target in enumerate(targets, start=1):
-        check_size(target.camera, f"Target {number}")
+            targets.append(Target(photographs.camera(frame, options.resolution), frame))
     return targets
 
 
-def check_size(camera: Camera, name: str) -> None:
-    """Refuse images in which there is nothing to match and to score."""
-    if min(camera.width, camera.height) < MIN_SIZE:
-        raise InputError(
-            f"{name} is {camera.width} x {camera.height} pixels, and both sides must have at least "
-            f"{MIN_SIZE}; choose a larger --resolution."
-        )
+def with_photograph(
+    target: Target, photographs: PosedPhotographs, options: CompleteOptions
+) -> Target:
+    """`target` and what its camera took, if it is a frame that has a photograph."""
+    if target.frame is None or not photographs.has_photograph(target.frame):
+        return target
+    (view,) = photographs.views([target.frame], options.resolution)
+    return replace(target, photograph=view.image)
 
 
-def is_whole_number(word: str) -> bool:
-    return word.lstrip("-").isdigit()
+def check_sizes(cameras: Sequence[Camera]) -> None:
+    """Refuse images in which there is nothing to match and to score, and those beyond all memory.
+
+    Raises:
+        InputError: where there are such.
+    """
+    for camera in cameras:
+        if min(camera.width, camera.height) < MIN_SIZE:
+            raise InputError(
+                f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
+                f"least {MIN_SIZE}; choose a larger --resolution, or another camera."
+            )
+    check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
 
 
-def settings_of(options: CompleteOptions, config: CompleterConfig) -> dict[str, Any]:
+def frame_number(word: str) -> int | None:
+    """The number that `word` writes, or None where it names a file.
+
+    Raises:
+        InputError: where it has more digits than there are frames anywhere.
+    """
+    if re.fullmatch("-?[0-9]+", word) is None:
+        return None
+    if len(word) > MAX_DIGITS:
+        raise InputError(f"There is no frame {quoted(word)}; name one by its number.", "target")
+    return int(word)
+
+
+def settings_of(options: CompleteOptions) -> dict[str, Any]:
     """Everything that decided the result, for `summary.json`."""
     return {
         "folder": str(options.folder),
@@ -177,12 +186,12 @@ def settings_of(options: CompleteOptions, config: CompleterConfig) -> dict[str, 
         "scene": None if options.scene is None else str(options.scene),
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
-        **asdict(options.synthesis),
-        "uses_target_photographs": options.synthesis.generator == "oracle",
+        **options.synthesis.as_summary(),
+        "uses_target_photographs": options.synthesis.name == "oracle",
         "resolution": None if options.resolution is None else list(options.resolution),
         "near": options.near,
         "far": options.far,
-        "config": asdict(config),
+        "config": asdict(options.config),
     }
 
 

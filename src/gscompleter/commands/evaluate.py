@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -12,37 +13,26 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.complete import generator_settings
 from gscompleter.commands.options import EvaluateOptions, IndexOptions, TablesOptions
 from gscompleter.data.cases import read_cases
 from gscompleter.data.datasets import Skipped, open_clips, usable
 from gscompleter.data.framing import check_resolution
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.progress import shown_on
 from gscompleter.render import choose_device
-from gscompleter.reports.plots import PlotsNotAvailable, plot_sequences, plots
-from gscompleter.reports.sequence_tables import overview, sequence_tables
-from gscompleter.reports.tables import (
-    COLUMNS,
-    Summary,
-    present,
-    score_cells,
-    seconds_of,
-    tables,
-)
+from gscompleter.reports.plots import PlotsNotAvailable, plots
+from gscompleter.reports.summary import Summary
+from gscompleter.reports.tables import score_cells, tables
 from gscompleter.runs.methods import methods_named
 from gscompleter.runs.protocols import (
-    SequenceCase,
     ViewByView,
-    cases_of,
     index_of,
     parse_protocol,
-    sequences_of,
     write_evaluation_index,
 )
-from gscompleter.runs.runner import EvaluationCase, RunConfig, evaluate
-from gscompleter.runs.sequences import evaluate_sequences
-from gscompleter.runs.store import CASES, SEQUENCES
+from gscompleter.runs.runner import RunConfig, evaluate
+from gscompleter.runs.store import row_paths
+from gscompleter.runs.tasks import Task, task_of, tasks_of
 
 
 def run_evaluation(options: EvaluateOptions) -> None:
@@ -56,42 +46,29 @@ def run_evaluation(options: EvaluateOptions) -> None:
     console = Console(stderr=True, quiet=options.quiet)
     methods = methods_named(options.methods)
     shard = parse_shard(options.shard)
-    if options.limit is not None and options.limit < 1:
-        raise InputError(f"--limit is {options.limit}, and at least one case is needed.")
     check_resolution(options.resolution)
     skipped: list[Skipped] = []
-    cases = chosen_cases(options, skipped)
+    tasks = chosen_tasks(options, skipped)
     for clip in skipped:
         console.print(f"Left out {clip.name}: {clip.reason}.", highlight=False)
     config = RunConfig(
         reconstructor=options.reconstructor,
         weights=None if options.weights is None else str(options.weights),
-        generator=options.synthesis.generator,
-        generator_settings=generator_settings(options.synthesis),
+        generator=options.synthesis.name,
+        generator_settings=options.synthesis.settings(),
         device=choose_device(options.device),
         seed=options.seed,
         source=source_of(options),
     )
-    sequences = [case for case in cases if isinstance(case, SequenceCase)]
-    singles = [case for case in cases if not isinstance(case, SequenceCase)]
     with shown_on(None if options.quiet else console):
-        tallies = []
-        if singles or not sequences:
-            tallies.append(evaluate(singles, methods, options.out, config, shard, options.again))
-        if sequences:
-            tallies.append(
-                evaluate_sequences(sequences, methods, options.out, config, shard, options.again)
-            )
-    done, failed, before = (
-        sum(getattr(tally, count) for tally in tallies) for count in ("done", "failed", "skipped")
-    )
+        counts = evaluate(tasks, methods, options.out, config, shard, options.again)
     console.print(
-        f"Scored {done}, failed {failed}, there before {before}.",
+        f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}.",
         highlight=False,
     )
     # An empty shard, where there are more shards than cases, has nothing to show.
-    if done + failed + before > 0:
-        show(options.out, options.quiet)
+    if counts.done + counts.failed + counts.skipped > 0:
+        show(options.out, options.quiet, num_rows=len(tasks) * len(methods))
 
 
 def source_of(options: EvaluateOptions) -> dict[str, Any]:
@@ -112,26 +89,34 @@ def run_tables(options: TablesOptions) -> None:
     show(options.out, options.quiet, options.fid)
 
 
-def show(out: Path, quiet: bool, with_fid: bool = False) -> None:
+def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> None:
     """Write the tables and plots of a run, and print the former unless `quiet`.
+
+    Where other shards finished meanwhile and all `num_rows` rows are there, it does so once more:
+    of shards that end at the same moment, none can leave tables behind that lack rows of another.
 
     Raises:
         InputError: where there is no run.
     """
-    if (out / SEQUENCES).is_dir():
-        tell_sequences(out, quiet)
-        if not (out / CASES).is_dir():
-            return
-    summary = tables(out, with_fid)
-    draw(quiet, lambda: plots(summary, out))
+    seen, there = None, rows_there(out)
+    while seen is None or (there != seen and len(there) >= num_rows):
+        seen = there
+        summary = tables(out, with_fid)
+        draw(summary, out, quiet)
+        there = rows_there(out)
     if not quiet:
         tell(summary, out)
 
 
-def draw(quiet: bool, drawing: Callable[[], object]) -> None:
-    """Do `drawing`, or say what it needs."""
+def rows_there(out: Path) -> dict[Path, int]:
+    """The rows of a run, and when each was written."""
+    return {path: path.stat().st_mtime_ns for path in row_paths(out)}
+
+
+def draw(summary: Summary, out: Path, quiet: bool) -> None:
+    """Draw the plots of a run, or say what they need."""
     try:
-        drawing()
+        plots(summary, out)
     except PlotsNotAvailable as missing:
         if not quiet:
             Console(stderr=True).print(str(missing), highlight=False, markup=False)
@@ -147,11 +132,6 @@ def run_index(options: IndexOptions) -> None:
         raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
     skipped: list[Skipped] = []
     protocol = parse_protocol(options.protocol)
-    if isinstance(protocol, ViewByView):
-        raise InputError(
-            f"{protocol.name} has no index, as its targets are not apart from each other; give it "
-            "to `evaluate` itself."
-        )
     index = index_of(protocol, usable(open_clips(options.path), skipped))
     index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
     write_evaluation_index(options.out, index)
@@ -169,10 +149,8 @@ def run_index(options: IndexOptions) -> None:
     )
 
 
-def chosen_cases(
-    options: EvaluateOptions, skipped: list[Skipped]
-) -> Sequence[EvaluationCase | SequenceCase]:
-    """The cases that the options ask for; clips that are left out go to `skipped`.
+def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped]) -> list[Task]:
+    """The tasks that the options ask for; clips that are left out go to `skipped`.
 
     Raises:
         InputError: where there are none to be found, or a protocol is needed or wrong.
@@ -180,22 +158,22 @@ def chosen_cases(
     if not options.protocol:
         files = [cases_file(path) for path in options.paths]
         cases = [case for file in files for case in read_cases(file)][: options.limit]
-        if options.resolution is None:
-            return cases
-        return [replace(case, resolution=options.resolution) for case in cases]
+        resolution = options.resolution
+        if resolution is not None:
+            cases = [replace(case, resolution=resolution) for case in cases]
+        return [task_of(case) for case in cases]
+    return list(islice(tasks_in_clips(options, skipped), options.limit))
+
+
+def tasks_in_clips(options: EvaluateOptions, skipped: list[Skipped]) -> Iterator[Task]:
+    """The tasks that the protocols find in the data, clip by clip; the rest as `chosen_tasks`."""
     protocols = [parse_protocol(text) for text in options.protocol]
-    clips = (clip for path in options.paths for clip in usable(open_clips(path), skipped))
-    found = (
-        case
-        for clip in clips
-        for protocol in protocols
-        for case in (
-            sequences_of(protocol, [clip], skipped, options.resolution)
-            if isinstance(protocol, ViewByView)
-            else cases_of(protocol, clip, options.resolution)
-        )
-    )
-    return list(islice(found, options.limit))
+    for path in options.paths:
+        for clip in usable(open_clips(path), skipped):
+            for protocol in protocols:
+                if isinstance(protocol, ViewByView) and (reason := protocol.reason_to_skip(clip)):
+                    skipped.append(Skipped(clip.name, reason))
+                yield from tasks_of(protocol, clip, options.resolution)
 
 
 def cases_file(path: Path) -> Path:
@@ -204,10 +182,12 @@ def cases_file(path: Path) -> Path:
     Raises:
         InputError: where it is and holds none.
     """
-    file = path / "cases.json" if path.is_dir() else path
-    if not file.exists() and not path.exists():
-        raise InputError(f"There is no {path}; name a cases.json, or scenes with --protocol.")
-    if file.suffix != ".json" or not file.exists() or file.name in ("transforms.json",):
+    if not os.path.exists(path):
+        raise InputError(
+            f"There is no '{quoted(path)}'; name a cases.json, or scenes with --protocol."
+        )
+    file = path / "cases.json" if os.path.isdir(path) else path
+    if file.suffix != ".json" or not os.path.isfile(file) or file.name == "transforms.json":
         raise InputError(
             f"{path} says not which frames are given and which are the target; add --protocol, as "
             "in --protocol n-10."
@@ -225,45 +205,27 @@ def parse_shard(text: str | None) -> tuple[int, int]:
         return 0, 1
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if match is None:
-        raise InputError(f"--shard is {text!r}; give it as i/n, as in 0/4 for the first of four.")
+        raise InputError(
+            f"--shard is '{quoted(text)}'; give it as i/n, as in 0/4 for the first of four."
+        )
     return int(match[1]), int(match[2])
-
-
-def tell_sequences(out: Path, quiet: bool) -> None:
-    """Write the tables of sequences, and print their overview unless `quiet`.
-
-    Raises:
-        InputError: where a row is damaged, or a file cannot be written.
-    """
-    summary = sequence_tables(out)
-    if summary is None:
-        return
-    draw(quiet, lambda: plot_sequences(summary, out))
-    if quiet:
-        return
-    console = Console()
-    console.print(overview(summary), highlight=False, markup=False, soft_wrap=True)
-    for name, method, steps, reason in summary.failures:
-        text = f"Failed: {name}, {method}, after {steps} steps: {reason}"
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
-    console.print(f"Each step: {out / 'sequences.md'}", highlight=False, soft_wrap=True)
 
 
 def tell(summary: Summary, out: Path) -> None:
     """Print the tables, turned on their side: a column per method."""
     table = Table("", *summary.methods, box=None)
-    columns = present(summary, COLUMNS)
+    columns = summary.present(summary.columns)
     cells = score_cells(summary, columns)
     for number, column in enumerate(columns, start=1):
         table.add_row(column.title, *(row[number] for row in cells))
-    seconds = seconds_of(summary)
-    table.add_row("seconds", *(f"{seconds[m]['total']:.1f}" for m in summary.methods))
+    if summary.common:
+        table.add_row("seconds", *(f"{summary.seconds(m)['total']:.1f}" for m in summary.methods))
     console = Console()
     console.print(table)
     for case, method, reason in summary.failures:
         console.print(f"Failed: {case}, {method}: {reason}", highlight=False, markup=False)
     console.print(
-        f"Over {len(summary.common)} of {summary.cases} cases: {out / 'tables.md'}",
+        f"Over {len(summary.common)} of {len(summary.tasks)} cases: {out / 'tables.md'}",
         highlight=False,
         soft_wrap=True,
     )

@@ -10,46 +10,56 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from annotated_types import Interval
 
+from gscompleter.commands.generator_options import GeneratorOptions
+from gscompleter.config import CompleterConfig
+from gscompleter.config.settings import Seed, Settings
+
+Frame = Annotated[int, Interval(ge=0, lt=10**9)]
 Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class GeneratorOptions:
-    """How the image at a target comes about."""
+class Options(Settings):
+    """What every command can be told that does something."""
 
-    generator: str = "warp-inpaint"
-    """The model that synthesizes the image at the target: warp-inpaint, which needs no weights,
-    pe-field, diffusers-inpaint (any inpainting pipeline), or oracle (the true photograph)."""
-    generator_path: str | None = None
-    """Its weights: a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the Hugging
-    Face hub. pe-field knows its published ones; diffusers-inpaint must be told."""
-    generator_steps: int | None = None
-    """Its denoising steps. If not given, 4 for pe-field, and what an inpainting pipeline itself
-    takes."""
-    generator_retries: int = 0
-    """How many further seeds are tried where its image disagrees with the photographs."""
-    generator_prompt: str | None = None
-    """What diffusers-inpaint is told of the image, in words."""
-    generator_depth: str | None = None
-    """Where pe-field takes the depth of the photograph from: context, the scene itself (if not
-    given); monocular, a published network; or the folder or hub id of another one."""
-    generator_at_once: int | None = None
-    """How many targets pe-field denoises together, at most. Fewer need less memory. If not given,
-    4."""
-    generator_offload: bool = False
-    """Keep on the GPU only the part of the generator that is at work, the rest in main memory."""
+    quiet: bool = False
+    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompleteOptions:
+class RunOptions(Options):
+    """What every command can be told that completes something."""
+
+    device: Device = "auto"
+    """Where to run."""
+    seed: Seed = 0
+    """Of everything random. The same seed gives the same bytes on a CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(RunOptions):
+    """What every command can be told that lets its models be chosen."""
+
+    reconstructor: str = "plane-sweep"
+    """The model that turns views into Gaussians: plane-sweep, which needs no weights, or one of
+    those that `gscompleter models` lists."""
+    weights: Path | None = None
+    """The file of its weights, where they are not to be downloaded."""
+    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
+    """How the image at a target comes about."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompleteOptions(ModelOptions):
     """Fill what the photographs never saw, as seen from the targets, and write the scene."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Posed photographs: a folder with a COLMAP model or a nerfstudio transforms.json, a
     cameras.json beside its photographs, a poses_bounds.npy of LLFF, a sequence of KITTI, a scene
     of DGP, a chunk of pixelSplat, or a camera file of RealEstate10K beside its frames."""
-    context: tuple[int, ...]
+    context: tuple[Frame, ...]
     """Numbers of the frames to start from, in the order of the sorted file paths."""
     target: tuple[str, ...]
     """Frames to complete the scene for, by number, or a file of cameras (transforms.json,
@@ -63,12 +73,6 @@ class CompleteOptions:
     scene: Path | None = None
     """A .ply of Gaussians to complete, in the frame of the photographs. It is kept as it is.
     Without it the context is reconstructed from the photographs."""
-    reconstructor: str = "plane-sweep"
-    """The model that turns views into Gaussians: plane-sweep, which needs no weights, or one of
-    those that `gscompleter models` lists."""
-    weights: Path | None = None
-    """The file of its weights, where they are not to be downloaded."""
-    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
     resolution: tuple[int, int] | None = None
     """Height and width to work at: photographs are scaled to cover it and cropped around the
     centre. If not given, they keep their own size."""
@@ -76,22 +80,17 @@ class CompleteOptions:
     """Smallest depth in the scene, in its own unit. Estimated if not given."""
     far: float | None = None
     """Largest depth in the scene, in its own unit. Estimated if not given."""
-    device: Device = "auto"
-    """Where to run."""
-    seed: int = 0
-    """Of everything random. The same seed gives the same bytes on a CPU."""
-    config: str = "default"
-    """Settings of the stages: default, paper, an ablation such as no-sa, or a YAML file."""
+    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
+    """Settings of the stages. `--config NAME` says where they start: default, paper, an ablation
+    such as no-sa, or a YAML file. Those given here are applied over it."""
     drop_nonfinite: bool = False
     """Leave out Gaussians of the .ply that hold NaN or infinity."""
     overwrite: bool = False
     """Replace what an earlier run left in the output folder."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions:
+class DemoOptions(RunOptions):
     """Complete a real stereo pair beyond its left and its right camera, and show before/after.
 
     The photographs are the Middlebury motorcycle pair that scikit-image carries. Nothing is
@@ -100,18 +99,12 @@ class DemoOptions:
 
     out: Path = Path("demo")
     """Folder for the scene, its completion and before_after.png."""
-    device: Device = "auto"
-    """Where to run."""
-    seed: int = 0
-    """Of everything random."""
     overwrite: bool = False
     """Replace what an earlier run left in the output folder."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
+class EvaluateOptions(ModelOptions):
     """Run methods on cases of which the truth is known, and score them.
 
     Run again with the same options, it goes on where it was stopped. The tables are printed and
@@ -140,36 +133,22 @@ class EvaluateOptions:
     """i/n does every n-th case from the i-th on, i from 0 to n - 1: n processes share the work."""
     resolution: tuple[int, int] | None = None
     """Height and width to work at. If not given, that of the cases or of the photographs."""
-    limit: int | None = None
+    limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to do, in all shards together."""
-    reconstructor: str = "plane-sweep"
-    """The model that turns views into Gaussians: plane-sweep, which needs no weights, or one of
-    those that `gscompleter models` lists."""
-    weights: Path | None = None
-    """The file of its weights, where they are not to be downloaded."""
-    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
-    device: Device = "auto"
-    """Where to run."""
-    seed: int = 0
-    """Of everything random."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class TablesOptions:
+class TablesOptions(Options):
     """Write the tables of what `evaluate` has done so far, and print them."""
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder that `evaluate` wrote. The tables and plots go there."""
     fid: bool = False
     """Compare the pictures of each method with the photographs by FID, too."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class IndexOptions:
+class IndexOptions(Options):
     """Write down which frames a protocol chooses in a data set."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -180,12 +159,10 @@ class IndexOptions:
     """The evaluation index, a JSON file."""
     overwrite: bool = False
     """Replace the file where there is one."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelsOptions:
+class ModelsOptions(Settings):
     """List the published weights: what they are, under which licence, and which are cached."""
 
     json: bool = False

@@ -21,7 +21,7 @@ from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.json_numbers import array_of, number_of, size_of, text_of
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import made_rigid, pose_defect
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.json_file import begins_a_list, read_json
 
 NAME = "cameras.json"
@@ -61,12 +61,12 @@ def read_camera_list(path: Path) -> list[Frame]:
     """
     content = read_json(path, ADVICE)
     if not isinstance(content, list) or not content:
-        raise InputError(f"{path} lists no cameras; a list of cameras is needed, {ADVICE}.")
+        raise InputError(f"{quoted(path)} lists no cameras; a list of cameras is needed, {ADVICE}.")
     return [_frame(entry, number, path) for number, entry in enumerate(content)]
 
 
 def _frame(entry: Any, number: int, path: Path) -> Frame:
-    title = f"camera {number} of {path}"
+    title = f"camera {number} of {quoted(path)}"
     if not isinstance(entry, dict):
         raise InputError(f"{capital(title)} is no object with a position and a rotation; {ADVICE}.")
     fx, fy = (number_of(entry, key, title, 1 / LARGEST, LARGEST) for key in ("fx", "fy"))

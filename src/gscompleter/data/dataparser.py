@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from gscompleter.data.json_numbers import array_of, number_of
 from gscompleter.data.poses import pose_defect
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.json_file import read_json
 
 SCALE_RANGE = (1e-9, 1e9)
@@ -26,10 +26,14 @@ def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
     """
     content = read_json(path, "copy it from the folder of the nerfstudio run again")
     if not isinstance(content, dict):
-        raise InputError(f"{path} is no object with `transform` and `scale`; copy it again.")
+        raise InputError(
+            f"{quoted(path)} is no object with `transform` and `scale`; copy it again."
+        )
     rigid = np.vstack([array_of(content, "transform", (3, 4), str(path)), [0, 0, 0, 1]])
     defect = pose_defect(rigid)
     if defect is not None:
-        raise InputError(f"The `transform` of {path} cannot be used: {defect}; copy it again.")
+        raise InputError(
+            f"The `transform` of {quoted(path)} cannot be used: {defect}; copy it again."
+        )
     scale = number_of(content, "scale", str(path), *SCALE_RANGE)
     return np.diag([scale, scale, scale, 1.0]) @ rigid

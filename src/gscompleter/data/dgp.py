@@ -48,20 +48,20 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     """
     file = _scene_file(path)
     if file is None:
-        raise InputError(f"There is no scene of DGP in {quoted(str(path))}; name its scene.json.")
+        raise InputError(f"There is no scene of DGP in {quoted(path)}; name its scene.json.")
     content = read_json(file, ADVICE)
     cameras = _calibrations(file, content)
     images = [datum for datum in _list(content, "data") if "image" in _object(datum, "datum")]
     frames = sorted((_frame(d, cameras, file) for d in images), key=lambda frame: frame.name)
     if not frames:
-        raise InputError(f"{file} lists no images; name a scene with cameras.")
+        raise InputError(f"{quoted(file)} lists no images; name a scene with cameras.")
     yield photographs_of(file.resolve().parent.name, str(file), frames)
 
 
 def _frame(datum: Any, cameras: Mapping[str, Intrinsics], file: Path) -> Frame:
     image, camera = _object(datum["datum"], "image"), _object(datum, "id").get("name")
     name = text_of(image, "filename", str(file))
-    title = f"image {quoted(name)} of {file}"
+    title = f"image {quoted(name)} of {quoted(file)}"
     if name is None or not isinstance(camera, str) or camera not in cameras:
         raise InputError(
             f"The {title} has no file name, or its camera {quoted(camera)} is not in the "
@@ -90,7 +90,10 @@ def _calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     names, entries = _list(calibration, "names"), _list(calibration, "intrinsics")
     # Those of other sensors than cameras are zeros.
     pairs = [(n, e) for n, e in zip(names, entries, strict=False) if _is_camera(n, e)]
-    return {name: _intrinsics(entry, f"camera {quoted(name)} of {file}") for name, entry in pairs}
+    return {
+        name: _intrinsics(entry, f"camera {quoted(name)} of {quoted(file)}")
+        for name, entry in pairs
+    }
 
 
 def _is_camera(name: Any, entry: Any) -> bool:
@@ -112,7 +115,7 @@ def _calibration_file(scene: Path, content: Any) -> Path:
     found = next((path for path in candidates if os.path.isfile(path)), None)
     if found is None:
         raise InputError(
-            f"The calibration of {scene} is missing; put it at {quoted(str(candidates[0]))}."
+            f"The calibration of {quoted(scene)} is missing; put it at {quoted(candidates[0])}."
         )
     return found
 

@@ -52,7 +52,7 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     """
     poses = _poses_of(path) if os.path.isdir(path) else path
     if poses is None:
-        raise InputError(f"There are no poses in {quoted(str(path))}; put {POSES} into it.")
+        raise InputError(f"There are no poses in {quoted(path)}; put {POSES} into it.")
     folder = path if os.path.isdir(path) else _sequence_of(path)
     calibration = _calibration_beside(folder, poses)
     images, camera = _camera_folder(folder)
@@ -68,7 +68,7 @@ def _frame(
     number: int, c2w: Float[np.ndarray, "4 4"], intrinsics: Intrinsics, images: Path, poses: Path
 ) -> Frame:
     name = f"{number:06d}"
-    title = f"frame {number} of {poses}"
+    title = f"frame {number} of {quoted(poses)}"
     return Frame(name, title, c2w, intrinsics, images / name)
 
 
@@ -77,14 +77,14 @@ def _camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarra
     projections = _matrices(calibration)
     if len(projections) <= camera:
         raise InputError(
-            f"{calibration} has {len(projections)} projections, and the photographs are those of "
-            f"camera {camera}; a line P{camera} is needed."
+            f"{quoted(calibration)} has {len(projections)} projections, and the photographs are "
+            f"those of camera {camera}; a line P{camera} is needed."
         )
     K, aside = projections[camera][:3, :3], projections[camera][:3, 3]
     if not _is_upright(K):
         raise InputError(
-            f"The projection of camera {camera} in {calibration} is none of a rectified camera; "
-            "name the calib.txt of KITTI odometry."
+            f"The projection of camera {camera} in {quoted(calibration)} is none of a rectified "
+            "camera; name the calib.txt of KITTI odometry."
         )
     transform = np.eye(4)
     transform[:3, 3] = -np.linalg.solve(K, aside)
@@ -103,11 +103,13 @@ def _matrices(path: Path) -> list[Float[np.ndarray, "4 4"]]:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             lines = [line for line in file if line.strip() and not line.startswith("Tr")]
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; correct the path.") from error
+        raise InputError(
+            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+        ) from error
     matrices = [_matrix(line) for line in lines]
     found = [matrix for matrix in matrices if matrix is not None]
     if not found or len(found) < len(matrices):
-        raise InputError(f"{path} is no file of KITTI: each of its lines needs 12 numbers.")
+        raise InputError(f"{quoted(path)} is no file of KITTI: each of its lines needs 12 numbers.")
     return found
 
 
@@ -141,8 +143,8 @@ def _calibration_beside(folder: Path, poses: Path) -> Path:
         if os.path.isfile(path) and path != poses:
             return path
     raise InputError(
-        f"{poses} holds poses only, and there is no {CALIBRATION} in {folder}; copy it there from "
-        "the same sequence."
+        f"{quoted(poses)} holds poses only, and there is no {CALIBRATION} in "
+        f"{quoted(folder)}; copy it there from the same sequence."
     )
 
 
@@ -151,7 +153,7 @@ def _camera_folder(folder: Path) -> tuple[Path, int]:
         if os.path.isdir(folder / name):
             return folder / name, camera
     raise InputError(
-        f"There are no photographs in {quoted(str(folder))}; a folder image_2 or image_0 of the "
+        f"There are no photographs in {quoted(folder)}; a folder image_2 or image_0 of the "
         "same sequence is needed."
     )
 

@@ -53,7 +53,7 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     rows = _read_rows(file)
     images = _photographs_beside(file, len(rows))
     numbered = enumerate(zip(images, rows, strict=True))
-    frames = [_frame(image, row, f"row {n} of {file}") for n, (image, row) in numbered]
+    frames = [_frame(image, row, f"row {n} of {quoted(file)}") for n, (image, row) in numbered]
     near, far = with_room(float(rows[:, 15].min()), float(rows[:, 16].max()))
     scene = photographs_of(file.resolve().parent.name, str(file), frames)
     yield replace(scene, near=near, far=far)
@@ -77,16 +77,16 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
     fitting = stored.ndim == 2 and stored.shape[1] == 17 and len(stored) > 0
     if not (fitting and stored.dtype.kind in "fiu" and stored.nbytes <= MAX_BYTES):
         raise InputError(
-            f"{path} holds {stored.dtype} of shape {list(stored.shape)}, where a row of 17 numbers "
-            "for each photograph is needed; run LLFF's imgs2poses again."
+            f"{quoted(path)} holds {stored.dtype} of shape {list(stored.shape)}, where a row "
+            "of 17 numbers for each photograph is needed; run LLFF's imgs2poses again."
         )
     rows = np.array(stored, dtype=np.float64)
     low, high = DEPTH_RANGE
     near, far = rows[:, 15], rows[:, 16]
     if not ((near >= low) & (near < far) & (far <= high)).all():
         raise InputError(
-            f"The bounds in {path} are no z-depths, nearest first, from {low:g} to {high:g}; run "
-            "LLFF's imgs2poses again."
+            f"The bounds in {quoted(path)} are no z-depths, nearest first, from {low:g} to "
+            f"{high:g}; run LLFF's imgs2poses again."
         )
     return rows
 
@@ -98,10 +98,11 @@ def _stored_array(path: Path) -> Shaped[np.ndarray, "..."]:
             warnings.simplefilter("ignore")
             return np.lib.format.open_memmap(path, mode="r")
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error}; correct the path.") from error
+        raise InputError(f"{quoted(path)} cannot be read: {error}; correct the path.") from error
     except _NO_ARRAY as error:
         raise InputError(
-            f"{path} is no array of numbers ({quoted(str(error))}); run LLFF's imgs2poses again."
+            f"{quoted(path)} is no array of numbers ({quoted(str(error))}); run LLFF's "
+            "imgs2poses again."
         ) from error
 
 
@@ -113,8 +114,9 @@ def _photographs_beside(file: Path, count: int) -> list[Path]:
     if fitting is None:
         numbers = ", ".join(f"{len(i)} in {f}" for f, i in zip(folders, found, strict=True))
         raise InputError(
-            f"{file} has {count} rows, which belong to as many photographs in order of their "
-            f"names, and there are {numbers}; put exactly these into a folder `images` beside it."
+            f"{quoted(file)} has {count} rows, which belong to as many photographs in order of "
+            f"their names, and there are {numbers}; put exactly these into a folder "
+            "`images` beside it."
         )
     return fitting
 

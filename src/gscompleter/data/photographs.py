@@ -50,10 +50,6 @@ class PosedPhotographs(Protocol):
     def origin(self) -> Float[np.ndarray, "3"]:
         """Where the cameras' coordinates are counted from, in those of the files (float64)."""
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences about what was chosen or left out when they were opened."""
-
     def __len__(self) -> int:
         """How many frames there are."""
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.ply import Element, read_header, read_vertices
 
 AXES = ("x", "y", "z")
@@ -24,10 +24,14 @@ def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:
             header = read_header(file, path)
             vertex = next((e for e in header.elements if e.name == "vertex"), None)
             if vertex is None or not _is_table(vertex):
-                raise InputError(f"{path} holds no points with x, y and z; export them again.")
+                raise InputError(
+                    f"{quoted(path)} holds no points with x, y and z; export them again."
+                )
             vertices = read_vertices(file, header, vertex, path)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; correct the path.") from error
+        raise InputError(
+            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+        ) from error
     return np.stack([vertices[axis].astype(np.float64) for axis in AXES], axis=-1)
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from gscompleter.data.frame import Frame, capital
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.json_numbers import array_of, optional_number
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 
 DEFAULT_FOV = 60.0
 """Opening angle that SuperSplat gives poses without one, in degrees."""
@@ -49,13 +49,13 @@ def poses_of(content: Any, path: Path, resolution: tuple[int, int] | None) -> li
     """
     if resolution is None:
         raise InputError(
-            f"The poses of SuperSplat in {path} do not say how large the images are; give "
+            f"The poses of SuperSplat in {quoted(path)} do not say how large the images are; give "
             "--resolution HEIGHT WIDTH."
         )
     poses = _poses(content)
     if not isinstance(poses, list) or not poses:
-        raise InputError(f"{path} holds no poses; {ADVICE}.")
-    return [_frame(pose, f"pose {n} of {path}", resolution) for n, pose in enumerate(poses)]
+        raise InputError(f"{quoted(path)} holds no poses; {ADVICE}.")
+    return [_frame(pose, f"pose {n} of {quoted(path)}", resolution) for n, pose in enumerate(poses)]
 
 
 def _poses(content: Any) -> Any:

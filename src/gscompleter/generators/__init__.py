@@ -7,12 +7,21 @@ A generator says what it needs and answers requests; any callable of the form ab
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.config.generators import (
+    DiffusersInpaintSettings,
+    GeneratorSettings,
+    OracleSettings,
+    PEFieldSettings,
+    WarpInpaintSettings,
+    settings_class,
+)
+from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.types import Camera, SceneContext, View
 
@@ -77,82 +86,12 @@ def as_generator(phi: Generator | ImageFunction) -> Generator:
     return phi if isinstance(phi, Generator) else OneByOne(phi)
 
 
-@dataclass(frozen=True)
-class DiffusionSettings:
-    """What a generator with weights can be told. Whatever is None is left to it."""
-
-    path: str | None = None
-    """Folder or hub id of its weights; None takes the published ones."""
-    steps: int | None = None
-    """Denoising steps."""
-    retries: int = 0
-    """How many further seeds are tried where an image disagrees with the photographs."""
-    prompt: str | None = None
-    """What it is told of the image, in words."""
-    depth: str | None = None
-    """Where the depth of the photograph comes from: `context`, `monocular`, or the folder or hub id
-    of a depth estimation model of transformers."""
-    at_once: int | None = None
-    """How many targets are denoised together, at most."""
-    offload: bool = False
-    """Keep on the GPU only the part of the network that is at work: slower, and less memory."""
-
-
-TAKES: dict[str, tuple[str, ...]] = {
-    "pe-field": ("path", "steps", "retries", "depth", "at_once", "offload"),
-    "diffusers-inpaint": ("path", "steps", "retries", "prompt", "offload"),
-}
-"""The settings that each generator with weights knows; the others know none."""
-
-
-@dataclass(frozen=True)
-class GeneratorRequest:
-    """What a generator of the table may be made from."""
-
-    seed: int
-    photographs: Sequence[View]
-    device: str
-    settings: DiffusionSettings
-
-
-def _warp_inpaint(request: GeneratorRequest) -> Generator:
-    from gscompleter.generators.warp_inpaint import WarpInpaint
-
-    return OneByOne(WarpInpaint(seed=request.seed))
-
-
-def _oracle(request: GeneratorRequest) -> Generator:
-    from gscompleter.generators.oracle import Oracle
-
-    return Oracle(request.photographs)
-
-
-def _pe_field(request: GeneratorRequest) -> Generator:
-    from gscompleter.generators.diffusion.pe_field import load_pe_field
-
-    return load_pe_field(request.seed, request.device, request.settings)
-
-
-def _diffusers_inpaint(request: GeneratorRequest) -> Generator:
-    from gscompleter.generators.diffusion.inpaint import load_diffusers_inpaint
-
-    return OneByOne(load_diffusers_inpaint(request.seed, request.device, request.settings))
-
-
-GENERATORS: dict[str, Callable[[GeneratorRequest], Generator]] = {
-    "warp-inpaint": _warp_inpaint,
-    "oracle": _oracle,
-    "pe-field": _pe_field,
-    "diffusers-inpaint": _diffusers_inpaint,
-}
-
-
 def load_generator(
     name: str,
     seed: int = 0,
     photographs: Sequence[View] = (),
     device: str = "cpu",
-    settings: DiffusionSettings = DiffusionSettings(),
+    settings: GeneratorSettings | None = None,
 ) -> Generator:
     """The generator called `name`.
 
@@ -161,43 +100,48 @@ def load_generator(
         seed: Of everything random in it; the same seed gives the same image.
         photographs: True images of the targets, which only `oracle` looks at.
         device: Where its network runs, if it has one: cpu or cuda.
-        settings: For one with weights. The network itself is loaded once in a process.
+        settings: Of the class that the table has for it; None leaves all as it is. A network is
+            loaded once in a process.
 
     Raises:
-        InputError: where there is none of that name, packages or weights are missing, or a setting
-            is one that it does not know, or out of range.
+        InputError: where there is none of that name, packages or weights are missing, or settings
+            are another generator's, or out of range.
     """
-    if name not in GENERATORS:
-        raise InputError(f"There is no generator {name!r}; choose one of {', '.join(GENERATORS)}.")
-    check_settings(name, settings, device)
-    return GENERATORS[name](GeneratorRequest(seed, photographs, device, settings))
-
-
-def check_settings(name: str, settings: DiffusionSettings, device: str) -> None:
-    """Refuse settings that the generator called `name` does not know, and senseless values.
-
-    Raises:
-        InputError: where there is one.
-    """
-    for field in fields(settings):
-        value, option = getattr(settings, field.name), f"--generator-{field.name.replace('_', '-')}"
-        if value == "":
-            raise InputError(f"{option} is empty; leave it out, or say what it shall be.")
-        if value != field.default and field.name not in TAKES.get(name, ()):
-            others = [other for other, known in TAKES.items() if field.name in known]
-            raise InputError(
-                f"The generator {name!r} knows no {option} ({value}); leave that out, or choose "
-                f"{' or '.join(others)}."
-            )
-    for option, number, least in (
-        ("steps", settings.steps, 1),
-        ("retries", settings.retries, 0),
-        ("at-once", settings.at_once, 1),
-    ):
-        if number is not None and number < least:
-            raise InputError(f"--generator-{option} is {number}; at least {least} is needed.")
-    if settings.offload and device == "cpu":
+    kind = settings_class(name)
+    if not isinstance(settings, kind | None):
         raise InputError(
-            "--generator-offload keeps parts of the generator off the GPU, and it runs on the CPU; "
-            "leave it out, or choose --device cuda."
+            f"The generator {name!r} takes {kind.__name__}, got {type(settings).__name__}.",
+            "generator",
         )
+    settings = checked(settings or kind(), "generator_")
+    if getattr(settings, "offload", False) and device == "cpu":
+        raise InputError(
+            "offload keeps parts of the generator off the GPU, and it runs on the CPU; leave it "
+            "out, or choose the device cuda.",
+            "generator_offload",
+        )
+    return _made(settings, seed, photographs, device)
+
+
+def _made(
+    settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
+) -> Generator:
+    """The generator that has such settings. Its module is imported only now."""
+    match settings:
+        case PEFieldSettings():
+            from gscompleter.generators.diffusion.pe_field import load_pe_field
+
+            return load_pe_field(seed, device, settings)
+        case DiffusersInpaintSettings():
+            from gscompleter.generators.diffusion.inpaint import load_diffusers_inpaint
+
+            return OneByOne(load_diffusers_inpaint(seed, device, settings))
+        case OracleSettings():
+            from gscompleter.generators.oracle import Oracle
+
+            return Oracle(photographs)
+        case WarpInpaintSettings():
+            from gscompleter.generators.warp_inpaint import WarpInpaint
+
+            return OneByOne(WarpInpaint(seed))
+    raise TypeError(f"no generator is made from {type(settings).__name__}")

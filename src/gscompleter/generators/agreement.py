@@ -19,30 +19,25 @@ from gscompleter.generators.robust import robust_affine
 from gscompleter.generators.warp import Warped
 from gscompleter.interpolation import smoothed
 
-
-@dataclass(frozen=True)
-class AgreementConfig:
-    blur: int = 2
-    """Radius, in pixels, over which colours are averaged before they are compared: a painted edge
-    may lie a pixel beside the photographed one."""
-    max_share: float = 0.6
-    """Difference of colours, once the shift is taken back, from which an image counts as another
-    scene: as a share of what a single colour would leave."""
-    quantile: float = 0.7
-    """Which pixel's difference counts, from the least to the largest. The median would be that of a
-    blank wall where this fills half of what is seen."""
-    least: float = 0.03
-    """A difference that counts as none, however dull the scene. Colours are in [0, 1]."""
-    max_gain: float = 1.6
-    """Largest factor of a channel, and its inverse the smallest, that counts as a colour shift."""
-    max_offset: float = 0.25
-    """Largest number added to a channel that counts as a colour shift."""
-    min_pixels: int = 200
-    """Fewest observed pixels that say anything."""
-    rounds: int = 5
-    """Fits of the shift; each leaves out what disagrees with the one before."""
-    retries: int = 0
-    """How many further seeds are tried where an image disagrees. The best one is kept."""
+BLUR = 2
+"""Radius, in pixels, over which colours are averaged before they are compared: a painted edge may
+lie a pixel beside the photographed one."""
+MAX_SHARE = 0.6
+"""Difference of colours, once the shift is taken back, from which an image counts as another scene:
+as a share of what a single colour would leave."""
+QUANTILE = 0.7
+"""Which pixel's difference counts, from the least to the largest. The median would be that of a
+blank wall where this fills half of what is seen."""
+LEAST = 0.03
+"""A difference that counts as none, however dull the scene. Colours are in [0, 1]."""
+MAX_GAIN = 1.6
+"""Largest factor of a channel, and its inverse the smallest, that counts as a colour shift."""
+MAX_OFFSET = 0.25
+"""Largest number added to a channel that counts as a colour shift."""
+MIN_PIXELS = 200
+"""Fewest observed pixels that say anything."""
+ROUNDS = 5
+"""Fits of the shift; each leaves out what disagrees with the one before."""
 
 
 @dataclass(frozen=True)
@@ -72,23 +67,23 @@ def checked(
     paint: Callable[[int], Float[Tensor, "h w 3"]],
     seed: int,
     observed: Warped,
-    config: AgreementConfig = AgreementConfig(),
+    retries: int = 0,
 ) -> Synthesis:
     """An image painted from a seed, its colours brought to those observed, and notes on it.
 
     Args:
         paint: Seed -> image in [0, 1].
-        seed: The first to try; `config.retries` more follow while the image disagrees.
+        seed: The first to try.
         observed: What the photographs show of the target.
-        config: What counts as agreement.
+        retries: How many further seeds are tried while the image disagrees. The best one is kept.
 
     Raises:
         InputError: where no seed gives finite colours.
     """
     found: list[Agreement] = []
-    for attempt in range(config.retries + 1):
+    for attempt in range(retries + 1):
         image = paint(seed + attempt)
-        found.append(compare(image, observed.image, observed.known, config))
+        found.append(compare(image, observed.image, observed.known))
         if found[-1].agrees:
             break
     best = min(found, key=lambda one: (not one.agrees, one.residual))
@@ -104,26 +99,24 @@ def compare(
     image: Float[Tensor, "h w 3"],
     observed: Float[Tensor, "h w 3"],
     known: Bool[Tensor, "h w"],
-    config: AgreementConfig = AgreementConfig(),
 ) -> Agreement:
     """Measure the colour shift of `image` against `observed` where that is `known`."""
     ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
     share = known.float().mean().item()
     if not image.isfinite().all():
         inf = float("inf")
-        return Agreement(ones, zeros, inf, config.least, share, False, image)
-    if int(known.sum()) < config.min_pixels:
-        return Agreement(ones, zeros, 0.0, config.least, share, True, image)
-    ours = smoothed(image, known, config.blur)[known]
-    theirs = smoothed(observed, known, config.blur)[known]
-    gain, offset = robust_affine(ours, theirs, config.rounds)
-    residual = quantile((gain * ours + offset - theirs).abs().mean(dim=-1), config.quantile)
+        return Agreement(ones, zeros, inf, LEAST, share, False, image)
+    if int(known.sum()) < MIN_PIXELS:
+        return Agreement(ones, zeros, 0.0, LEAST, share, True, image)
+    ours = smoothed(image, known, BLUR)[known]
+    theirs = smoothed(observed, known, BLUR)[known]
+    gain, offset = robust_affine(ours, theirs, ROUNDS)
+    residual = quantile((gain * ours + offset - theirs).abs().mean(dim=-1), QUANTILE)
     plain = theirs - theirs.median(dim=0).values
-    contrast = quantile(plain.abs().mean(dim=-1), config.quantile)
-    limit = max(config.least, config.max_share * contrast)
+    contrast = quantile(plain.abs().mean(dim=-1), QUANTILE)
+    limit = max(LEAST, MAX_SHARE * contrast)
     plausible = bool(
-        ((gain >= 1 / config.max_gain) & (gain <= config.max_gain)).all()
-        and (offset.abs() <= config.max_offset).all()
+        ((gain >= 1 / MAX_GAIN) & (gain <= MAX_GAIN)).all() and (offset.abs() <= MAX_OFFSET).all()
     )
     agrees = plausible and residual <= limit
     corrected = (gain * image + offset).clamp(0, 1) if agrees else image

@@ -9,21 +9,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.coverage import COVERED
-from gscompleter.generators.harmonize import HarmonizeConfig, gains
+from gscompleter.generators.harmonize import gains
 from gscompleter.generators.smooth import continued
 from gscompleter.geometry import baseline_between, inside, project, sample, unproject
 from gscompleter.types import Camera, Render, SceneContext, View
 
-
-@dataclass(frozen=True)
-class WarpConfig:
-    depth_tolerance: float = 0.03
-    """Difference between the depth of a point and the depth that a photograph sees in its
-    direction, relative to the depth, at which the weight of the photograph has fallen to 1/e."""
-    sharpness: float = 4.0
-    """Power of the weights: larger ones prefer the nearest photograph to the average."""
-    harmonize: HarmonizeConfig = HarmonizeConfig()
-    """How exposures are compared."""
+DEPTH_TOLERANCE = 0.03
+"""Difference between the depth of a point and the depth that a photograph sees in its direction,
+relative to the depth, at which the weight of the photograph has fallen to 1/e."""
+SHARPNESS = 4.0
+"""Power of the weights: larger ones prefer the nearest photograph to the average."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +42,7 @@ class Warped:
         )
 
 
-def warp_photographs(
-    nearest: View, target: Camera, context: SceneContext, config: WarpConfig = WarpConfig()
-) -> Warped:
+def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Warped:
     """Colours of all photographs at the surfaces that the target sees.
 
     A photograph counts where the scene, seen from its camera, lies at the depth of the surface:
@@ -62,13 +55,13 @@ def warp_photographs(
     colours, weights = [], []
     for view, render in zip(context.views, context.at_views, strict=True):
         pixels, z = project(points, view.camera)
-        visible = _visibility(pixels, z, view, render, config)
+        visible = _visibility(pixels, z, view, render)
         colours.append(sample(view.image, pixels))
-        weights.append((visible * _closeness(points, target, view)) ** config.sharpness)
+        weights.append((visible * _closeness(points, target, view)) ** SHARPNESS)
 
     baselines = [baseline_between(nearest.camera, view.camera) for view in context.views]
     reference = baselines.index(min(baselines))
-    factors = gains(colours, [known & (w > 1) for w in weights], reference, config.harmonize)
+    factors = gains(colours, [known & (w > 1) for w in weights], reference)
     total = torch.stack(weights).sum(dim=0)
     colour = torch.stack(
         [w[..., None] * c * g for w, c, g in zip(weights, colours, factors, strict=True)]
@@ -81,11 +74,7 @@ def warp_photographs(
 
 
 def with_unexplained(
-    warped: Warped,
-    guess: Float[Tensor, "h w"],
-    target: Camera,
-    context: SceneContext,
-    config: WarpConfig = WarpConfig(),
+    warped: Warped, guess: Float[Tensor, "h w"], target: Camera, context: SceneContext
 ) -> Warped:
     """`warped`, and in its holes what photographs show although the scene has a hole there too.
 
@@ -101,7 +90,7 @@ def with_unexplained(
         pixels, z = project(points, view.camera)
         empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
         unexplained = empty & inside(pixels, z, view.camera) & ~warped.known
-        weight = unexplained * _closeness(points, target, view) ** config.sharpness
+        weight = unexplained * _closeness(points, target, view) ** SHARPNESS
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
         total = total + weight
     found = total > 0
@@ -133,16 +122,12 @@ def background_first(
 
 
 def _visibility(
-    pixels: Float[Tensor, "h w 2"],
-    z: Float[Tensor, "h w"],
-    view: View,
-    render: Render,
-    config: WarpConfig,
+    pixels: Float[Tensor, "h w 2"], z: Float[Tensor, "h w"], view: View, render: Render
 ) -> Float[Tensor, "h w"]:
     """1 where the point at depth `z` is what the photograph shows at `pixels`, towards 0 else."""
     layers = torch.stack([render.depth, render.alpha], dim=-1)
     depth, alpha = sample(layers, pixels).unbind(-1)
-    error = (z - depth).abs() / (config.depth_tolerance * z.abs().clamp_min(1e-12))
+    error = (z - depth).abs() / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
     visible = inside(pixels, z, view.camera) & (alpha >= COVERED)
     return torch.exp(-(error**2)) * visible
 

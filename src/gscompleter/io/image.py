@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-import struct
-import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,19 +13,14 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
 
-_DAMAGED = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-)
-"""What Pillow raises for files that are no images, or are damaged ones."""
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
+"""Formats of images that are read. Others that Pillow knows run programs, or are no photographs."""
+
+MAX_PIXELS = 178_956_970
+"""Of an image: where Pillow too takes a small file for a bomb."""
 
 _ORIENTATION = 0x0112
 """The EXIF tag of how a photograph is to be turned; 1 for not at all."""
@@ -77,8 +71,8 @@ def is_turned(path: Path) -> bool:
     """Whether the EXIF data of a photograph tell viewers to turn it; False where it has none."""
     try:
         with _opened(path) as image:
-            return image.getexif().get(_ORIENTATION, 1) != 1
-    except (InputError, *_DAMAGED):
+            return bool(image.getexif().get(_ORIENTATION, 1) != 1)
+    except Exception:  # whatever a damaged file does to Pillow; who reads the photograph is told
         return False
 
 
@@ -92,10 +86,8 @@ def read_pixels(path: Path | str) -> UInt8[np.ndarray, "h w 3"]:
         InputError: where it is missing, truncated or not an image.
     """
     with _opened(path) as image:
-        try:
-            return _over_black(image)
-        except _DAMAGED as error:
-            raise InputError(f"The image {path} is damaged ({error}); copy it again.") from error
+        told = f"The image {quoted(Path(path))} is damaged"
+        return _checked(lambda: _over_black(image), told, "copy it again")
 
 
 def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
@@ -109,10 +101,8 @@ def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
         InputError: where they are truncated or no image.
     """
     with _decoded(data, name) as image:
-        try:
-            return _over_black(image)
-        except _DAMAGED as error:
-            raise InputError(f"{name} is damaged ({error}); copy its file again.") from error
+        told = f"{quoted(name)} is damaged"
+        return _checked(lambda: _over_black(image), told, "copy its file again")
 
 
 def decoded_size(data: bytes, name: str) -> tuple[int, int]:
@@ -133,46 +123,60 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     """
     if not os.path.isfile(path):
         raise InputError(
-            f"There is no depth map {path}; restore it, or remove its `depth_file_path`."
+            f"There is no depth map {quoted(path)}; restore it, or remove its `depth_file_path`."
         )
-    try:
-        if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
-        else:
-            with Image.open(path) as image:
-                values = np.array(image)
-    except _DAMAGED as error:
-        raise InputError(
-            f"The depth map {path} cannot be read ({error}); copy it again."
-        ) from error
+    told = f"The depth map {quoted(path)} cannot be read"
+    values = _checked(lambda: _depth_values(path), told, "copy it again")
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
         raise InputError(
-            f"{path} is no depth map: a 16-bit grey PNG or an array [h, w] of numbers is needed, "
-            f"and it holds {values.dtype} of shape {list(values.shape)}."
+            f"{quoted(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of numbers is "
+            f"needed, and it holds {values.dtype} of shape {quoted(list(values.shape))}."
         )
-    depth = (values.astype(np.float64) * unit).astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = (values.astype(np.float64) * unit).astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def _opened(path: Path | str) -> Image.Image:
-    if not os.path.isfile(path):
-        raise InputError(f"There is no image {path}; restore it or correct its path.")
+def _depth_values(path: Path) -> np.ndarray:
+    if path.suffix != ".npy":
+        with Image.open(path, formats=FORMATS) as image:
+            return np.array(image)
+    # A map of the file holds no more than the file does, whatever its header claims.
+    values = np.lib.format.open_memmap(path, mode="r")
+    if not 0 < values.size <= MAX_PIXELS:
+        raise ValueError(f"it claims {values.size:,} values")
+    return values
+
+
+def _checked(decode: Callable[[], np.ndarray], told: str, advice: str) -> np.ndarray:
+    """What `decode` gives; a damaged file can fail in any way."""
     try:
-        return Image.open(path)
-    except _DAMAGED as error:
-        raise InputError(
-            f"{path} is not an image that can be read; a PNG or JPEG file is needed."
-        ) from error
+        return decode()
+    except Exception as error:
+        raise InputError(f"{told} ({quoted(str(error))}); {advice}.") from error
+
+
+def _opened(path: Path | str) -> Image.Image:
+    path = Path(path)
+    if not os.path.isfile(path):
+        raise InputError(f"There is no image {quoted(path)}; restore it or correct its path.")
+    return _open(path, quoted(path), "a PNG or JPEG file is")
 
 
 def _decoded(data: bytes, name: str) -> Image.Image:
+    return _open(io.BytesIO(data), quoted(name), "the bytes of a PNG or JPEG file are")
+
+
+def _open(file: Path | io.BytesIO, name: str, needed: str) -> Image.Image:
     try:
-        return Image.open(io.BytesIO(data))
-    except _DAMAGED as error:
+        return Image.open(file, formats=FORMATS)
+    except Image.DecompressionBombError as error:
         raise InputError(
-            f"{name} is not an image that can be read; the bytes of a PNG or JPEG file are needed."
+            f"{name} claims more than {MAX_PIXELS:,} pixels; make it smaller."
         ) from error
+    except Exception as error:  # whatever a damaged file does to Pillow
+        raise InputError(f"{name} is not an image that can be read; {needed} needed.") from error
 
 
 def _over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:

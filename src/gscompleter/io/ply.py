@@ -9,6 +9,7 @@ opacities logits, and f_rest_* runs through all coefficients of red, then green,
 from __future__ import annotations
 
 import io
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
 from gscompleter.types import Gaussians
 
@@ -133,12 +134,13 @@ def read_header(file: BinaryIO, path: Path) -> Header:
                 raise ValueError
         except (IndexError, KeyError, ValueError) as error:
             raise InputError(
-                f"{path} has a broken header: {' '.join(words)!r} means nothing; write it anew."
+                f"{path} has a broken header: '{quoted(' '.join(words))}' means nothing; "
+                "write it anew."
             ) from error
     if file_format not in _BYTE_ORDERS:
         raise InputError(
-            f"{path} has the PLY format {file_format!r}; ascii, binary_little_endian and "
-            "binary_big_endian are known."
+            f"{path} has the PLY format '{quoted(file_format)}'; ascii, "
+            "binary_little_endian and binary_big_endian are known."
         )
     return Header(file_format, elements)
 
@@ -161,16 +163,32 @@ def _property(words: list[str]) -> Property:
 def read_vertices(file: BinaryIO, header: Header, vertex: Element, path: Path) -> np.ndarray:
     """The rows of `vertex` as a structured array, whatever stands before it skipped."""
     ahead = header.elements[: header.elements.index(vertex)]
+    for element in ahead:
+        _check_claim(file, element, header.format, path)
     if header.format == "ascii":
         return _ascii_vertices(file, ahead, vertex, path)
     byte_order = _BYTE_ORDERS[header.format]
     for element in ahead:
         _skip(file, element, byte_order, path)
     dtype = vertex.dtype(byte_order)
-    remaining = path.stat().st_size - file.tell()
+    remaining = _bytes_left(file)
     if remaining < vertex.count * dtype.itemsize:
         raise _truncated(path, remaining // dtype.itemsize, vertex.count)
     return np.fromfile(file, dtype, vertex.count)
+
+
+def _check_claim(file: BinaryIO, element: Element, file_format: str, path: Path) -> None:
+    """Refuse an element of more rows than what is left of the file can hold."""
+    sizes = [np.dtype(p.count_kind or p.kind).itemsize for p in element.properties]
+    # A number of an ASCII file takes a digit and what parts it from the next.
+    least = 2 * max(len(sizes), 1) if file_format == "ascii" else sum(sizes)
+    remaining = _bytes_left(file) + 1  # the last line may lack its end
+    if element.count * least > remaining:
+        raise _truncated(path, remaining // least, element.count, element.name)
+
+
+def _bytes_left(file: BinaryIO) -> int:
+    return max(os.fstat(file.fileno()).st_size - file.tell(), 0)
 
 
 def _skip(file: BinaryIO, element: Element, byte_order: str, path: Path) -> None:
@@ -209,15 +227,17 @@ def _ascii_vertices(
             f"{path} holds rows that are not {width} numbers each; write it anew."
         ) from error
     vertices = np.empty(vertex.count, vertex.dtype("="))
-    for column, prop in enumerate(vertex.properties):
-        vertices[prop.name] = table[:, column]
+    # What a column cannot hold becomes infinite or odd, and values that count are looked at later.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for column, prop in enumerate(vertex.properties):
+            vertices[prop.name] = table[:, column]
     return vertices
 
 
 def _truncated(path: Path, found: int, expected: int, what: str = "Gaussian") -> InputError:
     return InputError(
-        f"{path} is truncated: {found:,} of {expected:,} {what}s are there; fetch or write the "
-        "file again."
+        f"{path} is truncated: {found:,} of {quoted(f'{expected:,}')} {quoted(what)}s are there; "
+        "fetch or write the file again."
     )
 
 
@@ -237,12 +257,14 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """
     path = Path(path)
     try:
+        if os.path.exists(path) and not os.path.isfile(path):
+            raise InputError(f"{quoted(path)} is a directory or a device; a 3DGS .ply is needed.")
         with path.open("rb") as file:
             header = read_header(file, path)
             vertex = _gaussian_element(header, path)
             vertices = read_vertices(file, header, vertex, path)
     except OSError as error:
-        raise InputError(f"Cannot read {path}: {error.strerror}.") from error
+        raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
     return _whole(_gaussians(vertices, vertex), path, drop_nonfinite)
 
 
@@ -256,8 +278,8 @@ def _gaussian_element(header: Header, path: Path) -> Element:
     for element in header.elements:
         if len({p.name for p in element.properties}) < len(element.properties):
             raise InputError(
-                f"{path} has a broken header: a property of its element {element.name!r} is named "
-                "twice; write it anew."
+                f"{path} has a broken header: a property of its element "
+                f"'{quoted(element.name)}' is named twice; write it anew."
             )
     if "chunk" in found or "packed_position" in names:
         raise InputError(
@@ -301,7 +323,8 @@ def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
     encoded = columns((*_SCALES, "opacity"))
     generated = np.zeros(len(vertices), np.uint8)
     if "generated" in names:
-        generated = vertices["generated"].astype(np.uint8)
+        with np.errstate(invalid="ignore"):
+            generated = vertices["generated"].astype(np.uint8)
     return Gaussians(
         means=columns(_MEANS),
         quats=columns(_QUATS),
@@ -325,7 +348,8 @@ def _whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
     if not drop_nonfinite:
         raise InputError(
             f"{path} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a rotation of "
-            "zeros; mend it, or go on without them by --drop-nonfinite."
+            "zeros; mend it, or drop what is not finite.",
+            "drop_nonfinite",
         )
     if bad == len(good):
         raise InputError(f"{path} holds no Gaussian without NaN or infinity; write it anew.")

@@ -16,7 +16,9 @@ BLOCK = 16
 
 @njit(cache=True, fastmath={"contract"}, inline="always")
 def _clip(value, low, high):
-    return min(max(value, low), high)
+    """The nearest number from low to high; of NaN low, for what comes out becomes an index."""
+    value = value if value > low else low
+    return value if value < high else high
 
 
 @njit(cache=True, fastmath={"contract"})
@@ -123,6 +125,7 @@ def matching_costs(reference, source, transform, inverse_depths, radius, noise, 
                     line[1, x] = _clip(sy, np.float32(0), np.float32(H - 1))
                 for x in range(wide):
                     sx, sy = line[0, x], line[1, x]
+                    # `_clip` has made numbers from 0 to W - 1 and H - 1 of them, whatever came in.
                     ix = min(np.int32(sx), W - 2)
                     iy = min(np.int32(sy), H - 2)
                     ax, ay = sx - np.float32(ix), sy - np.float32(iy)
@@ -205,7 +208,7 @@ def best_mean(costs, share, unseen_cost):
                 if seen == 0:
                     merged[y, x, k] = unseen_cost
                     continue
-                count = max(1, np.int32(np.ceil(seen * share)))
+                count = max(1, min(seen, np.int32(np.ceil(seen * share))))
                 total = 0
                 for i in range(count):
                     total += ranked[i]

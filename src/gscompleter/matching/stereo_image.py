@@ -11,6 +11,9 @@ from jaxtyping import Float
 from gscompleter.errors import InputError
 from gscompleter.types import View
 
+MIN_SIDE = 8
+"""Pixels of an image's side under which nothing can be matched, and costs have no paths."""
+
 
 @dataclass(frozen=True)
 class StereoImage:
@@ -35,12 +38,19 @@ def stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]:
     whose float32 poses were multiplied by any factor gives the very same values.
 
     Raises:
-        InputError: with fewer than two views, or where all of them stand in one place.
+        InputError: with fewer than two views, tiny ones, or where all of them stand in one place.
     """
     if len(views) < 2:
         raise InputError(
             f"Stereo needs at least two views and got {len(views)}; give it another photograph."
         )
+    for view in views:
+        if min(view.image.shape[:2]) < MIN_SIDE:
+            height, width = view.image.shape[:2]
+            raise InputError(
+                f"An image of {width} x {height} pixels was given, and stereo needs at least "
+                f"{MIN_SIDE} x {MIN_SIDE}; give a larger one."
+            )
     centers = np.stack([view.camera.center.detach().cpu().double().numpy() for view in views])
     unit = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
     if unit <= 2e-7 * float(np.linalg.norm(centers, axis=-1).max()):

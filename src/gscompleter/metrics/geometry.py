@@ -25,6 +25,11 @@ from gscompleter.types import Camera, Gaussians
 MIN_OPACITY = 1 / 255
 """Gaussians of less opacity are dropped by every renderer: they are part of no surface."""
 
+MATCHED = 0.05
+"""Distance that counts as matched, as a share of the median context depth at the target.
+Relative, so that scenes of any unit and size can be averaged; 5 % is wider than the spacing of the
+primitives and well below the depth of a room."""
+
 
 def abs_rel(
     depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]
@@ -70,16 +75,6 @@ class CloudDistances:
         return 2 * precision * recall / total if total > 0 else 0.0
 
 
-def chamfer_distance(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> float:
-    """Symmetric Chamfer distance of two point sets, in scene units (`CloudDistances.chamfer`)."""
-    return cloud_distances(a, b).chamfer
-
-
-def f_score(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"], threshold: float) -> float:
-    """F-score of `a` against `b`; `threshold` is in scene units (`CloudDistances.f_score`)."""
-    return cloud_distances(a, b).f_score(threshold)
-
-
 def cloud_distances(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> CloudDistances:
     """Exact nearest-neighbour distances between two point sets, both ways.
 
@@ -112,14 +107,6 @@ def nearest(points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]) -> Float
 
 
 @dataclass(frozen=True)
-class AlignmentConfig:
-    threshold: float = 0.05
-    """Distance that counts as matched, as a share of the median context depth at the target.
-    Relative, so that scenes of any unit and size can be averaged; 5 % is wider than the spacing
-    of the primitives and well below the depth of a room."""
-
-
-@dataclass(frozen=True)
 class Alignment:
     """How generated primitives continue the context where the two overlap. None: nowhere."""
 
@@ -145,7 +132,6 @@ def alignment(
     context: Gaussians,
     target: Camera,
     renderer: Renderer,
-    config: AlignmentConfig = AlignmentConfig(),
 ) -> Alignment:
     """AbsRel, Chamfer distance and F-score between what one target added and the context.
 
@@ -170,7 +156,6 @@ def alignment(
         context: The scene as it was before, usually `Completion.context`.
         target: The camera it was completed for.
         renderer: Draws both.
-        config: What counts as matched.
     """
     added = added[added.opacities >= MIN_OPACITY]
     context = context[context.opacities >= MIN_OPACITY]
@@ -182,7 +167,7 @@ def alignment(
         return Alignment(share, None, None, None, None)
 
     scale = reference.depth[reference.valid].double().median().item()
-    threshold = config.threshold * scale
+    threshold = MATCHED * scale
     judged = keep_in_holes(added, None, overlap, target).means
     surface = keep_in_holes(context, None, overlap, target).means
     surface = surface[on_surface(surface, reference.depth, target, threshold)]

@@ -297,27 +297,19 @@ def read_weights(path: Path, file: WeightsFile) -> Mapping[str, Tensor]:
     return weights
 
 
-@dataclass(frozen=True)
-class LpipsScore:
-    """An entry of a table: a value, or the reason why there is none."""
-
-    value: float | None
-    reason: str | None = None
-
-
 @torch.no_grad()
-def try_lpips(
+def lpips_if_available(
     image: Float[Tensor, "h w 3"],
     truth: Float[Tensor, "h w 3"],
     network: NetworkName = "vgg",
     folder: Path | None = None,
-) -> LpipsScore:
-    """LPIPS where its weights lie on this machine, else no value; nothing is downloaded."""
+) -> float | None:
+    """LPIPS where its weights lie on this machine, else None; nothing is downloaded."""
     try:
         metric = cached_lpips(network, folder)
     except WeightsNotAvailable:
-        return LpipsScore(None, "weights not available")
-    return LpipsScore(metric(image, truth).item())
+        return None
+    return float(metric(image, truth).item())
 
 
 @lru_cache(maxsize=2)

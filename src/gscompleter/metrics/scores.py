@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,27 +11,12 @@ from torch import Tensor
 
 from gscompleter.metrics.geometry import abs_rel, alignment
 from gscompleter.metrics.image import masked_psnr, psnr, ssim
-from gscompleter.metrics.lpips import try_lpips
+from gscompleter.metrics.lpips import lpips_if_available
 from gscompleter.render import Renderer
+from gscompleter.stages.integration import hole_mask
 from gscompleter.types import Camera, Gaussians, Render, View
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a method, ours or another, made of a scene."""
-
-    context: Gaussians
-    """The scene before."""
-    scene: Gaussians
-    """The scene after."""
-    added: Gaussians | None
-    """What stands in `scene` beside the context; None where the context itself was changed."""
-    hole_mask: Bool[Tensor, "h w"]
-    """True where the context has a hole, seen from the target; the same for all methods."""
-    seconds: dict[str, float]
-    """Wall time by stage, without that of the context, and `total`."""
-    notes: tuple[str, ...] = ()
-    """Fallbacks that were taken, a sentence each."""
+Image = Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -44,35 +29,12 @@ class Truth:
     neighbours: tuple[View, ...] = ()
 
 
-def ranged_truth(
-    views: Sequence[View],
-    target: View,
-    neighbours: Sequence[View],
-    near: float | None,
-    far: float | None,
-) -> Truth:
-    """Photographs whose cameras have the depth range (scene units) that the method worked with."""
-
-    def with_range(view: View) -> View:
-        return replace(view, camera=replace(view.camera, near=near, far=far))
-
-    return Truth(
-        tuple(with_range(view) for view in views),
-        with_range(target),
-        tuple(with_range(view) for view in neighbours),
-    )
-
-
 @dataclass(frozen=True)
 class Change:
     """One score before and after completion."""
 
     before: float
     after: float
-
-    @property
-    def gain(self) -> float:
-        return self.after - self.before
 
 
 @dataclass(frozen=True)
@@ -113,7 +75,7 @@ class Scores:
     """Median relative difference of depth between what was added, drawn alone, and the context,
     where both cover the target: the step at the border of the holes."""
     align_abs_rel: float | None
-    """AbsRel of what was added against the context (`geometry_metrics.alignment`)."""
+    """AbsRel of what was added against the context (`geometry.alignment`)."""
     align_chamfer: float | None
     """Chamfer distance between the two, as a share of the median depth at the target."""
     align_f_score: float | None
@@ -126,41 +88,59 @@ class Drawings:
 
     before: Render
     after: Render
+    holes: Bool[Tensor, "h w"]
+    """True where the scene before has a hole."""
 
 
 @torch.no_grad()
-def score(outcome: Outcome, truth: Truth, renderer: Renderer) -> tuple[Scores, Drawings]:
-    """All scores of an outcome, and what the target camera sees of it."""
-    target, hole = truth.target, outcome.hole_mask
-    before = renderer.render(outcome.context, target.camera)
-    after = renderer.render(outcome.scene, target.camera)
-    covered = after.depth_map().valid
-    context = [(_drawn(outcome, view, renderer), view.image) for view in truth.views]
-    beside = [(_drawn(outcome, view, renderer), view.image) for view in truth.neighbours]
-    added = outcome.added
-    aligned, rim = None, None
-    if added is not None and len(added) > 0:
-        aligned = alignment(added, outcome.context, target.camera, renderer)
-        rim = rim_error(added, before, target.camera, renderer)
+def score(
+    before: Gaussians,
+    after: Gaussians,
+    added: Gaussians | None,
+    truth: Truth,
+    renderer: Renderer,
+) -> tuple[Scores, Drawings]:
+    """All scores of a completion, and what the target camera sees of it.
+
+    Args:
+        before: The scene before.
+        after: The scene after.
+        added: What stands in `after` beside `before`; None where that itself was changed.
+        truth: The photographs.
+        renderer: Draws all of them.
+    """
+    target = truth.target
+    was = renderer.render(before, target.camera)
+    now = renderer.render(after, target.camera)
+    holes, covered = hole_mask(was), now.depth_map().valid
+    context = _drawn(before, after, truth.views, renderer)
+    beside = _drawn(before, after, truth.neighbours, renderer)
     scores = Scores(
-        hole_fraction=hole.float().mean().item(),
-        target_before=quality(before.image, target.image),
-        target_after=quality(after.image, target.image),
-        hole_psnr=masked_psnr(after.image, target.image, hole),
-        observed_psnr=_masked_change(before, after, target, ~hole),
-        neighbours_psnr=mean_change(
-            [Change(psnr(b, image), psnr(a, image)) for (b, a), image in beside]
-        ),
-        context_psnr=tuple(Change(psnr(b, image), psnr(a, image)) for (b, a), image in context),
-        context_ssim=tuple(Change(ssim(b, image), ssim(a, image)) for (b, a), image in context),
-        depth_observed=_abs_rel(after.depth, target.depth, ~hole & covered),
-        depth_hole=_abs_rel(after.depth, target.depth, hole & covered),
-        depth_rim=rim,
-        align_abs_rel=None if aligned is None else aligned.abs_rel,
-        align_chamfer=None if aligned is None else aligned.relative_chamfer,
-        align_f_score=None if aligned is None else aligned.f_score,
+        hole_fraction=holes.float().mean().item(),
+        target_before=quality(was.image, target.image),
+        target_after=quality(now.image, target.image),
+        hole_psnr=masked_psnr(now.image, target.image, holes),
+        observed_psnr=_masked_change(was, now, target, ~holes),
+        neighbours_psnr=mean_change(_changes(beside, psnr)),
+        context_psnr=_changes(context, psnr),
+        context_ssim=_changes(context, ssim),
+        depth_observed=_abs_rel(now.depth, target.depth, ~holes & covered),
+        depth_hole=_abs_rel(now.depth, target.depth, holes & covered),
+        depth_rim=None,
+        align_abs_rel=None,
+        align_chamfer=None,
+        align_f_score=None,
     )
-    return scores, Drawings(before, after)
+    if added is not None and len(added) > 0:
+        aligned = alignment(added, before, target.camera, renderer)
+        scores = replace(
+            scores,
+            depth_rim=rim_error(added, was, target.camera, renderer),
+            align_abs_rel=aligned.abs_rel,
+            align_chamfer=aligned.relative_chamfer,
+            align_f_score=aligned.f_score,
+        )
+    return scores, Drawings(was, now, holes)
 
 
 def quality(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Quality:
@@ -168,8 +148,8 @@ def quality(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Qua
     return Quality(
         psnr(image, truth),
         ssim(image, truth),
-        try_lpips(image, truth, "vgg").value,
-        try_lpips(image, truth, "alex").value,
+        lpips_if_available(image, truth, "vgg"),
+        lpips_if_available(image, truth, "alex"),
     )
 
 
@@ -184,8 +164,8 @@ def rim_error(
 
     None where fewer than `min_pixels` are covered by both.
     """
-    alone = renderer.render(added, target)
-    both = alone.depth_map().valid & context.depth_map().valid
+    alone = renderer.render(added, target).depth_map()
+    both = alone.valid & context.depth_map().valid
     if both.sum() < min_pixels:
         return None
     return ((alone.depth - context.depth).abs() / context.depth)[both].median().item()
@@ -208,13 +188,23 @@ def _masked_change(
 
 
 def _drawn(
-    outcome: Outcome, view: View, renderer: Renderer
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]]:
-    """The image of a view before and after."""
-    return (
-        renderer.render(outcome.context, view.camera).image,
-        renderer.render(outcome.scene, view.camera).image,
-    )
+    before: Gaussians, after: Gaussians, views: Sequence[View], renderer: Renderer
+) -> list[tuple[Image, Image, Image]]:
+    """The image of each view before and after, and its photograph."""
+    return [
+        (
+            renderer.render(before, view.camera).image,
+            renderer.render(after, view.camera).image,
+            view.image,
+        )
+        for view in views
+    ]
+
+
+def _changes(
+    drawn: Sequence[tuple[Image, Image, Image]], metric: Callable[[Image, Image], float]
+) -> tuple[Change, ...]:
+    return tuple(Change(metric(was, image), metric(now, image)) for was, now, image in drawn)
 
 
 def _abs_rel(

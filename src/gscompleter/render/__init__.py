@@ -82,10 +82,14 @@ def choose_device(device: Literal["auto", "cpu", "cuda"] = "auto") -> Literal["c
     if device == "auto":
         return "cuda" if has_gpu and has_gsplat else "cpu"
     if device == "cuda" and not has_gpu:
-        raise InputError("--device cuda needs a GPU, and torch sees none here; use --device cpu.")
+        raise InputError(
+            "The device cuda needs a GPU, and torch sees none here; choose the device cpu.",
+            "device",
+        )
     if device == "cuda" and not has_gsplat:
         raise InputError(
-            "--device cuda renders through gsplat, which is not installed; "
-            "run `pip install gscompleter[cuda]` or use --device cpu."
+            "The device cuda renders through gsplat, which is not installed; "
+            "run `pip install gscompleter[cuda]` or choose the device cpu.",
+            "device",
         )
     return device

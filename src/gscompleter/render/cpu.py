@@ -18,6 +18,7 @@ from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gscompleter.errors import InputError
 from gscompleter.kernels import rasterizer
 from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
 from gscompleter.render import OpacityRender
@@ -25,6 +26,12 @@ from gscompleter.types import Camera, Gaussians, Render
 
 PIECES_PER_THREAD = 4
 """Tiles take unequally long; more pieces than threads even that out."""
+
+MAX_SIDE = TILE * np.iinfo(np.int16).max
+"""Pixels of an image's side, whose tiles the kernels number in 16 bits."""
+
+MAX_ENTRIES = np.iinfo(np.int32).max
+"""Of the tiles' lists together, which the kernels number in 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +143,7 @@ class Viewpoint:
 
     def bin(self, gaussians: GaussianArrays, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
         """Project the Gaussians, sort them and enter them into the lists of the tiles."""
-        n = len(gaussians.means)
+        n = length_of(gaussians)
         splats = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
         boxes = np.empty((n, 4), np.int32)
         self.share(rasterizer.project, n, gaussians, self.pinhole, splats, boxes)
@@ -154,6 +161,11 @@ class Viewpoint:
         )
         slot_start = np.zeros(n + 1, np.int64)
         np.cumsum(sizes, out=slot_start[1:])
+        if slot_start[-1] > MAX_ENTRIES:
+            raise InputError(
+                f"The {n:,} Gaussians cover {slot_start[-1]:,} tiles of the image, and at most "
+                f"{MAX_ENTRIES:,} can be drawn; take fewer or smaller ones, or a smaller image."
+            )
         tile_start = rasterizer.places_of(counts)
         entries, slots = np.empty(tile_start[-1], np.int32), np.empty(tile_start[-1], np.int32)
         filled = (order, depths, depth_limits, self.tiles_x, rectangles, slot_start)
@@ -285,7 +297,16 @@ class _Planned(torch.autograd.Function):
 
 
 def pinhole_of(camera: Camera) -> Pinhole:
-    """The camera as the kernels want it."""
+    """The camera as the kernels want it.
+
+    Raises:
+        InputError: where its image is larger than the kernels can number.
+    """
+    if not 0 < min(camera.width, camera.height) <= max(camera.width, camera.height) <= MAX_SIDE:
+        raise InputError(
+            f"An image of {camera.width} x {camera.height} pixels cannot be drawn; its sides must "
+            f"have 1 to {MAX_SIDE:,} pixels."
+        )
     K = camera.K.detach().to("cpu", torch.float64)
     c2w = camera.c2w.detach().to("cpu", torch.float64)
     return Pinhole(
@@ -296,6 +317,14 @@ def pinhole_of(camera: Camera) -> Pinhole:
         width=camera.width,
         height=camera.height,
     )
+
+
+def length_of(gaussians: GaussianArrays) -> int:
+    """How many there are, once every array is seen to hold that many: kernels do not look."""
+    lengths = {len(array) for array in gaussians}
+    if len(lengths) > 1:
+        raise ValueError(f"the fields of Gaussians have different lengths: {sorted(lengths)}")
+    return lengths.pop()
 
 
 def arrays_of(gaussians: Gaussians) -> GaussianArrays:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -18,7 +17,7 @@ from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
 from gscompleter.metrics.image import psnr, ssim
 from gscompleter.render import Renderer
-from gscompleter.types import Camera, Completion, TargetCompletion, View
+from gscompleter.types import Camera, Completion, TargetCompletion
 
 
 @dataclass(frozen=True)
@@ -64,30 +63,23 @@ def compare(
 
 def summarize(
     completion: Completion,
-    views: Sequence[View],
     targets: Sequence[Target],
     context_images: Sequence[Images],
     target_images: Sequence[Images],
-    settings: Mapping[str, Any],
-    seed: int,
-    device: str,
-    frame: Float[np.ndarray, "4 4"],
+    said: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The content of `summary.json`."""
+    """The content of `summary.json`: what was `said` in advance, and what came of it."""
     return {
         "version": __version__,
-        "settings": dict(settings),
-        "seed": seed,
-        "device": device,
-        "frame": {"method": "given", "transform": frame.tolist()},
+        **said,
         "context": [
             {"frame": view.frame, **images.scores()}
-            for view, images in zip(views, context_images, strict=True)
+            for view, images in zip(completion.views, context_images, strict=True)
         ],
         "targets": [
             {
                 "frame": target.frame,
-                "anchor": views[result.anchor].frame,
+                "anchor": completion.views[result.anchor].frame,
                 "anchor_fallback": result.anchor_fallback,
                 "hole_fraction": result.hole_fraction,
                 "affine": {
@@ -116,26 +108,28 @@ def provenance(result: TargetCompletion) -> int | None:
 def write_report(
     folder: Path,
     completion: Completion,
-    views: Sequence[View],
     targets: Sequence[Target],
     renderer: Renderer,
-    settings: Mapping[str, Any],
-    seed: int,
-    device: str,
-    frame: Float[np.ndarray, "4 4"],
+    said: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Write `context.ply`, `completed.ply`, `images/` and `summary.json`; returns the summary.
 
-    `frame` takes points of the photographs' own frame to that of the scene.
+    Args:
+        folder: Where to.
+        completion: What was done.
+        targets: The cameras it was done for, in their order.
+        renderer: Draws the scene before and after.
+        said: Settings, seed and device, for the summary.
 
     Raises:
         InputError: where a file cannot be written.
     """
-    context_images = [compare(completion, v.camera, v.image, renderer) for v in views]
-    target_images = [compare(completion, t.camera, t.photograph, renderer) for t in targets]
-    summary = summarize(
-        completion, views, targets, context_images, target_images, settings, seed, device, frame
-    )
+    context_images = [compare(completion, v.camera, v.image, renderer) for v in completion.views]
+    target_images = [
+        compare(completion, result.target, target.photograph, renderer)
+        for target, result in zip(targets, completion.targets, strict=True)
+    ]
+    summary = summarize(completion, targets, context_images, target_images, said)
     save_ply(folder / "context.ply", completion.context)
     save_ply(folder / "completed.ply", completion.scene, provenance=True)
     (folder / "images").mkdir()

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from gscompleter.config import ABLATIONS
 from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
-from gscompleter.reports.sequence_tables import SequenceSummary
-from gscompleter.reports.tables import Row, Summary, seconds_of, stage_place
+from gscompleter.reports.summary import Step, Summary, gain_of, psnr_after, stage_place
 from gscompleter.runs.store import slug
 
 if TYPE_CHECKING:
@@ -29,16 +28,21 @@ class PlotsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in
 def plots(summary: Summary, out: Path) -> list[Path]:
     """Draw the plots of a run into `out`, as far as there is something to show.
 
-    `gain_by_hole.png`, `gain_by_distance.png` and `seconds.png`. Where methods are compared with
-    ours, its ablations are left out of the first two, which they would fill.
+    `gain_by_hole.png`, `gain_by_distance.png` and `seconds.png`, and `sequence_TASK.png` for each
+    task of several steps. Where methods are compared with ours, its ablations are left out of the
+    first two, which they would fill.
 
     Raises:
         PlotsNotAvailable: where matplotlib is missing.
         InputError: where a file cannot be written.
     """
+    drawn = [
+        save_curves(out / f"sequence_{slug(name)}.png", steps)
+        for name, steps in summary.sequences.items()
+    ]
     if not summary.common:
-        return []
-    drawn = [save_plot(out / "gain_by_hole.png", lambda a: draw_gain_by_hole(a, summary))]
+        return drawn
+    drawn.append(save_plot(out / "gain_by_hole.png", lambda a: draw_gain_by_hole(a, summary)))
     if len(summary.gains) > 1:
         drawn.append(
             save_plot(out / "gain_by_distance.png", lambda a: draw_gain_by_distance(a, summary))
@@ -48,28 +52,15 @@ def plots(summary: Summary, out: Path) -> list[Path]:
     return drawn
 
 
-def plot_sequences(summary: SequenceSummary, out: Path) -> list[Path]:
-    """Draw `sequence_SEQUENCE.png` for each sequence: PSNR, scale and seconds of each step.
-
-    Raises:
-        PlotsNotAvailable: where matplotlib is missing.
-        InputError: where a file cannot be written.
-    """
-    return [
-        save_curves(out / f"sequence_{slug(name)}.png", steps)
-        for name, steps in summary.steps.items()
-    ]
-
-
-CURVES: tuple[tuple[str, Callable[[dict[str, Any]], float | None]], ...] = (
-    ("PSNR after the step (dB)", lambda step: step["psnr_after"]),
+CURVES: tuple[tuple[str, Callable[[Step], float | None]], ...] = (
+    ("PSNR after the step (dB)", psnr_after),
     ("depth scale", lambda step: step["depth_scale"]),
     ("seconds", lambda step: step["seconds"]["total"]),
 )
 """What is drawn of each step, one above the other."""
 
 
-def save_curves(path: Path, steps: Mapping[str, Sequence[dict[str, Any]]]) -> Path:
+def save_curves(path: Path, steps: Mapping[str, Sequence[Step]]) -> Path:
     """A PNG of each method's steps in one sequence.
 
     Raises:
@@ -134,12 +125,12 @@ def compared(methods: Sequence[str]) -> list[str]:
 
 
 def draw_gain_by_hole(axes: Axes, summary: Summary) -> None:
-    """A point for each case: how much of the target was a hole, and what was gained there."""
+    """A point for each step: how much of the target was a hole, and what was gained there."""
     for number, method in enumerate(compared(summary.methods)):
-        rows = summary.rows[method]
+        steps = [step for row in summary.rows[method] for step in row["steps"]]
         axes.plot(
-            [100 * row["scores"]["hole_fraction"] for row in rows],
-            [gain_of(row) for row in rows],
+            [100 * step["scores"]["hole_fraction"] for step in steps],
+            [gain_of(step) for step in steps],
             linestyle="none",
             label=method,
             **_style(number),
@@ -166,7 +157,7 @@ def draw_gain_by_distance(axes: Axes, summary: Summary) -> None:
 
 def draw_seconds(axes: Axes, summary: Summary) -> None:
     """Median seconds of each stage, one bar for each method."""
-    seconds = seconds_of(summary)
+    seconds = {method: summary.seconds(method) for method in summary.methods}
     stages = sorted(
         {s for found in seconds.values() for s in found if s != "total"}, key=stage_place
     )
@@ -178,13 +169,7 @@ def draw_seconds(axes: Axes, summary: Summary) -> None:
         left = [start + width for start, width in zip(left, widths, strict=True)]
     axes.set_yticks(places, summary.methods)
     axes.invert_yaxis()
-    axes.set_xlabel("median seconds per case")
-
-
-def gain_of(row: Row) -> float:
-    """PSNR at the target after less before, in dB."""
-    scores = row["scores"]
-    return float(scores["target_after"]["psnr"] - scores["target_before"]["psnr"])
+    axes.set_xlabel("median seconds per step")
 
 
 def _style(number: int) -> dict[str, Any]:

@@ -7,134 +7,35 @@ the same bytes as one that was not.
 from __future__ import annotations
 
 import json
-import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from gscompleter.completer import STAGES
 from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
 from gscompleter.io.image import read_image
 from gscompleter.metrics.fid import fid
-from gscompleter.runs.methods import METHODS
-from gscompleter.runs.store import CASES, RUN, case_folder, read_json, slug
-
-Row = dict[str, Any]
-"""What `evaluate` writes for a case and a method."""
-
-Scores = dict[str, Any]
-"""The scores of a row: `scores.Scores` as JSON."""
-
-
-@dataclass(frozen=True)
-class Column:
-    """A score, as a table shows it."""
-
-    key: str
-    title: str
-    digits: int
-    of: Callable[[Scores], float | None]
-    """Takes the scores of a row. None where no truth exists."""
-    over: Literal["mean", "lowest"] = "mean"
-    """What is made of the cases."""
-
-
-def _target(key: str) -> Callable[[Scores], float | None]:
-    return lambda scores: scores["target_after"][key]
-
-
-def _gain(scores: Scores) -> float:
-    return scores["target_after"]["psnr"] - scores["target_before"]["psnr"]
-
-
-def _after(key: str) -> Callable[[Scores], float | None]:
-    return lambda scores: None if scores[key] is None else scores[key]["after"]
-
-
-def _change(key: str) -> Callable[[Scores], float | None]:
-    return lambda scores: (
-        None if scores[key] is None else scores[key]["after"] - scores[key]["before"]
-    )
-
-
-def _worst_view(scores: Scores) -> float:
-    return min(view["after"] - view["before"] for view in scores["context_psnr"])
-
-
-def _views(key: str) -> Callable[[Scores], float]:
-    return lambda scores: statistics.fmean(view["after"] for view in scores[key])
-
-
-def _score(key: str) -> Callable[[Scores], float | None]:
-    return lambda scores: scores[key]
-
-
-IMAGES = (
-    Column("psnr", "PSNR", 2, _target("psnr")),
-    Column("gain", "gain", 2, _gain),
-    Column("lowest_gain", "lowest gain", 2, _gain, "lowest"),
-    Column("ssim", "SSIM", 3, _target("ssim")),
-    Column("lpips_vgg", "LPIPS (VGG)", 3, _target("lpips_vgg")),
-    Column("lpips_alex", "LPIPS (Alex)", 3, _target("lpips_alex")),
-    Column("hole_psnr", "in holes", 2, _score("hole_psnr")),
-    Column("observed_psnr", "outside", 2, _after("observed_psnr")),
-    Column("neighbours", "beside", 2, _after("neighbours_psnr")),
-    Column("neighbours_gain", "gain beside", 2, _change("neighbours_psnr")),
-    Column("context", "context", 2, _views("context_psnr")),
-    Column("context_ssim", "SSIM of context", 3, _views("context_ssim")),
-    Column("context_change", "worst context change", 2, _worst_view, "lowest"),
+from gscompleter.reports.summary import (
+    GEOMETRY,
+    IMAGES,
+    SEQUENCE,
+    Cell,
+    Column,
+    Step,
+    Summary,
+    psnr_after,
+    psnr_before,
+    read_rows,
+    stage_place,
+    summarize,
 )
-"""PSNR in dB: at the target; there in and outside of the holes of the context; beside the target;
-at the context views. The worst change is that of the context view that lost most."""
-
-GEOMETRY = (
-    Column("depth_observed", "AbsRel observed", 3, _score("depth_observed")),
-    Column("depth_hole", "AbsRel in holes", 3, _score("depth_hole")),
-    Column("depth_rim", "step at rim", 4, _score("depth_rim")),
-    Column("align_abs_rel", "AbsRel to context", 4, _score("align_abs_rel")),
-    Column("align_chamfer", "Chamfer to context", 4, _score("align_chamfer")),
-    Column("align_f_score", "F-score to context", 3, _score("align_f_score")),
-)
-"""Against true depth where it is known, and of what was added against the context. All lengths are
-shares of the depth."""
-
-COLUMNS = IMAGES + GEOMETRY
+from gscompleter.runs.store import step_path, task_folder, truth_path
 
 LPIPS_MISSING = (
     "LPIPS: weights not available. `gscompleter.metrics.lpips.load_lpips()` fetches them; then "
-    "`gscompleter evaluate` with `--again scores` adds the column.\n"
+    "scoring again adds the column.\n"
 )
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A mean (or the lowest value) over the cases that have the score."""
-
-    value: float | None
-    count: int
-
-
-@dataclass(frozen=True)
-class Summary:
-    """All that the tables show."""
-
-    methods: tuple[str, ...]
-    cases: int
-    """How many cases there are rows of."""
-    common: tuple[str, ...]
-    """Names of the cases that all methods finished."""
-    rows: dict[str, tuple[Row, ...]]
-    """By method, its rows of these cases, in their order."""
-    cells: dict[str, dict[str, Cell]]
-    """By method and column."""
-    gains: dict[int, dict[str, Cell]]
-    """By distance to the context in frames, and by method: the mean gain in dB."""
-    finished: dict[str, int]
-    """By method, the cases it finished."""
-    failures: tuple[tuple[str, str, str], ...]
-    """Case, method, reason."""
 
 
 @dataclass(frozen=True)
@@ -156,14 +57,13 @@ def tables(out: Path, with_fid: bool = False) -> Summary:
         InputError: where `out` is no folder of results, or has no rows or a damaged one.
     """
     summary = summarize(read_rows(out))
-    asked = Fid({}, "not asked for; `gscompleter tables OUT --fid` adds it")
-    fids = fid_of(out, summary) if with_fid else asked
+    fids = fid_of(out, summary) if with_fid else Fid({}, "not asked for")
     texts = {
         "tables.md": score_markdown(summary, fids),
         "tables.tex": score_latex(summary),
-        "tables.json": score_json(summary, fids),
+        "tables.json": _json(score_content(summary, fids)),
         "timings.md": timing_markdown(summary),
-        "timings.json": timing_json(summary),
+        "timings.json": _json(timing_content(summary)),
     }
     for name, text in texts.items():
         with replacing(out / name) as file:
@@ -171,118 +71,40 @@ def tables(out: Path, with_fid: bool = False) -> Summary:
     return summary
 
 
-def read_rows(out: Path) -> list[Row]:
-    """The rows of a run, in the order of cases and methods.
-
-    Raises:
-        InputError: where there are none, or one is damaged.
-    """
-    if not (out / RUN).is_file():
-        raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
-    paths = sorted((out / CASES).glob("*/*.json"))
-    if not paths:
-        raise InputError(f"The run in {out} has no rows yet; let `evaluate` finish a case first.")
-    rows = []
-    for path in paths:
-        row = read_json(path)
-        try:
-            row["case"]["name"], row["method"], row["error"], row["scores"], row["seconds"]
-        except (KeyError, TypeError) as error:
-            raise InputError(f"{path} is no row of scores; delete it and run again.") from error
-        rows.append(row)
-    return sorted(rows, key=lambda row: (row["case"]["name"], *place_of(row["method"])))
-
-
 def fid_of(out: Path, summary: Summary) -> Fid:
     """FID between what each method shows at the targets and the photographs."""
-    folders = [case_folder(out, name) for name in summary.common]
+    steps = [
+        (task_folder(out, row["task"]["name"]), number)
+        for row in summary.rows[summary.methods[0]]
+        for number in range(1, len(row["steps"]) + 1)
+    ]
     try:
-        truths = [read_image(folder / "truth.png") for folder in folders]
-        values = {
-            method: fid([read_image(folder / f"{slug(method)}.png") for folder in folders], truths)
-            for method in summary.methods
-        }
+        truths = [read_image(truth_path(folder, number)) for folder, number in steps]
+        values = {}
+        for method in summary.methods:
+            drawn = [step_path(folder, method, n).with_suffix(".png") for folder, n in steps]
+            values[method] = fid([read_image(path) for path in drawn], truths)
     except InputError as error:
         return Fid({}, f"not available ({error})")
     return Fid(values)
 
 
-def place_of(method: str) -> tuple[int, str]:
-    """What sorts methods into the order of the tables."""
-    order = list(METHODS)
-    return (order.index(method) if method in order else len(order), method)
+def shown(value: float | None, digits: int) -> str:
+    """The number, or a dash where there is none."""
+    return "–" if value is None else f"{value:.{digits}f}"
 
 
-def summarize(rows: Sequence[Row]) -> Summary:
-    """Means over the cases that all methods finished, so that they compare the same cases."""
-    methods = tuple(sorted({row["method"] for row in rows}, key=place_of))
-    done: dict[str, dict[str, Row]] = {name: {} for name in methods}
-    for row in rows:
-        if row["error"] is None:
-            done[row["method"]][row["case"]["name"]] = row
-    cases = sorted({row["case"]["name"] for row in rows})
-    common = tuple(name for name in cases if all(name in done[method] for method in methods))
-    chosen = {method: tuple(done[method][name] for name in common) for method in methods}
-    return Summary(
-        methods,
-        len(cases),
-        common,
-        chosen,
-        {m: {c.key: cell_of(chosen[m], c) for c in COLUMNS} for m in methods},
-        gains_by_gap(chosen),
-        {method: len(done[method]) for method in methods},
-        tuple((r["case"]["name"], r["method"], r["error"]) for r in rows if r["error"] is not None),
-    )
-
-
-def cell_of(rows: Iterable[Row], column: Column) -> Cell:
-    """The mean (or the lowest value) of a column over the rows that have it."""
-    values = [value for row in rows if (value := column.of(row["scores"])) is not None]
-    if not values:
-        return Cell(None, 0)
-    return Cell(min(values) if column.over == "lowest" else statistics.fmean(values), len(values))
-
-
-def gap_of(row: Row) -> int:
-    """Frames from the target to the nearest context frame: k of the protocol n-k."""
-    return min(abs(row["case"]["target"] - frame) for frame in row["case"]["context"])
-
-
-def gains_by_gap(rows: dict[str, tuple[Row, ...]]) -> dict[int, dict[str, Cell]]:
-    """The mean gain of each method at each distance from the context."""
-    gain = next(column for column in COLUMNS if column.key == "gain")
-    gaps = sorted({gap_of(row) for chosen in rows.values() for row in chosen})
-    return {
-        gap: {
-            method: cell_of((row for row in chosen if gap_of(row) == gap), gain)
-            for method, chosen in rows.items()
-        }
-        for gap in gaps
-    }
-
-
-def shown(cell: Cell, digits: int, cases: int) -> str:
-    """The number, and of how many cases it is where that is not all of them."""
-    if cell.value is None:
-        return "–"
-    number = f"{cell.value:.{digits}f}"
-    return number if cell.count == cases else f"{number} ({cell.count})"
-
-
-def present(summary: Summary, columns: Sequence[Column]) -> list[Column]:
-    """The columns that any method has a value in."""
-    return [
-        c
-        for c in columns
-        if any(summary.cells[method][c.key].value is not None for method in summary.methods)
-    ]
+def shown_cell(cell: Cell, digits: int, count: int) -> str:
+    """The number, and of how many it is where that is not all `count`."""
+    number = shown(cell.value, digits)
+    return number if cell.count in (0, count) else f"{number} ({cell.count})"
 
 
 def score_cells(summary: Summary, columns: Sequence[Column]) -> list[list[str]]:
     """A table of scores as text, a row per method."""
     n = len(summary.common)
     return [
-        [method, *(shown(summary.cells[method][c.key], c.digits, n) for c in columns)]
+        [method, *(shown_cell(summary.cell(method, c), c.digits, n) for c in columns)]
         for method in summary.methods
     ]
 
@@ -294,17 +116,17 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def score_markdown(summary: Summary, fids: Fid) -> str:
-    """Scores, what they are over, and what failed."""
-    parts = [
-        f"Over the {len(summary.common)} of {summary.cases} cases that all methods finished. A "
-        "number in brackets is how many of them have the score, where not all have it.\n"
-    ]
-    for title, columns in (("Images", present(summary, IMAGES)), ("Geometry", GEOMETRY)):
-        chosen = present(summary, columns)
+    """Scores, what they are over, what failed, and each step of tasks of several."""
+    parts = [scope(summary)]
+    groups = {"Images": IMAGES, "Geometry": GEOMETRY}
+    if summary.sequences:
+        groups["Sequences"] = SEQUENCE
+    for title, columns in groups.items():
+        chosen = summary.present(columns)
         if chosen:
             head = ["method", *(column.title for column in chosen)]
             parts.append(f"### {title}\n\n" + markdown(head, score_cells(summary, chosen)))
-    if not any(column.key.startswith("lpips") for column in present(summary, IMAGES)):
+    if not any(column.key.startswith("lpips") for column in summary.present(IMAGES)):
         parts.append(LPIPS_MISSING)
     parts.append(fid_markdown(summary, fids))
     if len(summary.gains) > 1:
@@ -312,7 +134,22 @@ def score_markdown(summary: Summary, fids: Fid) -> str:
     if summary.failures:
         rows = [[cell.replace("|", "\\|") for cell in failure] for failure in summary.failures]
         parts.append("### Failed\n\n" + markdown(["case", "method", "reason"], rows))
+    parts += [step_markdown(name, steps) for name, steps in summary.sequences.items()]
     return "\n".join(parts)
+
+
+def scope(summary: Summary) -> str:
+    """What the numbers are over, in a paragraph."""
+    text = (
+        f"Over the {len(summary.common)} of {len(summary.tasks)} cases that all methods finished. "
+        "A number in brackets is how many of them have the score, where not all have it.\n"
+    )
+    if not summary.sequences:
+        return text
+    return text + (
+        f"They have {summary.num_steps} steps in all: means over the steps of each, then over the "
+        "cases. A depth scale of 1 is metric; its drift over a sequence is max(ln s) - min(ln s).\n"
+    )
 
 
 def fid_markdown(summary: Summary, fids: Fid) -> str:
@@ -321,17 +158,20 @@ def fid_markdown(summary: Summary, fids: Fid) -> str:
         return f"FID: {fids.reason}.\n"
     rows = [[method, f"{value:.2f}"] for method, value in fids.values.items()]
     return (
-        f"### FID\n\nOf {len(summary.common)} pictures against as many photographs; biased for "
+        f"### FID\n\nOf {summary.num_steps} pictures against as many photographs; biased for "
         "few pictures.\n\n" + markdown(["method", "FID"], rows)
     )
 
 
 def gain_markdown(summary: Summary) -> str:
-    """The gain against the distance from the context."""
+    """The gain against the distance from the known views."""
     counts = {gap: max(c.count for c in cells.values()) for gap, cells in summary.gains.items()}
     head = ["method", *(f"{gap} ({counts[gap]})" for gap in summary.gains)]
     rows = [
-        [method, *(shown(cells[method], 2, counts[gap]) for gap, cells in summary.gains.items())]
+        [
+            method,
+            *(shown_cell(cells[method], 2, counts[gap]) for gap, cells in summary.gains.items()),
+        ]
         for method in summary.methods
     ]
     return (
@@ -340,10 +180,30 @@ def gain_markdown(summary: Summary) -> str:
     )
 
 
+def step_markdown(name: str, by_method: Mapping[str, Sequence[Step]]) -> str:
+    """Each step of a task."""
+    head = ["method", "frame", "anchor", "before", "after", "end", "depth scale", "added"]
+    rows = [[method, *step_cells(step)] for method, steps in by_method.items() for step in steps]
+    return f"### {name}\n\n" + markdown(head, rows)
+
+
+def step_cells(step: Step) -> list[str]:
+    """A step as a line of a table."""
+    numbers = [psnr_before(step), psnr_after(step), step["psnr_end"]]
+    return [
+        str(step["frame"]),
+        "–" if step["anchor"] is None else str(step["anchor"]),
+        *(shown(number, 2) for number in numbers),
+        shown(step["depth_scale"], 3),
+        str(step["added"]),
+    ]
+
+
 def score_latex(summary: Summary) -> str:
     """The tables of scores for LaTeX with booktabs."""
-    blocks = [f"% Over the {len(summary.common)} of {summary.cases} cases that all finished."]
-    for columns in (present(summary, IMAGES), present(summary, GEOMETRY)):
+    blocks = [f"% Over the {len(summary.common)} of {len(summary.tasks)} cases that all finished."]
+    for group in (IMAGES, GEOMETRY, SEQUENCE if summary.sequences else ()):
+        columns = summary.present(group)
         if columns:
             blocks.append(_tabular(summary, columns))
     return "\n".join(blocks) + "\n"
@@ -361,95 +221,75 @@ def _tabular(summary: Summary, columns: Sequence[Column]) -> str:
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
 
-def score_json(summary: Summary, fids: Fid) -> str:
-    """The same with all digits."""
-    methods = {
-        method: {
-            "finished": summary.finished[method],
-            **{
-                key: {"value": cell.value, "cases": cell.count}
-                for key, cell in summary.cells[method].items()
-            },
-        }
-        for method in summary.methods
-    }
-    gains = {
-        str(gap): {method: cell.value for method, cell in cells.items()}
-        for gap, cells in summary.gains.items()
-    }
-    failures = [
-        {"case": case, "method": method, "reason": reason}
-        for case, method, reason in summary.failures
-    ]
-    content = {
-        "cases": summary.cases,
+def score_content(summary: Summary, fids: Fid) -> dict[str, Any]:
+    """The same with all digits, for JSON."""
+    content: dict[str, Any] = {
+        "cases": len(summary.tasks),
         "common": list(summary.common),
-        "methods": methods,
-        "gain_by_distance": gains,
+        "methods": {
+            method: {
+                "finished": summary.finished[method],
+                **{
+                    column.key: {"value": cell.value, "cases": cell.count}
+                    for column in summary.columns
+                    for cell in [summary.cell(method, column)]
+                },
+            }
+            for method in summary.methods
+        },
+        "gain_by_distance": {
+            str(gap): {method: cell.value for method, cell in cells.items()}
+            for gap, cells in summary.gains.items()
+        },
         "fid": {"values": fids.values, "reason": fids.reason},
-        "failures": failures,
+        "failures": [
+            dict(zip(("case", "method", "reason"), failure, strict=True))
+            for failure in summary.failures
+        ],
     }
-    return json.dumps(content, indent=1) + "\n"
+    if summary.sequences:
+        content["steps"] = _steps(summary, without_cost)
+    return content
 
 
-def seconds_of(summary: Summary) -> dict[str, dict[str, float]]:
-    """By method and stage, the median wall time over the cases.
-
-    `reconstruct` is Ψ of the photographs, which is done once for all methods; `total` is without.
-    """
-    found = {}
-    for method, rows in summary.rows.items():
-        stages = sorted({s for row in rows for s in row["seconds"]}, key=stage_place)
-        found[method] = {
-            stage: statistics.median(row["seconds"].get(stage, 0.0) for row in rows)
-            for stage in stages
-        }
-    return found
+def without_cost(step: Step) -> Step:
+    """A step without what differs from run to run."""
+    return {key: step[key] for key in step if key not in ("seconds", "peak_bytes")}
 
 
-def stage_place(stage: str) -> tuple[int, str]:
-    """What sorts stages into the order in which they run."""
-    order = ["reconstruct", *STAGES, "optimize"]
-    return (order.index(stage) if stage in order else len(order), stage)
-
-
-def peak_of(summary: Summary) -> dict[str, int | None]:
-    """By method, the most memory in bytes that any case took; None where no system told."""
-    found = {}
-    for method, rows in summary.rows.items():
-        known = [row["peak_bytes"] for row in rows if row["peak_bytes"] is not None]
-        found[method] = max(known, default=None)
-    return found
+def _steps(summary: Summary, of: Callable[[Step], Any]) -> dict[str, dict[str, list[Any]]]:
+    """What `of` takes of each step, by task of several steps and method."""
+    return {
+        name: {method: [of(step) for step in steps] for method, steps in by_method.items()}
+        for name, by_method in summary.sequences.items()
+    }
 
 
 def timing_markdown(summary: Summary) -> str:
-    """Median seconds per case by stage, and the most memory."""
-    seconds, peak = seconds_of(summary), peak_of(summary)
-    stages = sorted({s for of_method in seconds.values() for s in of_method}, key=stage_place)
-
-    def cell(value: float | None) -> str:
-        return "–" if value is None else f"{value:.2f}"
-
-    rows = [
-        [
-            method,
-            *(cell(seconds[method].get(stage)) for stage in stages),
-            "–" if peak[method] is None else f"{(peak[method] or 0) / 2**30:.2f}",
-        ]
-        for method in summary.methods
-    ]
+    """Median seconds by stage, and the most memory."""
+    stages = sorted({s for m in summary.methods for s in summary.seconds(m)}, key=stage_place)
+    rows = []
+    for method in summary.methods:
+        seconds, peak = summary.seconds(method), summary.peak_bytes(method)
+        memory = None if peak is None else peak / 2**30
+        rows.append([method, *(shown(seconds.get(stage), 2) for stage in stages), shown(memory, 2)])
     return (
-        f"Median seconds over the {len(summary.common)} cases that all methods finished, and the "
-        "most memory (GiB) of any. The total is without the reconstruction of the context, which "
-        "is done once for all methods.\n\n" + markdown(["method", *stages, "memory"], rows)
+        f"Median seconds of a step over the {len(summary.common)} cases that all methods finished, "
+        "and the most memory (GiB) of any. The total is without the reconstruction of the context, "
+        "which is done once for all methods.\n\n" + markdown(["method", *stages, "memory"], rows)
     )
 
 
-def timing_json(summary: Summary) -> str:
-    """The same with all digits."""
-    seconds, peak = seconds_of(summary), peak_of(summary)
-    content = {
-        method: {"seconds": seconds[method], "peak_bytes": peak[method]}
+def timing_content(summary: Summary) -> dict[str, Any]:
+    """The same with all digits, for JSON, and of sequences the seconds of each step."""
+    content: dict[str, Any] = {
+        method: {"seconds": summary.seconds(method), "peak_bytes": summary.peak_bytes(method)}
         for method in summary.methods
     }
+    if summary.sequences:
+        content["steps"] = _steps(summary, lambda step: step["seconds"])
+    return content
+
+
+def _json(content: dict[str, Any]) -> str:
     return json.dumps(content, indent=1) + "\n"

@@ -1,32 +1,28 @@
-"""Methods to compare, by name. All of them begin with the same context, and all that need a
+"""Methods to compare, by name. All of them begin with the same scene, and all that need a
 synthesized image take the one that `full` takes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from gscompleter.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.completer import Clock, GSCompleter
-from gscompleter.config import ABLATIONS, HoleConfig, named_config
-from gscompleter.errors import InputError
+from gscompleter.config import ABLATIONS, named_config
+from gscompleter.errors import InputError, quoted
 from gscompleter.generators import Generator
-from gscompleter.metrics.scores import Outcome
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render import Renderer
 from gscompleter.stages.anchor import lift, select_anchor
-from gscompleter.stages.integration import hole_mask
-from gscompleter.types import Camera, Gaussians, View, merge
+from gscompleter.types import Camera, Completion, Gaussians, merge
 
 
 @dataclass(frozen=True)
-class Parts:
-    """The models and settings that every method shares."""
+class Models:
+    """The models that every method shares."""
 
     reconstructor: Reconstructor
     generator: Generator
@@ -36,10 +32,11 @@ class Parts:
     baseline_iterations: int | None = None
     """Most iterations of the baselines; their own numbers if None."""
 
-    def completer(self, name: str = "default") -> GSCompleter:
-        """Our method with the settings called `name`."""
-        config = named_config(name)
-        return GSCompleter(self.reconstructor, self.generator, self.renderer, config, self.seed)
+    def completer(self, config: str = "default") -> GSCompleter:
+        """Our method with the settings called `config`."""
+        return GSCompleter(
+            self.reconstructor, self.generator, self.renderer, named_config(config), self.seed
+        )
 
     def iterations(self, wanted: int) -> int:
         """`wanted`, or the most that is allowed."""
@@ -47,100 +44,92 @@ class Parts:
 
 
 @dataclass(frozen=True)
-class Start:
-    """Where every method begins."""
+class Prediction:
+    """What a method, ours or another, makes of a scene for one target."""
 
-    views: tuple[View, ...]
-    """The context photographs."""
-    target: Camera
-    context: Gaussians
-    """What Ψ makes of them."""
-    hole_mask: Bool[Tensor, "h w"]
-    """True where the context has a hole, seen from the target."""
-    seconds: float
-    """What Ψ took."""
-
-
-Method = Callable[[Start, Parts], Outcome]
-
-
-def start_of(views: Sequence[View], target: Camera, parts: Parts) -> Start:
-    """Reconstruct the context that all methods share.
-
-    Cameras without a depth range get one that is estimated from the photographs.
-
-    Raises:
-        InputError: fewer than two views, or none that make a stereo pair.
-    """
-    if len(views) < 2:
-        raise InputError(
-            f"{len(views)} context view was given, and stereo needs at least 2; name more frames."
-        )
-    begun = parts.completer().begin(views)
-    target = begun.ranged(target)
-    holes = hole_mask(parts.renderer.render(begun.scene, target), HoleConfig())
-    return Start(begun.views, target, begun.scene, holes, begun.seconds["total"])
+    scene: Gaussians
+    """The scene afterwards."""
+    added: Gaussians | None
+    """What stands in `scene` beside the scene before; None where that itself was changed."""
+    seconds: Mapping[str, float]
+    """Wall time by stage, without the reconstruction of the context, and `total`."""
+    anchor: int | None = None
+    """Which view made the stereo pair with the target; None where nothing was lifted."""
+    anchor_fallback: bool = False
+    """True where every view was turned too far and the least-turned one was taken."""
+    notes: tuple[str, ...] = ()
+    """Fallbacks that were taken, a sentence each."""
+    peak_bytes: int | None = None
+    """The most memory that was held meanwhile; None where the system does not tell."""
 
 
-def nothing_added(start: Start, parts: Parts) -> Outcome:
-    """Ψ alone."""
-    none = start.context[:0]
-    return Outcome(start.context, start.context, none, start.hole_mask, {"total": 0.0})
+Method = Callable[[Completion, Camera, Models], Prediction]
+"""Takes the scene as it stands, with the photographs that are known, and the target."""
+
+
+def nothing_added(state: Completion, target: Camera, models: Models) -> Prediction:
+    """The scene alone."""
+    return Prediction(state.scene, state.scene[:0], {"total": 0.0})
 
 
 def completed_with(config: str) -> Method:
     """Our method with the settings called `config`."""
 
-    def method(start: Start, parts: Parts) -> Outcome:
-        done = parts.completer(config)(start.views, start.target, start.context)
-        notes = done.targets[0].notes
-        return Outcome(
-            start.context, done.scene, done.added, start.hole_mask, dict(done.seconds), notes
+    def method(state: Completion, target: Camera, models: Models) -> Prediction:
+        completer = models.completer(config)
+        done = completer.advance(completer.begin(state.views, state.scene), target)
+        (result,) = done.targets
+        return Prediction(
+            done.scene,
+            result.added,
+            done.seconds,
+            result.anchor,
+            result.anchor_fallback,
+            result.notes,
         )
 
     return method
 
 
 def optimized_with(config: OptimizationConfig) -> Method:
-    """3DGS fitted to the photographs and the synthesized image, from the context on."""
+    """3DGS fitted to the photographs and the synthesized image, from the scene on."""
 
-    def method(start: Start, parts: Parts) -> Outcome:
+    def method(state: Completion, target: Camera, models: Models) -> Prediction:
         clock = Clock(())
         with clock("generate"):
-            views = [*start.views, synthesized(start, parts)]
-        budget = replace(config, iterations=parts.iterations(config.iterations))
+            views = [*state.views, models.completer().reference(state, target)]
+        budget = replace(config, iterations=models.iterations(config.iterations))
         with clock("optimize"):
-            fitted = optimize(start.context, views, parts.renderer, parts.seed, budget)
-        return Outcome(start.context, fitted.gaussians, None, start.hole_mask, clock.seconds)
+            fitted = optimize(state.scene, views, models.renderer, models.seed, budget)
+        return Prediction(fitted.gaussians, None, clock.seconds)
 
     return method
 
 
-def registered_by_similarity(start: Start, parts: Parts) -> Outcome:
-    """RegGS: all that was lifted, brought to the context by one similarity."""
+def registered_by_similarity(state: Completion, target: Camera, models: Models) -> Prediction:
+    """RegGS: all that was lifted, brought to the scene by one similarity."""
     clock = Clock(())
     with clock("generate"):
-        reference = synthesized(start, parts)
+        reference = models.completer().reference(state, target)
     with clock("lift"):
-        anchor = start.views[select_anchor(start.target, start.views).index]
-        lifted = lift(parts.reconstructor, reference, anchor).gaussians
+        anchor = select_anchor(reference.camera, state.views)
+        lifted = lift(models.reconstructor, reference, state.views[anchor.index]).gaussians
     with clock("register"):
-        config = RegGSConfig(iterations=parts.iterations(RegGSConfig.iterations))
-        found = register_by_similarity(
-            lifted, start.context, reference, parts.renderer, parts.seed, config
-        )
-    added = replace(found.gaussians, generated=torch.ones_like(found.gaussians.generated))
-    scene = merge([start.context, added])
-    return Outcome(start.context, scene, added, start.hole_mask, clock.seconds)
+        config = RegGSConfig(iterations=models.iterations(RegGSConfig.iterations))
+        added = register_by_similarity(
+            lifted, state.scene, reference, models.renderer, models.seed, config
+        ).gaussians
+    scene = merge([state.scene, added])
+    return Prediction(scene, added, clock.seconds, anchor.index, anchor.fallback)
 
 
-def synthesized(start: Start, parts: Parts) -> View:
-    """The image of Φ that `full` takes, as far as the target sees it.
-
-    Φ draws it with the margin of `full`, which is cut off, so that not a pixel differs.
-    """
-    completer = parts.completer()
-    return completer.reference(completer.begin(start.views, start.context), start.target)
+def numbered(prediction: Prediction, number: int, before: Gaussians) -> Prediction:
+    """`prediction` with what it added to the scene `before` marked as made for target `number`."""
+    if prediction.added is None:
+        return prediction
+    generated = torch.full_like(prediction.added.generated, number)
+    added = replace(prediction.added, generated=generated)
+    return replace(prediction, added=added, scene=merge([before, added]))
 
 
 BASELINES: dict[str, Method] = {
@@ -150,6 +139,9 @@ BASELINES: dict[str, Method] = {
     "reggs": registered_by_similarity,
 }
 """Methods that are not ours."""
+
+SCENE_CHANGING = ("densify-100", "densify-800", "distill")
+"""Methods that change the scene that is there, so that their steps cannot be compared."""
 
 _ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABLATIONS}
 # By the name of the method, that of its settings. Three degrees of freedom are no ablation but
@@ -190,8 +182,8 @@ def methods_named(names: Sequence[str]) -> tuple[str, ...]:
     return chosen
 
 
-def check_methods(names: Sequence[str]) -> None:
-    """Refuse names of no method, none at all, and the same one twice.
+def check_methods(names: Sequence[str], steps: int = 1) -> None:
+    """Refuse names of no method, none at all, the same one twice, and what cannot do `steps`.
 
     Raises:
         InputError: where there is one.
@@ -203,8 +195,13 @@ def check_methods(names: Sequence[str]) -> None:
     for name in names:
         if name not in METHODS:
             raise InputError(
-                f"There is no method {name!r}; choose of {known} (paper/no-sa for an ablation of "
-                "the paper's settings)."
+                f"There is no method '{quoted(name)}'; choose of {known} (paper/no-sa for an "
+                "ablation of the paper's settings)."
+            )
+        if steps > 1 and name in SCENE_CHANGING:
+            raise InputError(
+                f"The method {name!r} changes the scene that is there, and in a sequence each step "
+                "has to add to it; choose of context, full, paper, an ablation of these, and reggs."
             )
     if len(set(names)) < len(names):
         raise InputError(f"A method is named twice ({' '.join(names)}); name each once.")

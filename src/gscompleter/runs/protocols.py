@@ -1,27 +1,26 @@
 """Which frames of a clip are given and which are to be synthesized.
 
-Three protocols: a published evaluation index (`{scene: {"context", "target"} or null}`), the
-extrapolation `n-k` (frames n and n + k show what frame n + 2k is completed from, and the same
-backwards) and a stress test far outside of what the context sees. Apart from them stands
-`sequence-k`, whose targets depend on each other: they are completed one after the other.
+A published evaluation index (`{scene: {"context", "target"} or null}`), the extrapolation `n-k`
+(frames n and n + k show what frame n + 2k is completed from, and the same backwards), a stress test
+far outside of what the context sees, and `sequence-k`, whose targets depend on each other: they are
+completed one after the other.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from gscompleter.completer import MAX_TARGETS
-from gscompleter.data.datasets import Skipped
 from gscompleter.data.photographs import PosedPhotographs
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
 from gscompleter.io.json_file import read_json
-from gscompleter.types import View
 
 VERSION = 1
 """Of the files that `write_evaluation_index` writes."""
@@ -34,7 +33,10 @@ class Split:
     context: tuple[int, ...]
     """What is given."""
     targets: tuple[int, ...]
-    """What is to be synthesized, each by itself."""
+    """What is to be synthesized."""
+    in_sequence: bool = False
+    """True where the scene is completed for one target after the other; else each stands by
+    itself."""
 
 
 @runtime_checkable
@@ -125,64 +127,18 @@ class ViewByView:
     def name(self) -> str:
         return f"sequence-{self.k}" + ("" if self.steps is None else f"-steps-{self.steps}")
 
-    def case(
-        self, clip: PosedPhotographs, resolution: tuple[int, int] | None = None
-    ) -> SequenceCase | None:
-        """The sequence of a clip; None where the clip is too short for one step."""
+    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         targets = tuple(range(2 * self.k, len(clip), self.k))[: self.steps or MAX_TARGETS]
-        return SequenceCase(clip, (0, self.k), targets, resolution) if targets else None
+        return (Split((0, self.k), targets, in_sequence=True),) if targets else ()
+
+    def reason_to_skip(self, clip: PosedPhotographs) -> str | None:
+        """Why a clip has no split; None where it has one."""
+        needed = 2 * self.k + 1
+        short = f"it has {len(clip)} frames, and {self.name} needs {needed}"
+        return short if len(clip) < needed else None
 
 
-@dataclass(frozen=True)
-class SequenceCase:
-    """A clip that is completed view after view."""
-
-    clip: PosedPhotographs
-    context: tuple[int, ...]
-    """Frames that are known from the beginning."""
-    targets: tuple[int, ...]
-    """Frames that are completed, in this order."""
-    resolution: tuple[int, int] | None = None
-    """Height and width; those of the photographs if left out."""
-
-    @property
-    def name(self) -> str:
-        first, last = self.targets[0], self.targets[-1]
-        span = f"{first}" if first == last else f"{first}..{last}"
-        return f"{self.clip.name} {'+'.join(map(str, self.context))}>{span}"
-
-    def load(self, frames: Sequence[int]) -> list[View]:
-        """Photographs of `frames`."""
-        return self.clip.views(frames, self.resolution)
-
-
-@dataclass(frozen=True)
-class ClipCase:
-    """One completion task in a clip."""
-
-    clip: PosedPhotographs
-    context: tuple[int, ...]
-    target: int
-    neighbours: tuple[int, ...]
-    """Frames beside the target, for scoring only."""
-    resolution: tuple[int, int] | None = None
-    """Height and width; those of the photographs if left out."""
-
-    @property
-    def scene(self) -> str:
-        """Name of the clip."""
-        return self.clip.name
-
-    @property
-    def name(self) -> str:
-        return f"{self.scene} {'+'.join(map(str, self.context))}>{self.target}"
-
-    def load(self, frames: Sequence[int]) -> list[View]:
-        """Photographs of `frames`."""
-        return self.clip.views(frames, self.resolution)
-
-
-def parse_protocol(text: str) -> EvaluationProtocol | ViewByView:
+def parse_protocol(text: str) -> EvaluationProtocol:
     """The protocol of that name: `n-10`, `n-10-stride-5`, `stress`, `sequence-4`,
     `sequence-4-steps-6`, or the path of an index.
 
@@ -197,58 +153,11 @@ def parse_protocol(text: str) -> EvaluationProtocol | ViewByView:
         return ViewByView(int(match[1]), None if match[2] is None else int(match[2]))
     if text == "stress":
         return StressTest()
-    if Path(text).is_file():
+    if os.path.isfile(text):
         return read_evaluation_index(text)
     raise InputError(
-        f"There is no protocol {text!r}; give n-K for a number of frames K (as n-10), stress, "
-        "sequence-K (as sequence-4), or the path of an evaluation index."
-    )
-
-
-def cases_of(
-    protocol: EvaluationProtocol, clip: PosedPhotographs, resolution: tuple[int, int] | None = None
-) -> list[ClipCase]:
-    """The cases of a clip, one for each target.
-
-    Raises:
-        InputError: where a frame of the protocol is not in the clip.
-    """
-    cases = []
-    for split in protocol.splits(clip):
-        for frame in (*split.context, *split.targets):
-            if frame >= len(clip):
-                raise InputError(
-                    f"The protocol {protocol.name} asks for frame {frame} of {clip.name}, which "
-                    f"has {len(clip)} frames; use the index that was made for this data set."
-                )
-        for target in split.targets:
-            beside = neighbours(target, split.context, len(clip))
-            cases.append(ClipCase(clip, split.context, target, beside, resolution))
-    return cases
-
-
-def sequences_of(
-    protocol: ViewByView,
-    clips: Iterable[PosedPhotographs],
-    skipped: list[Skipped],
-    resolution: tuple[int, int] | None = None,
-) -> Iterator[SequenceCase]:
-    """The sequence of each clip; clips that are too short for a step are appended to `skipped`."""
-    for clip in clips:
-        case = protocol.case(clip, resolution)
-        if case is None:
-            needed = f"{protocol.name} needs {2 * protocol.k + 1}"
-            skipped.append(Skipped(clip.name, f"it has {len(clip)} frames, and {needed}"))
-        else:
-            yield case
-
-
-def neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:
-    """The frames before and after `target`, where they exist and are not context."""
-    return tuple(
-        frame
-        for frame in (target - 1, target + 1)
-        if 0 <= frame < num_frames and frame not in context
+        f"There is no protocol '{quoted(text)}'; give n-K for a number of frames K (as n-10), "
+        "stress, sequence-K (as sequence-4), or the path of an evaluation index."
     )
 
 
@@ -256,8 +165,13 @@ def index_of(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) ->
     """What a protocol chooses in each of `clips`, written down.
 
     Raises:
-        InputError: where two clips have the same name.
+        InputError: where two clips have the same name, or targets depend on each other.
     """
+    if isinstance(protocol, ViewByView):
+        raise InputError(
+            f"{protocol.name} has no index, as its targets are not apart from each other; give it "
+            "to `evaluate` itself."
+        )
     scenes: dict[str, tuple[Split, ...]] = {}
     for clip in clips:
         if clip.name in scenes:
@@ -267,17 +181,6 @@ def index_of(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) ->
     return EvaluationIndex(protocol.name, chosen, tuple(n for n in scenes if not scenes[n]))
 
 
-def n_k_index(
-    clips: Iterable[PosedPhotographs], k: int, stride: int | None = None
-) -> EvaluationIndex:
-    """The extrapolations over k frames in each of `clips`; those too short are skipped.
-
-    Raises:
-        InputError: where k or the stride is not positive, or two clips have the same name.
-    """
-    return index_of(Extrapolation(k, stride), clips)
-
-
 def read_evaluation_index(path: Path | str) -> EvaluationIndex:
     """An evaluation index, as published or as `write_evaluation_index` writes it.
 
@@ -285,12 +188,17 @@ def read_evaluation_index(path: Path | str) -> EvaluationIndex:
         InputError: where it is missing or damaged, or from a later version.
     """
     path = Path(path)
-    content = _read_named(path)
+    content = read_json(path, "download it again")
+    if not isinstance(content, dict):
+        raise InputError(
+            f"{path} is no evaluation index: it has to map the name of each scene to its context "
+            "and target frames, or to null."
+        )
     if "version" not in content:
         return _index(path.stem, content, path)
     if content["version"] != VERSION:
         raise InputError(
-            f"{path} is of version {content['version']!r} and version {VERSION} can be read; "
+            f"{path} is of version {quoted(content['version'])} and version {VERSION} can be read; "
             "update gscompleter, or write the index again."
         )
     name, scenes = content.get("protocol"), content.get("scenes")
@@ -320,16 +228,6 @@ def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
         file.write(text.encode())
 
 
-def _read_named(path: Path) -> dict[str, Any]:
-    content = read_json(path, "download it again")
-    if not isinstance(content, dict):
-        raise InputError(
-            f"{path} is no evaluation index: it has to map the name of each scene to its context "
-            "and target frames, or to null."
-        )
-    return content
-
-
 def _index(name: str, content: Mapping[str, Any], path: Path) -> EvaluationIndex:
     scenes = {
         scene: _splits(entry, scene, path) for scene, entry in content.items() if entry is not None
@@ -342,8 +240,8 @@ def _splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
     rows = entry if isinstance(entry, list) else [entry]
     if not rows or not all(isinstance(row, dict) for row in rows):
         raise InputError(
-            f"The entry of the scene {scene} in {path} is {entry!r}; context and target, or null, "
-            "are needed."
+            f"The entry of the scene {scene} in {path} is {quoted(entry)}; context and target, "
+            "or null, are needed."
         )
     return tuple(
         Split(_frames(row, "context", scene, path), _frames(row, "target", scene, path))
@@ -359,7 +257,7 @@ def _frames(row: dict[str, Any], key: str, scene: str, path: Path) -> tuple[int,
         or not all(type(frame) is int and frame >= 0 for frame in frames)
     ):
         raise InputError(
-            f"The `{key}` of the scene {scene} in {path} is {frames!r}; a list of frame numbers, "
-            "at least one, is needed."
+            f"The `{key}` of the scene {scene} in {path} is {quoted(frames)}; a list of frame "
+            "numbers, at least one, is needed."
         )
     return tuple(frames)

@@ -1,114 +1,72 @@
-"""Cases times methods: predict, save, score. A run that was stopped goes on where it was.
+"""Tasks times methods: predict, save, score. A run that was stopped goes on where it was.
 
 Rows of scores are made from what is saved, so that to score again needs no method to run again.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Literal
 
-from jaxtyping import Float
-from torch import Tensor
-
+from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
-from gscompleter.generators import DiffusionSettings, Generator, load_generator
-from gscompleter.io.image import write_image
-from gscompleter.metrics.scores import Truth, ranged_truth, score
+from gscompleter.generators import Generator, load_generator
 from gscompleter.progress import shown_on, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.runs.memory import peak_memory
-from gscompleter.runs.methods import (
-    METHODS,
-    Parts,
-    Start,
-    check_methods,
-    start_of,
-)
+from gscompleter.runs.methods import Models, check_methods
+from gscompleter.runs.steps import Prepared, Step, attempt, complete_task, read_back
 from gscompleter.runs.store import (
-    RUN,
-    OutputError,
-    Saved,
-    case_folder,
-    keep_outcome,
-    load_outcome,
-    load_start,
+    VERSION,
+    SavedContext,
+    claim,
+    load_context,
     read_json,
-    save_start,
+    row_path,
+    save_context,
     slug,
+    task_folder,
     write_json,
 )
+from gscompleter.runs.tasks import Task
 from gscompleter.types import View
-
-T = TypeVar("T")
-C = TypeVar("C", bound="Named")
-
-VERSION = 2
-"""Of the files in a folder of results."""
-
-
-@runtime_checkable
-class Named(Protocol):
-    """Anything that a method is run on and that has a place in the folder of results."""
-
-    @property
-    def name(self) -> str: ...
-
-
-@runtime_checkable
-class EvaluationCase(Named, Protocol):
-    """A completion task: of a `cases.json`, or chosen by a protocol in a clip."""
-
-    @property
-    def context(self) -> tuple[int, ...]: ...
-
-    @property
-    def target(self) -> int: ...
-
-    @property
-    def neighbours(self) -> tuple[int, ...]: ...
-
-    def load(self, frames: tuple[int, ...]) -> list[View]:
-        """Photographs of `frames`."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What decides the numbers, beside the cases."""
+    """What decides the numbers, beside the tasks."""
 
     reconstructor: str = "plane-sweep"
     weights: str | None = None
     """The file of the reconstructor's weights; None takes the published ones."""
     generator: str = "warp-inpaint"
-    generator_settings: DiffusionSettings = DiffusionSettings()
-    """What a generator with weights is told."""
+    generator_settings: GeneratorSettings | None = None
+    """What the generator is told; None leaves all as it is."""
     device: Literal["cpu", "cuda"] = "cpu"
     seed: int = 0
     """Of everything random."""
     baseline_iterations: int | None = None
     """Most iterations of the baselines; their own numbers if None."""
     source: Mapping[str, Any] = field(default_factory=dict)
-    """Where the cases come from, so that no folder mixes two sources."""
+    """Where the tasks come from, so that no folder mixes two sources."""
 
     def load_reconstructor(self) -> Reconstructor:
-        """Ψ. One with weights is kept from one case to the next."""
+        """Ψ. One with weights is kept from one task to the next."""
         weights = None if self.weights is None else Path(self.weights)
         return load_reconstructor(self.reconstructor, weights, self.device)
 
     def load_generator(self, targets: Sequence[View] = ()) -> Generator:
-        """Φ. One with weights is kept from one case to the next."""
+        """Φ. One with weights is kept from one task to the next."""
         return load_generator(
             self.generator, self.seed, targets, self.device, self.generator_settings
         )
 
-    def parts(self, *targets: View) -> Parts:
-        """The models for a case. Only the generator `oracle` looks at the images of `targets`."""
-        return Parts(
+    def models(self, targets: Sequence[View]) -> Models:
+        """The models for a task. Only the generator `oracle` looks at the images of `targets`."""
+        return Models(
             self.load_reconstructor(),
             self.load_generator(targets),
             load_renderer(self.device),
@@ -118,101 +76,59 @@ class RunConfig:
 
 
 Again = Literal["nothing", "failures", "scores"]
-"""What an earlier call did that is to be done once more: cases that failed, or all scores, from
+"""What an earlier call did that is to be done once more: tasks that failed, or all scores, from
 what is saved."""
 
 
 @dataclass(frozen=True)
-class Tally:
-    """What a call of `evaluate` did, in pairs of a case and a method."""
+class RowCounts:
+    """What a call of `evaluate` did, in rows: pairs of a task and a method."""
 
     done: int
     failed: int
-    """Of those that are done now, how many have a reason in place of scores."""
+    """Of those that are done now, how many say why they have no more steps."""
     skipped: int
     """Done by an earlier call."""
 
 
 def evaluate(
-    cases: Sequence[EvaluationCase],
+    tasks: Sequence[Task],
     methods: Sequence[str],
     out: Path,
     config: RunConfig = RunConfig(),
     shard: tuple[int, int] = (0, 1),
     again: Again = "nothing",
-) -> Tally:
-    """Run every method on every case of the shard, and write a row of scores for each.
+) -> RowCounts:
+    """Run every method on every task of the shard, and write a row of scores for each.
 
-    What is there already stays. A case that fails gives rows that say why, and the others go on.
+    What is there already stays: rows, and of a task that was stopped its whole steps. A task that
+    fails gives rows that say why, and the others go on.
 
     Args:
-        cases: The cases of all shards.
+        tasks: The tasks of all shards.
         methods: Names of methods.
-        out: Folder of results: a new one, or that of an earlier call.
+        out: Folder of results: a new one, or that of an earlier call, or of another shard.
         config: What decides the numbers; the same as in earlier calls.
-        shard: (i, n) takes the cases i, i + n, i + 2n, …; n calls with i from 0 do them all.
+        shard: (i, n) takes the tasks i, i + n, i + 2n, …; n calls with i from 0 do them all.
         again: What of an earlier call is done once more.
 
     Raises:
         InputError: a wrong name or shard, a folder that holds something else, a full disk.
     """
-    begin(cases, methods, out, config, shard)
-    return make_rows(
-        cases[shard[0] :: shard[1]],
-        methods,
-        partial(row_path, out),
-        lambda case: Bench(case, out, config).row,
-        again,
-    )
-
-
-def begin(
-    cases: Sequence[Named],
-    methods: Sequence[str],
-    out: Path,
-    config: RunConfig,
-    shard: tuple[int, int],
-) -> None:
-    """See that a run is possible, and make `out` its folder.
-
-    Raises:
-        InputError: a wrong name or shard, a folder that holds something else, a full disk.
-    """
-    check_methods(methods)
-    check_shard(shard)
-    check_cases(cases)
-    config.load_reconstructor()
-    config.load_generator()
-    claim(out, config)
-
-
-def make_rows(
-    cases: Sequence[C],
-    methods: Sequence[str],
-    path_of: Callable[[C, str], Path],
-    rows_of: Callable[[C], Callable[[str], dict[str, Any]]],
-    again: Again,
-) -> Tally:
-    """Write the rows that are missing, case by case.
-
-    Args:
-        cases: What the methods are run on.
-        methods: Names of methods.
-        path_of: Where the row of a case and a method lies.
-        rows_of: Of a case, what makes the row of a method; it is asked for once per case.
-        again: What of an earlier call is done once more.
-    """
-    jobs = [(case, name) for case in cases for name in methods]
-    missing = [job for job in jobs if is_missing(path_of(*job), again)]
-    failed, current, row_of = 0, None, None
-    for case, name in track(missing, "Evaluating"):
+    check_evaluation(tasks, methods, config, shard)
+    claim(out, deciding(config))
+    jobs = [(task, name) for task in tasks[shard[0] :: shard[1]] for name in methods]
+    missing = [job for job in jobs if is_missing(row_path(out, job[0].name, job[1]), again)]
+    failed, current, prepared = 0, None, None
+    for task, method in track(missing, "Evaluating"):
         with shown_on(None):  # one bar is enough
-            if row_of is None or current is not case:
-                current, row_of = case, rows_of(case)
-            row = row_of(name)
-        write_json(path_of(case, name), row)
+            folder = task_folder(out, task.name)
+            if prepared is None or task is not current:
+                current, prepared = task, attempt(partial(prepare, task, folder, config))
+            row = row_of(task, method, prepared, folder)
+        write_json(row_path(out, task.name, method), row)
         failed += row["error"] is not None
-    return Tally(len(missing) - failed, failed, len(jobs) - len(missing))
+    return RowCounts(len(missing) - failed, failed, len(jobs) - len(missing))
 
 
 def is_missing(path: Path, again: Again) -> bool:
@@ -222,143 +138,129 @@ def is_missing(path: Path, again: Again) -> bool:
     return again == "failures" and read_json(path).get("error") is not None
 
 
-class Bench:
-    """One case: its photographs and its context are read, or computed, once."""
+def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
+    """Read the photographs of a task, and read, or compute, the scene that all methods begin with.
 
-    def __init__(self, case: EvaluationCase, out: Path, config: RunConfig) -> None:
-        self.case = case
-        self.folder = case_folder(out, case.name)
-        self.config = config
-        self._ready: tuple[Start, Parts, Truth] | str | None = None
+    Raises:
+        InputError: where a photograph is damaged, other than that of a later target.
+        OutputError: where the scene cannot be saved.
+    """
+    views = photographs(task, task.context, config)
+    neighbours = photographs(task, task.neighbours, config)
+    targets, error = readable_targets(task, config)
+    if not targets:
+        raise InputError(str(error))
+    models = config.models(targets)
+    context = context_at(folder / "context.npz", views, models)
 
-    def row(self, method: str) -> dict[str, Any]:
-        """The scores of a method, or why there are none.
+    def ranged(view: View) -> View:
+        return replace(view, camera=replace(view.camera, near=context.near, far=context.far))
 
-        Raises:
-            OutputError: where a result cannot be written.
-        """
-        if self._ready is None:
-            self._ready = attempt(self._prepare)
-        if isinstance(self._ready, str):
-            return self._row_of(method, error=self._ready)
-        start, parts, truth = self._ready
-        path = self.folder / f"{slug(method)}.npz"
-        saved = load_outcome(path, start)
-        if saved is None:
-            made = attempt(lambda: measured(method, start, parts))
-            if isinstance(made, str):
-                return self._row_of(method, error=made)
-            saved = keep_outcome(path, made, start)
-        row = attempt(lambda: self._scored(method, saved, start, parts, truth))
-        return self._row_of(method, error=row) if isinstance(row, str) else row
-
-    def _prepare(self) -> tuple[Start, Parts, Truth]:
-        case, device = self.case, self.config.device
-        views = [view.to(device) for view in case.load(case.context)]
-        (target,) = (view.to(device) for view in case.load((case.target,)))
-        neighbours = [view.to(device) for view in case.load(case.neighbours)]
-        parts = self.config.parts(target)
-        start = start_at(self.folder / "start.npz", views, target, parts)
-        camera = start.target
-        truth = ranged_truth(start.views, target, neighbours, camera.near, camera.far)
-        return start, parts, truth
-
-    def _scored(
-        self, method: str, saved: Saved, start: Start, parts: Parts, truth: Truth
-    ) -> dict[str, Any]:
-        outcome = saved.outcome
-        scores, seen = score(outcome, truth, parts.renderer)
-        content = asdict(scores)
-        json.dumps(content, allow_nan=False)
-        for name, image in (
-            (slug(method), seen.after.image),
-            ("before", seen.before.image),
-            ("truth", truth.target.image),
-        ):
-            save_image(self.folder / f"{name}.png", image)
-        return self._row_of(
-            method,
-            scores=content,
-            gaussians={"context": len(outcome.context), "after": len(outcome.scene)},
-            notes=list(outcome.notes),
-            seconds={"reconstruct": start.seconds, **outcome.seconds},
-            peak_bytes=saved.peak_bytes,
-        )
-
-    def _row_of(self, method: str, error: str | None = None, **content: Any) -> dict[str, Any]:
-        nothing = dict.fromkeys(("scores", "gaussians", "notes", "seconds", "peak_bytes"))
-        case = {
-            "name": self.case.name,
-            "context": list(self.case.context),
-            "target": self.case.target,
-            "neighbours": list(self.case.neighbours),
-        }
-        return {
-            "version": VERSION,
-            "case": case,
-            "method": method,
-            "error": error,
-            **nothing,
-            **content,
-        }
+    return Prepared(
+        context.gaussians,
+        tuple(map(ranged, views)),
+        tuple(map(ranged, targets)),
+        tuple(map(ranged, neighbours)),
+        models,
+        context.seconds,
+        error,
+    )
 
 
-def start_at(path: Path, views: Sequence[View], target: View, parts: Parts) -> Start:
-    """The context that is saved at `path`, where it is computed and saved first if it is not there.
+def photographs(task: Task, frames: tuple[int, ...], config: RunConfig) -> list[View]:
+    """Photographs of `frames`, which they are numbered by.
+
+    Raises:
+        InputError: where one is damaged.
+    """
+    return [
+        replace(view.to(config.device), frame=frame)
+        for view, frame in zip(task.load(frames), frames, strict=True)
+    ]
+
+
+def readable_targets(task: Task, config: RunConfig) -> tuple[list[View], str | None]:
+    """The targets up to the first whose photograph is damaged, and what is wrong with that."""
+    targets: list[View] = []
+    for frame in task.targets:
+        loaded = attempt(partial(photographs, task, (frame,), config))
+        if isinstance(loaded, str):
+            return targets, f"Frame {frame}: {loaded}"
+        targets += loaded
+    return targets, None
+
+
+def context_at(path: Path, views: Sequence[View], models: Models) -> SavedContext:
+    """The scene that is saved at `path`, where it is computed and saved first if need be.
 
     It is read back in any case, so that a run that was stopped goes on with the very same tensors.
-    """
-    start = load_start(path, views, target)
-    if start is None:
-        save_start(path, start_of(views, target.camera, parts))
-        start = load_start(path, views, target)
-    if start is None:
-        raise OutputError(f"{path} cannot be read back; look whether the disk is sound.")
-    return start
-
-
-def measured(method: str, start: Start, parts: Parts) -> Saved:
-    """What a method makes of a case, and the most memory that this took."""
-    with peak_memory(start.context.means.device) as peak:
-        outcome = METHODS[method](start, parts)
-    return Saved(outcome, peak.bytes)
-
-
-def row_path(out: Path, case: EvaluationCase, method: str) -> Path:
-    """Where the row of scores of a case and a method lies."""
-    return case_folder(out, case.name) / f"{slug(method)}.json"
-
-
-def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
-    """A picture among the results.
 
     Raises:
-        OutputError: where it cannot be written.
+        InputError: fewer than two views, or none that make a stereo pair.
+        OutputError: where it cannot be saved.
     """
-    try:
-        write_image(path, image)
-    except InputError as error:
-        raise OutputError(str(error)) from error
+    device = views[0].image.device if views else "cpu"
+    saved = load_context(path, device)
+    if saved is not None:
+        return saved
+    begun = models.completer().begin(views)
+    camera = begun.views[0].camera
+    assert camera.near is not None
+    assert camera.far is not None
+    made = SavedContext(begun.scene, camera.near, camera.far, begun.seconds["total"])
+    save_context(path, made)
+    return read_back(load_context(path, device), path)
 
 
-def attempt(compute: Callable[[], T]) -> T | str:
-    """What `compute` returns, or why it failed, in one line.
+def row_of(task: Task, method: str, prepared: Prepared | str, folder: Path) -> dict[str, Any]:
+    """What a method came to on a task; `prepared` may be the reason why it came to nothing.
 
     Raises:
-        OutputError: where a result could not be written, which no other case could either.
+        OutputError: where a result cannot be written.
     """
-    try:
-        return compute()
-    except OutputError:
-        raise
-    except InputError as error:
-        return str(error)
-    except Exception as error:  # a defect of one case must not cost the others
-        return f"{type(error).__name__}: {' '.join(str(error).split())}"
+    steps: tuple[Step, ...] = ()
+    error: str | None
+    if isinstance(prepared, str):
+        error, seconds = prepared, None
+    else:
+        progress = complete_task(prepared, method, folder)
+        steps, error, seconds = progress.steps, progress.error, prepared.seconds
+    return {
+        "version": VERSION,
+        "task": {
+            "name": task.name,
+            "context": list(task.context),
+            "targets": list(task.targets),
+            "neighbours": list(task.neighbours),
+        },
+        "method": method,
+        "error": error,
+        "reconstruct_seconds": seconds,
+        "steps": [asdict(step) for step in steps],
+    }
+
+
+def check_evaluation(
+    tasks: Sequence[Task], methods: Sequence[str], config: RunConfig, shard: tuple[int, int]
+) -> None:
+    """See that a run is possible before anything is written.
+
+    Raises:
+        InputError: where it is not.
+    """
+    check_methods(methods, max((len(task.targets) for task in tasks), default=0))
+    check_shard(shard)
+    check_tasks(tasks)
+    config.load_reconstructor()
+    config.load_generator()
 
 
 def check_shard(shard: tuple[int, int]) -> None:
-    """Refuse shards that do not exist."""
+    """Refuse shards that do not exist.
+
+    Raises:
+        InputError: where it does not.
+    """
     number, count = shard
     if not 0 <= number < count:
         raise InputError(
@@ -366,21 +268,25 @@ def check_shard(shard: tuple[int, int]) -> None:
         )
 
 
-def check_cases(cases: Sequence[Named]) -> None:
-    """Refuse no case at all, and two that would be written to one place."""
-    if not cases:
+def check_tasks(tasks: Sequence[Task]) -> None:
+    """Refuse no task at all, and two that would be written to one place.
+
+    Raises:
+        InputError: where there are such.
+    """
+    if not tasks:
         raise InputError(
             "There is no case to run: no clip has the frames that the protocol asks for; choose a "
             "protocol with a smaller step, or other data."
         )
     names: dict[str, str] = {}
-    for case in cases:
-        folder = slug(case.name)
+    for task in tasks:
+        folder = slug(task.name)
         if folder in names:
             raise InputError(
-                f"The cases {names[folder]} and {case.name} have the same name; rename a scene."
+                f"The cases {names[folder]} and {task.name} have the same name; rename a scene."
             )
-        names[folder] = case.name
+        names[folder] = task.name
 
 
 def deciding(config: RunConfig) -> dict[str, Any]:
@@ -389,32 +295,6 @@ def deciding(config: RunConfig) -> dict[str, Any]:
     Where the parts of a generator wait is not among it.
     """
     values = asdict(config)
-    settings = values.pop("generator_settings")
-    del settings["offload"]
+    settings = values.pop("generator_settings") or {}
+    settings.pop("offload", None)
     return {**values, **{f"generator_{name}": value for name, value in settings.items()}}
-
-
-def claim(out: Path, config: RunConfig) -> None:
-    """Make `out` the folder of this run, or see that it is.
-
-    Raises:
-        InputError: where it holds something else, or a run with other settings.
-    """
-    wanted = json.loads(json.dumps({"version": VERSION, **deciding(config)}))
-    path = out / RUN
-    if path.exists():
-        found = read_json(path, "name another folder")
-        keys = (
-            key for key in wanted if not isinstance(found, dict) or found.get(key) != wanted[key]
-        )
-        differing = next(keys, None)
-        if differing is not None:
-            value = found.get(differing) if isinstance(found, dict) else None
-            raise InputError(
-                f"{out} holds a run with {differing} {value!r}, and {wanted[differing]!r} is asked "
-                "for; name another folder."
-            )
-        return
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} holds something other than a run; name another folder.")
-    write_json(path, wanted)

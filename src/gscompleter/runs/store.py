@@ -1,24 +1,23 @@
 """The folder of a run: where things lie in it, and how they are written and read.
 
-    run.json                         what decided the numbers
-    cases/CASE/start.npz             the context that all methods begin with
-    cases/CASE/METHOD.npz            what a method made of it
-    cases/CASE/METHOD.json           its row of scores, or why it has none
-    cases/CASE/METHOD.png            what the target camera sees afterwards
-    cases/CASE/before.png, truth.png the same before, and the photograph
-    sequences/NAME/start.npz              the context that all methods begin with
-    sequences/NAME/METHOD/step-001.npz    what a method added in its first step
-    sequences/NAME/METHOD/step-001.png    what the camera of that step sees afterwards
-    sequences/NAME/METHOD.json            its row: all steps, and why there are no more
+    run.json                            what decided the numbers
+    tasks/TASK/context.npz              the scene that all methods begin with
+    tasks/TASK/truth-001.png            the photograph of the first target
+    tasks/TASK/METHOD.json              the row of a method: its steps, and why there are no more
+    tasks/TASK/METHOD/step-001.npz      what it made of the scene for the first target
+    tasks/TASK/METHOD/step-001.png      what the camera of that target sees afterwards
+    tasks/TASK/METHOD/before-001.png    the same before
 
 Everything appears under its name once it is complete.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,25 +25,27 @@ from zipfile import BadZipFile
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io import json_file
 from gscompleter.io.files import replacing
-from gscompleter.metrics.scores import Outcome, ranged_truth
-from gscompleter.runs.methods import Start
-from gscompleter.types import Gaussians, View, merge
+from gscompleter.io.image import write_image
+from gscompleter.io.unfinished import MARK
+from gscompleter.runs.methods import Prediction
+from gscompleter.types import Gaussians, merge
 
 RUN = "run.json"
 """The file that says what decided the numbers of a folder."""
 
-CASES = "cases"
-"""Where the folders of the cases are."""
+TASKS = "tasks"
+"""Where the folders of the tasks are."""
 
-SEQUENCES = "sequences"
-"""Where the folders of the sequences are."""
+VERSION = 3
+"""Of the files in a folder of results."""
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
-
 
 Arrays = dict[str, np.ndarray]
 
@@ -58,110 +59,187 @@ def slug(name: str) -> str:
     return re.sub(r"[^\w.+-]+", "-", name.replace(">", "-to-"))
 
 
-def case_folder(out: Path, case: str) -> Path:
-    """Where everything about the case of that name lies."""
-    return out / CASES / slug(case)
+def task_folder(out: Path, task: str) -> Path:
+    """Where everything about the task of that name lies."""
+    return out / TASKS / slug(task)
 
 
-def sequence_folder(out: Path, sequence: str) -> Path:
-    """Where everything about the sequence of that name lies."""
-    return out / SEQUENCES / slug(sequence)
+def row_path(out: Path, task: str, method: str) -> Path:
+    """Where the row of a task and a method lies."""
+    return task_folder(out, task) / f"{slug(method)}.json"
+
+
+def step_path(folder: Path, method: str, number: int) -> Path:
+    """What a method made of the step `number`, counted from 1, of the task in `folder`."""
+    return folder / slug(method) / f"step-{number:03d}.npz"
+
+
+def truth_path(folder: Path, number: int) -> Path:
+    """The photograph of the target of the step `number` of the task in `folder`."""
+    return folder / f"truth-{number:03d}.png"
+
+
+def row_paths(out: Path) -> list[Path]:
+    """All rows of a run."""
+    return sorted((out / TASKS).glob("*/*.json"))
+
+
+def claim(out: Path, settings: Mapping[str, Any]) -> None:
+    """Make `out` the folder of the run with these settings, or see that it is.
+
+    Of any number of processes that claim a folder at the same time one makes it, and the others
+    compare. Only a file system without hard links cannot tell at the very same moment that two of
+    them differ in their settings.
+
+    Raises:
+        InputError: where it holds something else, or a run with other settings.
+    """
+    wanted = json.loads(json.dumps({"version": VERSION, **settings}))
+    if not is_run(out):
+        if holds_something_else(out):
+            raise InputError(f"{out} holds something other than a run; name another folder.")
+        write_json(out / RUN, wanted, first_stays=True)
+    found = settings_of(out)
+    for key in {**wanted, **found}:
+        if found.get(key) != wanted.get(key):
+            there, asked = quoted(repr(found.get(key))), quoted(repr(wanted.get(key)))
+            raise InputError(
+                f"{out} holds a run with {key} {there}, and {asked} is asked for; name another "
+                "folder."
+            )
+
+
+def check_run(out: Path) -> None:
+    """See that `out` is the folder of a run.
+
+    Raises:
+        InputError: where it is none, or one of another version.
+    """
+    if not is_run(out):
+        raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
+    settings_of(out)
+
+
+def settings_of(out: Path) -> dict[str, Any]:
+    """What `out` says of its run.
+
+    Raises:
+        InputError: where that cannot be read, or is of another version.
+    """
+    found = read_json(out / RUN, "name another folder")
+    version = found.get("version") if isinstance(found, dict) else None
+    if version != VERSION:
+        raise InputError(
+            f"{out} holds a run of version {quoted(version)}, and version {VERSION} is needed; "
+            "name another folder and run it again."
+        )
+    return dict(found)
+
+
+def is_run(out: Path) -> bool:
+    """Whether `out` is the folder of a run."""
+    return (out / RUN).is_file()
+
+
+def holds_something_else(out: Path) -> bool:
+    """Whether `out` is there and is neither empty nor the folder of a run.
+
+    What another process is writing does not count; and where it has written more than that, it has
+    claimed the folder before.
+    """
+    if not os.path.lexists(out):
+        return False
+    if not out.is_dir():
+        return True
+    entries = {name for name in os.listdir(out) if not name.startswith(MARK)}
+    return bool(entries) and RUN not in entries and not is_run(out)
 
 
 @dataclass(frozen=True)
-class Saved:
-    """What a method made of a case, and the most memory that this took."""
+class SavedContext:
+    """What Ψ makes of the photographs of a task."""
 
-    outcome: Outcome
-    peak_bytes: int | None
+    gaussians: Gaussians
+    near: float
+    """Depth range in scene units that it was made with."""
+    far: float
+    seconds: float
+    """What it took."""
 
 
-def save_start(path: Path, start: Start) -> None:
-    """Write the context, its hole mask, and the depth range that it was made with.
+def save_context(path: Path, context: SavedContext) -> None:
+    """Write the scene that all methods begin with.
 
     Raises:
         OutputError: where it cannot be written.
     """
-    numbers = [start.seconds, start.target.near, start.target.far]
-    write_arrays(
-        path,
-        {
-            **_arrays_of(start.context),
-            "hole_mask": start.hole_mask.cpu().numpy(),
-            "seconds_near_far": np.array(numbers, dtype=np.float64),
-        },
-    )
+    numbers = np.array([context.seconds, context.near, context.far], dtype=np.float64)
+    write_arrays(path, {**_arrays_of(context.gaussians), "seconds_near_far": numbers})
 
 
-def load_start(path: Path, views: Sequence[View], target: View) -> Start | None:
-    """What `save_start` wrote, with the photographs that it does not; None if it is not whole."""
+def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
+    """What `save_context` wrote; None where there is nothing whole."""
     arrays = load_arrays(path)
     if arrays is None:
         return None
     seconds, near, far = arrays["seconds_near_far"].tolist()
-    ranged = ranged_truth(views, target, (), near, far)
-    device = target.image.device
-    mask = torch.from_numpy(arrays["hole_mask"]).to(device)
-    context = _gaussians_of(arrays, device)
-    return Start(ranged.views, ranged.target.camera, context, mask, seconds)
+    return SavedContext(_gaussians_of(arrays, device), near, far, seconds)
 
 
-def save_outcome(path: Path, saved: Saved) -> None:
-    """Write what differs from the context: what was added, or else the whole scene.
+def save_prediction(path: Path, prediction: Prediction) -> None:
+    """Write what differs from the scene before: what was added, or else the whole scene.
 
     Raises:
         OutputError: where it cannot be written.
     """
-    outcome = saved.outcome
-    whole = outcome.added is None
-    peak = -1 if saved.peak_bytes is None else saved.peak_bytes
+    whole = prediction.added is None
     write_arrays(
         path,
         {
-            **_arrays_of(outcome.scene if outcome.added is None else outcome.added),
+            **_arrays_of(prediction.scene if prediction.added is None else prediction.added),
             "whole": np.array(whole),
-            "stages": np.array(list(outcome.seconds), dtype=np.str_),
-            "seconds": np.array(list(outcome.seconds.values()), dtype=np.float64),
-            "peak_bytes": np.array(peak, dtype=np.int64),
-            "notes": np.array(outcome.notes, dtype=np.str_),
+            "stages": np.array(list(prediction.seconds), dtype=np.str_),
+            "seconds": np.array(list(prediction.seconds.values()), dtype=np.float64),
+            "anchor": _optional(prediction.anchor),
+            "anchor_fallback": np.array(prediction.anchor_fallback),
+            "notes": np.array(prediction.notes, dtype=np.str_),
+            "peak_bytes": _optional(prediction.peak_bytes),
         },
     )
 
 
-def keep_outcome(path: Path, saved: Saved, start: Start) -> Saved:
-    """Save it and read it back, so that a run that was stopped goes on with the very same tensors.
-
-    Raises:
-        OutputError: where it cannot be written.
-    """
-    save_outcome(path, saved)
-    return load_outcome(path, start) or saved
-
-
-def load_outcome(path: Path, start: Start) -> Saved | None:
-    """What `save_outcome` wrote; None where there is nothing whole."""
+def load_prediction(path: Path, before: Gaussians) -> Prediction | None:
+    """What `save_prediction` wrote of the scene `before`; None where there is nothing whole."""
     arrays = load_arrays(path)
     if arrays is None:
         return None
-    changed = _gaussians_of(arrays, start.context.means.device)
+    changed = _gaussians_of(arrays, before.means.device)
     whole = bool(arrays["whole"])
-    peak = int(arrays["peak_bytes"])
-    outcome = Outcome(
-        context=start.context,
-        scene=changed if whole else merge([start.context, changed]),
+    return Prediction(
+        scene=changed if whole else merge([before, changed]),
         added=None if whole else changed,
-        hole_mask=start.hole_mask,
         seconds=dict(zip(arrays["stages"].tolist(), arrays["seconds"].tolist(), strict=True)),
+        anchor=_known(arrays["anchor"]),
+        anchor_fallback=bool(arrays["anchor_fallback"]),
         notes=tuple(arrays["notes"].tolist()),
+        peak_bytes=_known(arrays["peak_bytes"]),
     )
-    return Saved(outcome, None if peak < 0 else peak)
+
+
+def _optional(number: int | None) -> np.ndarray:
+    """A number that is not negative, or its absence."""
+    return np.array(-1 if number is None else number, dtype=np.int64)
+
+
+def _known(number: np.ndarray) -> int | None:
+    return None if number < 0 else int(number)
 
 
 def _arrays_of(gaussians: Gaussians) -> Arrays:
     return {name: getattr(gaussians, name).detach().cpu().numpy() for name in _FIELDS}
 
 
-def _gaussians_of(arrays: Mapping[str, np.ndarray], device: torch.device) -> Gaussians:
+def _gaussians_of(arrays: Mapping[str, np.ndarray], device: torch.device | str) -> Gaussians:
     """Copies, which lie in memory as torch's own tensors do: how a sum is rounded depends on it."""
     return Gaussians(*(torch.from_numpy(arrays[name]).clone().to(device) for name in _FIELDS))
 
@@ -181,26 +259,28 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
     Raises:
         OutputError: where it cannot be written.
     """
-    _make_folder(path.parent)
-    try:
-        with replacing(path) as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-    except InputError as error:
-        raise OutputError(str(error)) from error
+    with _writing(path), replacing(path) as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def write_json(path: Path, content: Any) -> None:
-    """All at once, so that a file that is there is complete.
+def write_json(path: Path, content: Any, first_stays: bool = False) -> None:
+    """All at once, so that a file that is there is complete. Arguments as those of `replacing`.
 
     Raises:
         OutputError: where it cannot be written.
     """
-    _make_folder(path.parent)
-    try:
-        with replacing(path) as file:
-            file.write((json.dumps(content, indent=1) + "\n").encode())
-    except InputError as error:
-        raise OutputError(str(error)) from error
+    with _writing(path), replacing(path, first_stays) as file:
+        file.write((json.dumps(content, indent=1) + "\n").encode())
+
+
+def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
+    """A picture among the results.
+
+    Raises:
+        OutputError: where it cannot be written.
+    """
+    with _writing(path):
+        write_image(path, image)
 
 
 def read_json(path: Path, advice: str = "delete it and run again") -> Any:
@@ -212,10 +292,15 @@ def read_json(path: Path, advice: str = "delete it and run again") -> Any:
     return json_file.read_json(path, advice)
 
 
-def _make_folder(folder: Path) -> None:
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Make the folder of `path`; what then cannot be written ends the run."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except InputError as error:
+        raise OutputError(str(error)) from error
     except OSError as error:
         raise OutputError(
-            f"Cannot make the folder {folder}: {error.strerror}; choose another place."
+            f"Cannot write {path}: {error.strerror}; choose another place."
         ) from error

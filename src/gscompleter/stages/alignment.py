@@ -11,13 +11,22 @@ from torch import Tensor
 from gscompleter.config import AffineConfig
 from gscompleter.types import DepthAffine, DepthMap, Lift, Render
 
+MAX_TRIALS = 512
+"""Two-point hypotheses, all scored at once."""
+MAX_PIXELS = 8192
+"""Pixels the hypotheses are scored on, drawn at random where there are more."""
+RESIDUAL_THRESHOLD = 0.05
+"""Largest residual of an inlier, relative to the context depth."""
+MIN_INLIERS = 0.3
+"""Smallest share of inliers that makes a fit trustworthy."""
+MIN_PIXELS = 64
+"""Fewest comparable pixels; under it there is nothing to fit."""
+MIN_DEPTH_SPREAD = 0.05
+"""Smallest spread of the predicted depths ((p95 - p5) / median) that tells scale and shift apart;
+under it only a scale is fitted."""
 
-def fit_affine(
-    predicted: DepthMap,
-    context: DepthMap,
-    rng: torch.Generator,
-    config: AffineConfig = AffineConfig(),
-) -> DepthAffine:
+
+def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> DepthAffine:
     """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 8).
 
     Where RANSAC cannot be trusted (few pixels, hardly any range of depth, few inliers) the median
@@ -26,20 +35,20 @@ def fit_affine(
     """
     comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
     x, y = predicted.depth[comparable].double(), context.depth[comparable].double()
-    if len(x) < config.min_pixels:
+    if len(x) < MIN_PIXELS:
         return DepthAffine()
-    if len(x) > config.max_pixels:
-        drawn = torch.randperm(len(x), generator=rng)[: config.max_pixels].to(x.device)
+    if len(x) > MAX_PIXELS:
+        drawn = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
         x, y = x[drawn], y[drawn]
 
-    if depth_spread(x) >= config.min_depth_spread:
-        scale, shift = ransac_line(x, y, rng, config)
-        inliers = affine_inliers(x, y, scale, shift, config).double().mean().item()
-        if scale > 0 and inliers >= config.min_inliers:
+    if depth_spread(x) >= MIN_DEPTH_SPREAD:
+        scale, shift = ransac_line(x, y, rng)
+        inliers = affine_inliers(x, y, scale, shift).double().mean().item()
+        if scale > 0 and inliers >= MIN_INLIERS:
             return DepthAffine(scale, shift, inliers, "ransac")
 
     scale = (y / x).median().item()
-    inliers = affine_inliers(x, y, scale, 0.0, config).double().mean().item()
+    inliers = affine_inliers(x, y, scale, 0.0).double().mean().item()
     return DepthAffine(scale, 0.0, inliers, "median")
 
 
@@ -50,39 +59,38 @@ def depth_spread(depth: Float[Tensor, "n"]) -> float:
 
 
 def affine_inliers(
-    x: Float[Tensor, "n"], y: Float[Tensor, "n"], scale: float, shift: float, config: AffineConfig
+    x: Float[Tensor, "n"], y: Float[Tensor, "n"], scale: float, shift: float
 ) -> Bool[Tensor, "n"]:
-    return (scale * x + shift - y).abs() < config.residual_threshold * y
+    return (scale * x + shift - y).abs() < RESIDUAL_THRESHOLD * y
 
 
 def ransac_line(
-    x: Float[Tensor, "n"],
-    y: Float[Tensor, "n"],
-    rng: torch.Generator,
-    config: AffineConfig,
+    x: Float[Tensor, "n"], y: Float[Tensor, "n"], rng: torch.Generator
 ) -> tuple[float, float]:
     """Scale and shift with the most inliers among two-point hypotheses, refitted on its inliers.
 
     Residuals count relative to depth, so that the far end of the scene does not outvote the near
     one, and the refit weighs them alike. (0, 0) where no hypothesis has a positive scale.
     """
-    i, j = torch.randint(len(x), (2, config.max_trials), generator=rng).to(x.device)
+    i, j = torch.randint(len(x), (2, MAX_TRIALS), generator=rng).to(x.device)
     scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
     shifts = y[i] - scales * x[i]
     residuals = (scales[:, None] * x + shifts[:, None] - y).abs()
-    counts = (residuals < config.residual_threshold * y).sum(dim=1)
+    counts = (residuals < RESIDUAL_THRESHOLD * y).sum(dim=1)
     best = counts.where(scales > 0, -1).argmax()
     if scales[best] <= 0:
         return 0.0, 0.0
 
     scale, shift = scales[best].item(), shifts[best].item()
     for _ in range(3):
-        agree = affine_inliers(x, y, scale, shift, config)
+        agree = affine_inliers(x, y, scale, shift)
         weight = 1 / y[agree]
         design = torch.stack([x[agree], torch.ones_like(x[agree])], dim=-1) * weight[:, None]
         # The normal equations have a closed form on any device, which lstsq has not.
         normal = design.T @ design
-        if torch.linalg.cond(normal) > 1e12:
+        # Its second column is in inverse depths: measured by their own size, no unit matters.
+        even = torch.stack([torch.ones_like(x[0]), y.median()])
+        if torch.linalg.cond(normal * even * even[:, None]) > 1e12:
             break
         scale, shift = torch.linalg.solve(normal, design.T @ (y[agree] * weight)).tolist()
     return scale, shift
@@ -103,8 +111,8 @@ def fit_bridge(
     if config.bridge == "none":
         return DepthAffine()
     if config.bridge == "target":
-        return fit_affine(lift.reference_depth, at_target.depth_map(), rng, config)
-    affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng, config)
+        return fit_affine(lift.reference_depth, at_target.depth_map(), rng)
+    affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng)
     return unless_contradicted(affine, lift.reference_depth, at_target.depth_map(), rng, config)
 
 
@@ -121,13 +129,13 @@ def unless_contradicted(
     its two views need not be of one scale, and what fits the anchor is wrong at the target.
     """
     comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
-    if config.min_agreement is None or comparable.sum() < config.min_pixels:
+    if config.min_agreement is None or comparable.sum() < MIN_PIXELS:
         return affine
     x, y = predicted.depth[comparable].double(), context.depth[comparable].double()
-    agree = affine_inliers(x, y, affine.scale, affine.shift, config).double().mean().item()
+    agree = affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
     if agree >= config.min_agreement:
         return affine
-    own = fit_affine(predicted, context, rng, config)
+    own = fit_affine(predicted, context, rng)
     # Where neither fits well, the paper's choice stands.
-    trusted = own.inliers >= max(config.min_inliers, 2 * agree)
+    trusted = own.inliers >= max(MIN_INLIERS, 2 * agree)
     return replace(own, contradicted=True) if trusted else affine

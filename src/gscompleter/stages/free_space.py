@@ -19,6 +19,14 @@ from gscompleter.geometry import project
 from gscompleter.stages.registration import slide
 from gscompleter.types import Camera, Gaussians, Render
 
+STEP = 0.04
+"""By how much a candidate slides each time, relative to its distance."""
+CLEARANCE = 0.01
+"""How far behind the scene's surface, relative to depth, a camera that sees this surface must find
+the candidate. What lies a little behind is hidden there, and still closes the hole."""
+BORDER = 3
+"""Pixels beyond the border of an image at which a Gaussian still shows within it."""
+
 
 def respect_free_space(
     gaussians: Gaussians,
@@ -36,7 +44,7 @@ def respect_free_space(
         cameras: The context cameras.
         renders: The scene as these see it.
         footprint: Whether sizes follow the distance, as in the registration.
-        config: Steps and tolerance.
+        config: How often they may slide.
 
     Returns:
         The Gaussians, and which of them found a place [n].
@@ -46,10 +54,10 @@ def respect_free_space(
     waiting = torch.arange(len(gaussians), device=ratio.device)
     for step in range(config.num_steps):
         means = target.center + ratio[waiting, None] * offsets[waiting]
-        waiting = waiting[seen_through(means, cameras, renders, config)]
+        waiting = waiting[seen_through(means, cameras, renders)]
         if len(waiting) == 0:
             break
-        ratio[waiting] = (1 + config.step) ** (step + 1)
+        ratio[waiting] = (1 + STEP) ** (step + 1)
     placed = torch.ones_like(ratio, dtype=torch.bool)
     placed[waiting] = config.num_steps == 0
     return slide(gaussians, target, ratio, footprint), placed
@@ -59,18 +67,16 @@ def seen_through(
     points: Float[Tensor, "n 3"],
     cameras: Sequence[Camera],
     renders: Sequence[Render],
-    config: FreeSpaceConfig,
 ) -> Bool[Tensor, "n"]:
     """Which points stand before what some camera sees of the scene."""
     contradicted = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for camera, render in zip(cameras, renders, strict=True):
         pixels, z = project(points, camera)
         size = torch.tensor([camera.width, camera.height], device=pixels.device)
-        reach = config.border
-        shows = (z > 0) & (pixels > -reach).all(-1) & (pixels < size + reach).all(-1)
+        shows = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
         nearest = torch.where(shows[:, None], pixels, 0.0).long().clamp_min(0)
         x, y = torch.minimum(nearest, size - 1).unbind(-1)
         scene = render.depth_map()
-        before = z < (1 + config.clearance) * scene.depth[y, x]
+        before = z < (1 + CLEARANCE) * scene.depth[y, x]
         contradicted |= shows & scene.valid[y, x] & before
     return contradicted

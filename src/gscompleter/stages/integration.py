@@ -16,6 +16,10 @@ from gscompleter.progress import track
 from gscompleter.render import FrozenView, OpacityRender
 from gscompleter.types import Camera, Gaussians, Lift, Render, View
 
+MAX_TRIALS = 16
+"""How often harmful Gaussians lose half of their opacity before a view that still does not hold
+loses all it sees of them."""
+
 
 def hole_mask(render: Render, config: HoleConfig = HoleConfig()) -> Bool[Tensor, "h w"]:
     """Where the scene has a hole, before dilation (paper, Eq. 12)."""
@@ -99,7 +103,7 @@ def do_no_harm(
 
     In a view that got worse, a Gaussian is harmful where less opacity would bring the view nearer
     to its photograph. The most harmful ones are halved, no more of them than it takes; a view
-    that still does not hold after `max_trials` loses every generated Gaussian that it sees, which
+    that still does not hold after `MAX_TRIALS` loses every generated Gaussian that it sees, which
     restores it.
 
     Args:
@@ -116,17 +120,17 @@ def do_no_harm(
         for frozen, view, allowed in zip(frozen_views, views, allowed_errors, strict=True)
     ]
     opacities = added.opacities
-    for trial in range(config.max_trials + 1):
+    for trial in range(MAX_TRIALS + 1):
         lowered = torch.zeros_like(opacities, dtype=torch.bool)
         for plan, photograph, allowed in checks:
             error, slope = error_slope(plan, photograph, opacities)
-            if error > allowed and trial == config.max_trials:
+            if error > allowed and trial == MAX_TRIALS:
                 lowered |= slope != 0
             elif error > allowed:
                 lowered |= most_harmful(slope * opacities / 2, error - allowed)
         if not lowered.any():
             break
-        factor = 0.5 if trial < config.max_trials else 0.0
+        factor = 0.5 if trial < MAX_TRIALS else 0.0
         opacities = torch.where(lowered, factor * opacities, opacities)
     return replace(added, opacities=opacities, encoded=None)
 

@@ -18,6 +18,12 @@ from gscompleter.render import FrozenView, Renderer
 from gscompleter.stages.alignment import fit_bridge
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
 
+OCCLUSION_TOLERANCE = 0.05
+"""How far behind the context, relative to depth, still counts as the same surface."""
+CARRY_TOLERANCE = 0.02
+"""Largest error of depth, relative to the scene's, of an observed pixel that is taken for an
+example by the holes."""
+
 
 @dataclass(frozen=True)
 class Registration:
@@ -84,7 +90,7 @@ def carry_into_holes(
     before = (coarse.means - camera.center) @ camera.forward
     after = (registered.means - camera.center) @ camera.forward
     error = (after / scene.depth.flatten()[pixel_index].clamp_min(1e-12) - 1).abs()
-    agrees = scene.valid.flatten()[pixel_index] & (error < config.carry_tolerance)
+    agrees = scene.valid.flatten()[pixel_index] & (error < CARRY_TOLERANCE)
 
     correction = torch.zeros_like(scene.depth).flatten()
     correction[pixel_index] = (after / before).log()
@@ -233,7 +239,5 @@ class Objective:
         seen = self.anchor_depth.valid & alone.depth_map().valid
         if not self.config.mask_occluded:
             return seen
-        behind = alone.depth.detach() > self.anchor_depth.depth * (
-            1 + self.config.occlusion_tolerance
-        )
+        behind = alone.depth.detach() > self.anchor_depth.depth * (1 + OCCLUSION_TOLERANCE)
         return seen & ~behind

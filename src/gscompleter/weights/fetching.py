@@ -61,7 +61,7 @@ def place_of(weights: PublishedWeights) -> Path:
 def cached(weights: PublishedWeights) -> Path | None:
     """The file in our cache or in that of the hub, or None; nothing is downloaded."""
     place = place_of(weights)
-    if place.is_file():
+    if os.path.isfile(place):
         return place
     if weights.repository is None or not hub_is_installed():
         return None
@@ -77,8 +77,8 @@ def hub_is_installed() -> bool:
 
 
 def _given(weights: PublishedWeights, local: Path) -> Path:
-    path = local / weights.file if local.is_dir() else local
-    if not path.is_file():
+    path = local / weights.file if os.path.isdir(local) else local
+    if not os.path.isfile(path):
         raise InputError(
             f"There are no weights at {path}; name the file {weights.file} or a folder that holds "
             f"it, which {weights.source} gives out."

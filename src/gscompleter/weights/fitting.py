@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import torch
 from torch import Tensor, nn
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 
 Shapes = Mapping[str, tuple[int, ...]]
 """The shape of each tensor of a network, by its name."""
@@ -29,7 +30,8 @@ def load_strictly(
             tensors do not fit, to say which network they belong to.
 
     Raises:
-        InputError: where a tensor is missing, is one too many, or has another shape.
+        InputError: where a tensor is missing, is one too many, has another shape, or holds NaN or
+            infinity.
     """
     needed, given = shapes_of(model.state_dict()), shapes_of(state_dict)
     if needed != given:
@@ -40,7 +42,18 @@ def load_strictly(
             f"{where} does not fit the network {type(model).__name__}: "
             f"{differences(needed, given)}; {advice}."
         )
+    check_finite(state_dict, where)
     model.load_state_dict(state_dict, strict=True)
+
+
+def check_finite(state_dict: Mapping[str, Tensor], where: Path | str) -> None:
+    """Raise an InputError where a tensor holds NaN or infinity, with which nothing is computed."""
+    bad = [name for name, tensor in state_dict.items() if not torch.isfinite(tensor).all()]
+    if bad:
+        raise InputError(
+            f"{where} holds NaN or infinity in {len(bad)} of {len(state_dict)} tensors (such as "
+            f"{quoted(bad[0])}); fetch or train it again."
+        )
 
 
 def shapes_of(state_dict: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
@@ -55,11 +68,15 @@ def differences(needed: Shapes, given: Shapes) -> str:
     other = [name for name in needed if name in given and needed[name] != given[name]]
     parts = []
     if missing:
-        parts.append(f"it lacks {len(missing)} of {len(needed)} tensors (such as {missing[0]})")
+        parts.append(
+            f"it lacks {len(missing)} of {len(needed)} tensors (such as {quoted(missing[0])})"
+        )
     if extra:
-        parts.append(f"it has {len(extra)} that the network does not know (such as {extra[0]})")
+        parts.append(
+            f"it has {len(extra)} that the network does not know (such as {quoted(extra[0])})"
+        )
     if other:
         name = other[0]
-        shapes = f"{list(given[name])} instead of {list(needed[name])}"
-        parts.append(f"it has {len(other)} of another shape (such as {name}, {shapes})")
+        shapes = f"{quoted(list(given[name]))} instead of {list(needed[name])}"
+        parts.append(f"it has {len(other)} of another shape (such as {quoted(name)}, {shapes})")
     return ", ".join(parts)

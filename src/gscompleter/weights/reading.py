@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import pickle
 import re
 import zipfile
@@ -13,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
 NOT_THE_ENCODERS = ("decoder.", "losses.")
@@ -47,7 +48,7 @@ def check_kind(path: Path, name: str) -> None:
     Raises:
         InputError: where it is missing, empty, a pointer, a web page, or cut off.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"There is no file {path}; {name} is needed there.")
     try:
         with path.open("rb") as file:
@@ -63,7 +64,7 @@ def check_kind(path: Path, name: str) -> None:
         wrong = "is a pointer of git-lfs and not the file itself"
     elif head.lstrip().lower().startswith((b"<!doctype", b"<html")):
         wrong = "is a web page that was saved under this name"
-    elif head.startswith(b"PK\x03\x04") and not zipfile.is_zipfile(path):
+    elif head.startswith(b"PK\x03\x04") and not is_archive(path):
         wrong = "ends too early, as after an interrupted download"
     if wrong:
         raise InputError(f"{path} {wrong}; {_replace_it(path, name)}.")
@@ -99,21 +100,29 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
+def is_archive(path: Path) -> bool:
+    """Whether it is a whole zip archive, as which torch saves."""
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:
+        return False
+
+
 def check_archive(path: Path, name: str) -> None:
     """Compare the parts of a zip archive, as which torch saves, with their checksums.
 
     Raises:
         InputError: where one differs.
     """
-    if not zipfile.is_zipfile(path):
+    if not is_archive(path):
         return
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
-    except (zipfile.BadZipFile, EOFError) as error:
+    except Exception as error:  # an archive can be damaged in any way
         damaged = str(error)
     if damaged is not None:
-        raise InputError(f"{path} is damaged ({damaged}); {_replace_it(path, name)}.")
+        raise InputError(f"{path} is damaged ({quoted(damaged)}); {_replace_it(path, name)}.")
 
 
 def read_tensors(path: Path, name: str) -> Any:
@@ -124,7 +133,7 @@ def read_tensors(path: Path, name: str) -> Any:
     """
     try:
         # Older files of torch are no zip archives and cannot be mapped.
-        mapped = zipfile.is_zipfile(path)
+        mapped = is_archive(path)
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as error:
         found = re.search(r"GLOBAL (\S+)", str(error))
@@ -133,8 +142,8 @@ def read_tensors(path: Path, name: str) -> Any:
                 f"{path} holds no plain weights; {_replace_it(path, name)}."
             ) from error
         raise InputError(
-            f"{path} holds no plain weights but Python objects too ({found[1]}), and to load those "
-            f"may run any code; {_replace_it(path, name)}."
+            f"{path} holds no plain weights but Python objects too ({quoted(found[1])}), and to "
+            f"load those may run any code; {_replace_it(path, name)}."
         ) from error
     except Exception as error:  # a damaged pickle can fail in any way
         raise InputError(f"{path} cannot be read by torch; {_replace_it(path, name)}.") from error
@@ -147,16 +156,17 @@ def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
         InputError: where it is damaged, or the package safetensors is not there.
     """
     try:
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
+        import safetensors.torch
     except ImportError as error:
         raise InputError(
             f"To read {path}, safetensors is needed: pip install safetensors; or give {name}."
         ) from error
     try:
-        return load_file(path)
-    except SafetensorError as error:
-        raise InputError(f"{path} is no safetensors file ({error}); give {name}.") from error
+        return safetensors.torch.load_file(path)
+    except Exception as error:  # a damaged file can fail in any way
+        raise InputError(
+            f"{path} is no safetensors file ({quoted(str(error))}); give {name}."
+        ) from error
 
 
 def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
@@ -186,7 +196,19 @@ def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> d
             f"{path} holds more than the network {weights.name}: {_some(unknown)}; give "
             f"{weights.file}."
         )
+    odd = [key for key, value in found.items() if not is_plain(value)]
+    if odd:
+        raise InputError(
+            f"{path} holds tensors without plain numbers ({_some(odd)}): empty shells, sparse or "
+            f"quantized ones; give {weights.file}."
+        )
     return found
+
+
+def is_plain(tensor: Tensor) -> bool:
+    """Whether it is an array of real numbers that are there."""
+    strided = tensor.layout == torch.strided and not tensor.is_nested
+    return strided and not (tensor.is_meta or tensor.is_quantized or tensor.is_complex())
 
 
 def _replace_it(path: Path, name: str) -> str:
@@ -195,5 +217,5 @@ def _replace_it(path: Path, name: str) -> str:
 
 
 def _some(keys: list[str]) -> str:
-    shown = ", ".join(keys[:3]) or "nothing"
+    shown = ", ".join(quoted(key) for key in keys[:3]) or "nothing"
     return f"{shown} and {len(keys) - 3} more" if len(keys) > 3 else shown

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from gscompleter.data.colmap.lenses import intrinsics_of, model_called
 from gscompleter.data.colmap.records import PosedImage, portable
 from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 
 MAX_NAME = 1024
 """Of bytes in the name of an image."""
@@ -71,7 +71,7 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 def _camera(records: _Records) -> tuple[int, Intrinsics]:
     number, model_number, width, height = records.numbers(_CAMERA)
-    title = f"camera {number} of {records.path}"
+    title = f"camera {number} of {quoted(records.path)}"
     model = model_called(model_number, title)
     numbers = records.numbers(Struct(f"<{len(model.parameters)}d"))
     return number, intrinsics_of(model, (width, height), numbers, title)
@@ -89,11 +89,13 @@ def _opened(path: Path) -> Iterator[_Records]:
     try:
         with path.open("rb") as file:
             if os.fstat(file.fileno()).st_size == 0:
-                raise InputError(f"{path} is empty; export the model again.")
+                raise InputError(f"{quoted(path)} is empty; export the model again.")
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
                 yield _Records(content, path)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; correct the path.") from error
+        raise InputError(
+            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+        ) from error
 
 
 class _Records:
@@ -134,6 +136,6 @@ class _Records:
 
     def _damaged(self) -> InputError:
         return InputError(
-            f"{self.path} is truncated or no such file of COLMAP: it claims more than its "
+            f"{quoted(self.path)} is truncated or no such file of COLMAP: it claims more than its "
             f"{len(self.content):,} bytes hold; export the model again."
         )

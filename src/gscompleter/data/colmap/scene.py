@@ -63,7 +63,7 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     models = _models(path)
     if not models:
         raise InputError(
-            f"There is no COLMAP model in {quoted(str(path))}; a folder sparse/0 with its cameras "
+            f"There is no COLMAP model in {quoted(path)}; a folder sparse/0 with its cameras "
             "and images, as .bin or .txt, is needed."
         )
     frames = [_frames_of(model) for model in models]
@@ -81,7 +81,7 @@ def read_image_file(path: Path) -> list[Frame]:
     cameras = _file(path.parent, "cameras")
     if cameras is None:
         raise InputError(
-            f"There is no cameras.txt or cameras.bin beside {quoted(str(path))}, and it holds "
+            f"There is no cameras.txt or cameras.bin beside {quoted(path)}, and it holds "
             "poses only; copy it there from the same model."
         )
     return _frames(cameras, path)
@@ -129,12 +129,12 @@ def _frames(cameras_file: Path, images_file: Path) -> list[Frame]:
     cameras = _READERS[cameras_file.suffix.lower()].read_cameras(cameras_file)
     images = _READERS[images_file.suffix.lower()].read_images(images_file)
     if not images:
-        raise InputError(f"{images_file} lists no images; export the model again.")
+        raise InputError(f"{quoted(images_file)} lists no images; export the model again.")
     return [_frame(image, cameras, images_file) for image in images]
 
 
 def _frame(image: PosedImage, cameras: dict[int, Intrinsics], path: Path) -> Frame:
-    title = f"image {quoted(image.name)} of {path}"
+    title = f"image {quoted(image.name)} of {quoted(path)}"
     if image.camera not in cameras:
         raise InputError(
             f"The {title} was taken by camera {image.camera}, which is not in the cameras file "

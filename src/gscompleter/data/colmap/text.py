@@ -94,9 +94,11 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
         with path.open(encoding="utf-8-sig", errors="surrogateescape") as file:
             for number, line in enumerate(file, start=1):
                 if line.strip() and not line.lstrip().startswith("#"):
-                    yield line, f"line {number} of {path}"
+                    yield line, f"line {number} of {quoted(path)}"
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; correct the path.") from error
+        raise InputError(
+            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+        ) from error
 
 
 def _damaged(place: str, line: str, form: str) -> InputError:

@@ -15,9 +15,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.config.generators import DiffusersInpaintSettings
 from gscompleter.errors import InputError
-from gscompleter.generators import DiffusionSettings, Synthesis
-from gscompleter.generators.agreement import AgreementConfig, checked
+from gscompleter.generators import Synthesis
+from gscompleter.generators.agreement import checked
 from gscompleter.generators.diffusion.complete import check_parts, language_models
 from gscompleter.generators.diffusion.kontext import resized
 from gscompleter.generators.diffusion.placing import place, precision_on
@@ -37,9 +38,11 @@ from gscompleter.generators.warp import (
 from gscompleter.masks import dilate
 from gscompleter.types import Camera, SceneContext, View
 
-PROMPT = "a photograph"
 SIDE = 512
 """Side of the square whose area is painted where a pipeline's configuration names none."""
+MARGIN = 4
+"""Pixels around a hole that the pipeline may paint anew, so that it meets no hard border. In the
+image that is returned they are as they were warped."""
 
 
 @dataclass(frozen=True)
@@ -96,26 +99,23 @@ class DiffusersInpaint:
     """What paints."""
     seed: int = 0
     """Of its noise; the same seed gives the same image on the same device."""
-    prompt: str = PROMPT
+    prompt: str = DiffusersInpaintSettings.prompt
     """What it is told, whatever the image."""
     steps: int | None = None
     """Denoising steps; the pipeline's own number if None."""
-    margin: int = 4
-    """Pixels around a hole that the pipeline may paint anew, so that it meets no hard border. In
-    the image that is returned they are as they were warped."""
-    agreement: AgreementConfig = AgreementConfig()
-    """How the painted image is compared with what was warped, before that is put back."""
+    retries: int = 0
+    """How many further seeds are tried where the painting disagrees with what was warped."""
 
     def __call__(self, nearest: View, target: Camera, context: SceneContext) -> Synthesis:
         """The image `target` would take; outside of the hole it is the warped one."""
         observed = completed_warp(nearest, target, context)
-        hole = dilate(~observed.known, self.margin)
+        hole = dilate(~observed.known, MARGIN)
 
         def paint(seed: int) -> Float[Tensor, "h w 3"]:
             return self.painter.paint(observed.image, hole, self.prompt, seed, self.steps)
 
         compared = replace(observed, known=~hole)
-        painted = checked(paint, self.seed, compared, self.agreement)
+        painted = checked(paint, self.seed, compared, self.retries)
         known = observed.known[..., None]
         return replace(painted, image=torch.where(known, observed.image, painted.image))
 
@@ -136,7 +136,9 @@ def completed_warp(nearest: View, target: Camera, context: SceneContext) -> Warp
 
 
 def load_diffusers_inpaint(
-    seed: int = 0, device: str = "cpu", settings: DiffusionSettings = DiffusionSettings()
+    seed: int = 0,
+    device: str = "cpu",
+    settings: DiffusersInpaintSettings = DiffusersInpaintSettings(),
 ) -> DiffusersInpaint:
     """An inpainting pipeline as the settings want it.
 
@@ -146,9 +148,9 @@ def load_diffusers_inpaint(
     return DiffusersInpaint(
         load_painter(settings.path, device, settings.offload),
         seed,
-        PROMPT if settings.prompt is None else settings.prompt,
+        settings.prompt,
         settings.steps,
-        agreement=AgreementConfig(retries=settings.retries),
+        settings.retries,
     )
 
 
@@ -167,8 +169,9 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
     needs_diffusers("diffusers-inpaint")
     if path is None:
         raise InputError(
-            "The generator 'diffusers-inpaint' needs a model; name one with --generator-path, a "
-            "folder that diffusers saved or USER/NAME on the Hugging Face hub."
+            "The generator 'diffusers-inpaint' needs the path of a model; give a folder that "
+            "diffusers saved or USER/NAME on the Hugging Face hub.",
+            "generator_path",
         )
     source = source_of(path)
     announce([source])

@@ -13,9 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.config.generators import PEFieldSettings
 from gscompleter.errors import InputError
-from gscompleter.generators import DiffusionSettings, Request, Synthesis
-from gscompleter.generators.agreement import AgreementConfig, checked
+from gscompleter.generators import Request, Synthesis
+from gscompleter.generators.agreement import checked
 from gscompleter.generators.diffusion.kontext import Kontext, resized
 from gscompleter.generators.diffusion.loading import load_kontext
 from gscompleter.generators.diffusion.position_ids import seen_from, source_ids, target_ids
@@ -29,11 +30,8 @@ from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import same_camera
 from gscompleter.types import Camera, Render, SceneContext, View
 
-STEPS = 4
-"""Evaluations of the transformer in the paper. The authors' own demonstration takes 28."""
-
-AT_ONCE = 4
-"""Images that are denoised together."""
+GUIDANCE = 3.5
+"""Scale of the distilled guidance."""
 
 
 @dataclass(frozen=True)
@@ -56,17 +54,15 @@ class PEField:
     """FLUX Kontext with per-head positions."""
     seed: int = 0
     """Of the noise; the same seed gives the same image on the same device."""
-    steps: int = STEPS
+    steps: int = PEFieldSettings.steps
     """Evaluations of the transformer."""
-    guidance: float = 3.5
-    """Scale of the distilled guidance."""
     depth: SourceDepth = context_depth
     """Depth of the photograph: of the scene itself, or `MonocularDepth`."""
     ids_dtype: torch.dtype = torch.bfloat16
     """What positions of the target are rounded to: bfloat16 as in the authors' run."""
-    agreement: AgreementConfig = AgreementConfig()
-    """How the image is compared with what the photographs show."""
-    at_once: int = AT_ONCE
+    retries: int = 0
+    """How many further seeds are tried where an image disagrees with the photographs."""
+    at_once: int = PEFieldSettings.at_once
     """Most images that are denoised together."""
 
     takes_margin: bool = True
@@ -94,7 +90,7 @@ class PEField:
                 return back.to(nearest.image.device)
 
             observed = warp_photographs(nearest, target, requests[i].context)
-            return checked(paint, self.seed, observed, self.agreement)
+            return checked(paint, self.seed, observed, self.retries)
 
         return [answer(i) for i in range(len(requests))]
 
@@ -121,7 +117,7 @@ class PEField:
             torch.stack([one.source_positions for one in conditions]),
             seed,
             self.steps,
-            self.guidance,
+            GUIDANCE,
         )
 
 
@@ -166,19 +162,18 @@ def render_at(view: View, context: SceneContext) -> Render:
 
 
 def load_pe_field(
-    seed: int = 0, device: str = "cpu", settings: DiffusionSettings = DiffusionSettings()
+    seed: int = 0, device: str = "cpu", settings: PEFieldSettings = PEFieldSettings()
 ) -> PEField:
     """PE-Field as the settings want it.
 
     Raises:
         InputError: where packages or weights are missing.
     """
-    depth = source_depth_named("context" if settings.depth is None else settings.depth, device)
     return PEField(
         load_kontext(settings.path, device, settings.offload),
         seed,
-        STEPS if settings.steps is None else settings.steps,
-        depth=depth,
-        agreement=AgreementConfig(retries=settings.retries),
-        at_once=AT_ONCE if settings.at_once is None else settings.at_once,
+        settings.steps,
+        source_depth_named(settings.depth, device),
+        retries=settings.retries,
+        at_once=settings.at_once,
     )

@@ -157,10 +157,10 @@ def needs_diffusers(name: str) -> None:
 
 
 @contextmanager
-def reading(source: Source, option: str = "--generator-path") -> Iterator[None]:
+def reading(source: Source, setting: str = "path") -> Iterator[None]:
     """While the files of `source` are read: nothing is said, and what fails becomes a sentence.
 
-    `option` is what on the command line names a folder in its place.
+    `setting` of the generator names a folder in its place.
 
     Raises:
         InputError: where the files cannot be had, or are not what they should be.
@@ -171,7 +171,7 @@ def reading(source: Source, option: str = "--generator-path") -> Iterator[None]:
     except InputError:
         raise
     except (OSError, ValueError, KeyError, ImportError, AttributeError, RuntimeError) as error:
-        raise cannot_load(source, error, option) from error
+        raise cannot_load(source, error, setting) from error
 
 
 @contextmanager
@@ -199,19 +199,20 @@ def silent(local: bool) -> Iterator[None]:
             log.enable_progress_bar()
 
 
-def cannot_load(source: Source, error: Exception, option: str) -> InputError:
+def cannot_load(source: Source, error: Exception, setting: str) -> InputError:
     """The sentence for a folder or repository that did not load."""
     reason = " ".join(str(error).split())[:400]
     page = f"https://huggingface.co/{source.place}"
     if source.is_local:
         way_out = "see that it is complete, as `save_pretrained` writes it"
     elif isinstance(error, IncompleteWeightsError):
-        way_out = f"see {page} for how it is loaded, or give a complete folder by {option}"
+        way_out = f"see {page} for how it is loaded, or give a complete folder as its {setting}"
     else:
         way_out = (
-            f"see that you accepted its terms at {page} and are logged in, or give a folder by "
-            f"{option}"
+            f"see that you accepted its terms at {page} and are logged in, or give a folder "
+            f"as its {setting}"
         )
     return InputError(
-        f"Could not load {source.place} ({type(error).__name__}: {reason.rstrip('.')}); {way_out}."
+        f"Could not load {source.place} ({type(error).__name__}: {reason.rstrip('.')}); {way_out}.",
+        f"generator_{setting}",
     )

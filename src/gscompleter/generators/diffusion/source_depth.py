@@ -152,7 +152,7 @@ def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth
     needs_diffusers("pe-field")
     source = source_of(path, "transformers")
     announce([source])
-    with reading(source, "--generator-depth"):
+    with reading(source, "depth"):
         from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
         network = loaded(AutoModelForDepthEstimation, source, "network", unused=NEVER_USED)

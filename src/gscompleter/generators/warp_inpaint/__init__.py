@@ -18,15 +18,23 @@ from torch import Tensor
 
 from gscompleter.generators.smooth import distance_to_known
 from gscompleter.generators.warp import (
-    WarpConfig,
     Warped,
     background_first,
     warp_photographs,
     with_unexplained,
 )
-from gscompleter.generators.warp_inpaint.exemplar import ExemplarConfig, Sources, fill_by_patches
+from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patches
 from gscompleter.interpolation import smoothed
 from gscompleter.types import Camera, SceneContext, View
+
+STRUCTURE_REACH = 0.1
+"""How far into a hole structure is continued, relative to the longer side of the image; it fades
+out on the way. Nothing tells what lies deeper, and a wrong guess is worse than none."""
+TONE_RADIUS = 6
+"""Pixels over which a hole keeps the mean colour of its smooth continuation. Patches alone look as
+plausible but drift in tone."""
+CRACK_WIDTH = 4
+"""Gaps of at most this many pixels are closed smoothly: patches have nothing to add there."""
 
 
 @dataclass(frozen=True)
@@ -35,31 +43,19 @@ class WarpInpaint:
 
     seed: int = 0
     """Of the random search for patches; the same seed gives the same bytes."""
-    warp: WarpConfig = WarpConfig()
-    """How photographs are carried into the target."""
-    exemplar: ExemplarConfig = ExemplarConfig()
-    """How patches are found."""
-    structure_reach: float = 0.1
-    """How far into a hole structure is continued, relative to the longer side of the image; it
-    fades out on the way. Nothing tells what lies deeper, and a wrong guess is worse than none."""
-    tone_radius: int = 6
-    """Pixels over which a hole keeps the mean colour of its smooth continuation. Patches alone
-    look as plausible but drift in tone."""
-    crack_width: int = 4
-    """Gaps of at most this many pixels are closed smoothly: patches have nothing to add there."""
 
     def __call__(
         self, nearest: View, target: Camera, context: SceneContext
     ) -> Float[Tensor, "h w 3"]:
         """The image `target` would take, completely filled, in [0, 1]."""
         device = nearest.image.device
-        warped = warp_photographs(nearest, target, context, self.warp)
+        warped = warp_photographs(nearest, target, context)
         if not warped.known.any():
             # Nothing of the scene is in sight: there is no border to continue.
             return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
         _, log_depth = background_first(warped)
         guess = log_depth.exp().to(device)
-        warped = with_unexplained(warped, guess, target, context, self.warp).to("cpu")
+        warped = with_unexplained(warped, guess, target, context).to("cpu")
         tone, log_depth = background_first(warped)
         image = self.with_structure(tone, log_depth, warped, context)
         return image.clamp(0, 1).to(device)
@@ -72,15 +68,15 @@ class WarpInpaint:
         context: SceneContext,
     ) -> Float[Tensor, "h w 3"]:
         """The smoothly completed image `tone`, with structure along the borders of its holes."""
-        reach = self.structure_reach * max(warped.known.shape)
+        reach = STRUCTURE_REACH * max(warped.known.shape)
         away = distance_to_known(warped.known)
-        undecided = without_cracks(~warped.known, self.crack_width) & (away <= reach)
+        undecided = without_cracks(~warped.known, CRACK_WIDTH) & (away <= reach)
         if not undecided.any():
             return tone
         sources = sources_of(context, warped)
-        patched = fill_by_patches(tone, ~undecided, log_depth, sources, self.seed, self.exemplar)
+        patched = fill_by_patches(tone, ~undecided, log_depth, sources, self.seed)
         detail = patched - tone
-        detail = detail - smoothed(detail, undecided, self.tone_radius)
+        detail = detail - smoothed(detail, undecided, TONE_RADIUS)
         fading = (1 - away / reach).clamp_min(0)
         return torch.where(undecided[..., None], tone + fading[..., None] * detail, tone)
 

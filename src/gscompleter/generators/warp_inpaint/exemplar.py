@@ -15,30 +15,27 @@ from torch.nn.functional import avg_pool2d, pad
 
 from gscompleter.kernels import patchmatch
 
-
-@dataclass(frozen=True)
-class ExemplarConfig:
-    radius: int = 3
-    """Patches are squares of 2 * radius + 1 pixels."""
-    max_bias: float = 0.1
-    """Largest shift of a patch's colour channel, in units of the colour."""
-    bias_penalty: float = 0.3
-    """Cost of a squared shift, relative to a squared difference of colour."""
-    depth_penalty: float = 0.02
-    """Cost of taking from a surface before the expected depth, per squared log-depth."""
-    distance_penalty: float = 0.002
-    """Cost of taking from the other end of the image."""
-    fewest_rounds: int = 2
-    """Rounds of search and vote on the finest level."""
-    most_rounds: int = 6
-    """Rounds on the coarsest level."""
-    confidence: float = 0.85
-    """Factor of the weight of an unknown pixel per pixel from the border of the hole."""
-    min_size: int = 80
-    """Shorter side, in pixels, under which the pyramid stops. Coarser levels would invent large
-    structures, which are seldom the true ones; over real cases they cost 0.3 dB."""
-    fine_reach: int = 8
-    """Pixels within which the random search looks around what the coarser level found."""
+RADIUS = 3
+"""Patches are squares of 2 * radius + 1 pixels."""
+MAX_BIAS = 0.1
+"""Largest shift of a patch's colour channel, in units of the colour."""
+BIAS_PENALTY = 0.3
+"""Cost of a squared shift, relative to a squared difference of colour."""
+DEPTH_PENALTY = 0.02
+"""Cost of taking from a surface before the expected depth, per squared log-depth."""
+DISTANCE_PENALTY = 0.002
+"""Cost of taking from the other end of the image."""
+FEWEST_ROUNDS = 2
+"""Rounds of search and vote on the finest level."""
+MOST_ROUNDS = 6
+"""Rounds on the coarsest level."""
+CONFIDENCE = 0.85
+"""Factor of the weight of an unknown pixel per pixel from the border of the hole."""
+MIN_SIZE = 80
+"""Shorter side, in pixels, under which the pyramid stops. Coarser levels would invent large
+structures, which are seldom the true ones; over real cases they cost 0.3 dB."""
+FINE_REACH = 8
+"""Pixels within which the random search looks around what the coarser level found."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +91,6 @@ def fill_by_patches(
     expected: Float[Tensor, "h w"],
     sources: Sources,
     seed: int,
-    config: ExemplarConfig = ExemplarConfig(),
 ) -> Float[Tensor, "h w 3"]:
     """`image` with what is not `known` made of patches of `sources`.
 
@@ -104,42 +100,36 @@ def fill_by_patches(
         expected: Logarithm of the depth that each pixel should have; nearer sources cost.
         sources: Where patches come from.
         seed: Of the random search.
-        config: Sizes and costs.
     """
     levels = [Level(image, known, expected, sources)]
-    while min(levels[-1].known.shape) // 2 >= config.min_size:
+    while min(levels[-1].known.shape) // 2 >= MIN_SIZE:
         levels.append(halved(levels[-1]))
     filled, field = image, None
     for number, level in reversed(list(enumerate(levels))):
         share = number / max(len(levels) - 1, 1)
-        extra = round((config.most_rounds - config.fewest_rounds) * share)
-        rounds = config.fewest_rounds + extra
-        filled, field = solve(level, field, rounds, seed + 7919 * number, config)
+        rounds = FEWEST_ROUNDS + round((MOST_ROUNDS - FEWEST_ROUNDS) * share)
+        filled, field = solve(level, field, rounds, seed + 7919 * number)
     return filled
 
 
 def solve(
-    level: Level,
-    coarse_field: CoarseField | None,
-    rounds: int,
-    seed: int,
-    config: ExemplarConfig,
+    level: Level, coarse_field: CoarseField | None, rounds: int, seed: int
 ) -> tuple[Float[Tensor, "h w 3"], Field | None]:
     """Alternate between the best patches for the image and the image these patches vote for.
 
     It begins with the first guess, or with what the field of the coarser level votes for.
     """
     h, w = level.known.shape
-    known, radius = level.known.numpy(), config.radius
-    usable = usable_centres(level.sources.valid, radius)
-    near_hole = dilated(~known, radius)
+    known = level.known.numpy()
+    usable = usable_centres(level.sources.valid, RADIUS)
+    near_hole = dilated(~known, RADIUS)
     if not usable.any() or known.all():
         return level.image, None
 
     queries, hole = np.argwhere(near_hole), np.argwhere(~known)
     query_at = np.full((h, w), -1, np.int64)
     query_at[near_hole] = np.arange(len(queries))
-    weight = trust(known, config.confidence)
+    weight = trust(known, CONFIDENCE)
     votes, shift = weight[near_hole], np.zeros((len(queries), 3), np.float32)
     matches = initial_matches(queries, coarse_field, usable, seed)
     images = np.ascontiguousarray(level.sources.images.numpy())
@@ -147,12 +137,12 @@ def solve(
     expected = level.expected.numpy()[near_hole]
 
     def voted() -> Float32[ndarray, "p 3"]:
-        return patchmatch.vote((h, w), hole, query_at, votes, images, matches, shift, radius)[0]
+        return patchmatch.vote((h, w), hole, query_at, votes, images, matches, shift, RADIUS)[0]
 
     current = level.image.numpy().copy()
     if coarse_field is not None:
         current[~known] = voted()
-    reach = max(usable.shape) if coarse_field is None else config.fine_reach
+    reach = max(usable.shape) if coarse_field is None else FINE_REACH
     for number in range(rounds):
         cost, shift = patchmatch.search(
             current,
@@ -164,11 +154,11 @@ def solve(
             usable,
             log_depth,
             matches,
-            radius,
-            np.float32(config.max_bias),
-            np.float32(config.bias_penalty),
-            np.float32(config.depth_penalty),
-            np.float32(config.distance_penalty),
+            RADIUS,
+            np.float32(MAX_BIAS),
+            np.float32(BIAS_PENALTY),
+            np.float32(DEPTH_PENALTY),
+            np.float32(DISTANCE_PENALTY),
             2,
             reach,
             seed + 31 * number,

@@ -63,7 +63,9 @@ def normals_of(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w 3"
     """Surface normals in camera axes, towards the camera, from the nearer of two differences."""
     camera = view.camera
     rays = camera.z_rays() @ camera.c2w[:3, :3]
-    points = rays * depth[..., None]
+    # A power of two scales without rounding, and squares neither overflow nor vanish.
+    unit = 2.0 ** depth.median().log2().round().item()
+    points = rays * (depth / unit)[..., None]
 
     def slope(p: Float[Tensor, "a b 3"]) -> Float[Tensor, "a b 3"]:
         step = p[:, 1:] - p[:, :-1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations, permutations
 
 import numpy as np
@@ -71,6 +71,8 @@ class PlaneSweep:
         Raises:
             InputError: fewer than two views, no baseline between them, an empty depth range.
         """
+        near, far = depth_range_of(views)
+        views = [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
         depths = self.depths(views)
         parts = [self.splat(view, depth) for view, depth in zip(views, depths, strict=True)]
         device = views[0].image.device

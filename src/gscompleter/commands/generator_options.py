@@ -1,0 +1,110 @@
+"""`--generator NAME` and `--generator-SETTING VALUE`, derived from each generator's settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, cast
+
+from tyro.constructors import (
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from gscompleter.config.generators import GENERATORS, GeneratorSettings, settings_class
+from gscompleter.errors import InputError, quoted
+
+PREFIX = "generator_"
+DEFAULT = "warp-inpaint"
+
+
+@dataclass(frozen=True)
+class GeneratorOptions:
+    """How the image at a target comes about."""
+
+    name: str = DEFAULT
+    """The generator."""
+    given: Mapping[str, Any] = field(default_factory=dict)
+    """Those of its settings that were given."""
+
+    def settings(self) -> GeneratorSettings:
+        """The settings of the generator with what was given.
+
+        Raises:
+            InputError: where there is no such generator, or it knows no such setting.
+        """
+        kind = settings_class(self.name)
+        for setting, value in self.given.items():
+            knowing = generators_with(setting)
+            if self.name not in knowing:
+                raise InputError(
+                    f"The generator {self.name!r} knows no {setting} ({quoted(value)}); leave that "
+                    f"out, or choose {' or '.join(knowing)}.",
+                    PREFIX + setting,
+                )
+        return kind(**self.given)
+
+    def as_summary(self) -> dict[str, Any]:
+        """The generator and all its settings, for `summary.json`."""
+        settings = asdict(self.settings())
+        return {"generator": self.name, **{PREFIX + name: settings[name] for name in settings}}
+
+
+def generators_with(setting: str) -> list[str]:
+    """The names of the generators that know a setting."""
+    return [
+        name for name, kind in GENERATORS.items() if setting in (one.name for one in fields(kind))
+    ]
+
+
+def generator_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """How tyro reads GeneratorOptions: by name, and by the settings that any generator knows."""
+    if info.type is not GeneratorOptions:
+        return None
+    kinds = "; ".join(f"{name}: {kind.__doc__}" for name, kind in GENERATORS.items())
+    sentence = f"What synthesizes the image at a target. {kinds}."
+    known: dict[str, list[tuple[str, StructFieldSpec]]] = {}
+    for name, kind in GENERATORS.items():
+        for spec in specs_of(kind):
+            known.setdefault(spec.name, []).append((name, spec))
+    chosen = StructFieldSpec("generator", str, DEFAULT, sentence)
+    return StructConstructorSpec(options_from, (chosen, *map(flag, known.values())))
+
+
+def specs_of(kind: type[GeneratorSettings]) -> tuple[StructFieldSpec, ...]:
+    """Name, type, default and sentence of each setting of a class."""
+    spec = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(kind, kind(), False))
+    assert isinstance(spec, StructConstructorSpec)
+    return spec.fields
+
+
+def flag(known: Sequence[tuple[str, StructFieldSpec]]) -> StructFieldSpec:
+    """The flag for a setting. Each generator that knows it has a sentence and a default of its own.
+
+    The flag's own default is None, or False for a switch, which leaves it to the generator.
+    """
+    first = known[0][1]
+    sentences: dict[str, list[str]] = {}
+    for name, spec in known:
+        text = spec.helptext() if callable(spec.helptext) else spec.helptext
+        default = f" ({spec.default})" if spec.default else ""
+        sentences.setdefault(" ".join((text or "").split()), []).append(name + default)
+    switch = first.type is bool
+    return StructFieldSpec(
+        PREFIX + first.name,
+        first.type if switch else cast(type, first.type | None),
+        False if switch else None,
+        " ".join(f"{', '.join(names)}: {text}" for text, names in sentences.items()),
+    )
+
+
+def options_from(generator: str, **values: Any) -> GeneratorOptions:
+    """The options with those values that were given."""
+    given = {
+        name.removeprefix(PREFIX): value
+        for name, value in values.items()
+        if value is not None and value is not False
+    }
+    return GeneratorOptions(generator, given)

@@ -1,0 +1,67 @@
+"""Whether a completion fits into the memory of this machine, before it is begun."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+
+from gscompleter.errors import InputError, quoted
+
+PROGRAM_BYTES = 600 * 10**6
+"""What the program holds whatever the size of the images."""
+BYTES_PER_PIXEL = 6_500
+"""What a completion holds for each pixel of the target, as it was asked for: costs of up to 256
+planes of the target widened by a quarter on every side, and of the anchor. Measured on two
+photographs: 0.75 GB at 256 x 256, 2.8 GB at 512 x 768."""
+BYTES_PER_PIXEL_OF_A_VIEW = 600
+"""What it holds for each pixel of each image besides: the image, its Gaussians, its renders.
+Measured on four photographs instead of two at 256 x 256."""
+
+_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+"""Where Linux tells what a container may hold, in its newer and its older way."""
+
+
+def check_memory(pixels: int, images: int) -> None:
+    """Refuse a completion that needs more memory than there is.
+
+    Args:
+        pixels: Of the largest image, at the resolution that is worked at.
+        images: Context views and targets together.
+
+    Raises:
+        InputError: with both numbers.
+    """
+    needed, there = needed_bytes(pixels, images), memory_bytes()
+    if there is not None and needed > there:
+        raise InputError(
+            f"{quoted(f'{images:,}')} images of up to {quoted(f'{pixels:,}')} pixels need about "
+            f"{_gigabytes(needed)} of memory, and there are {_gigabytes(there)}; choose a smaller "
+            "resolution, or fewer views.",
+            "resolution",
+        )
+
+
+def needed_bytes(pixels: int, images: int) -> int:
+    """About how much memory a completion holds at most. Arguments as in `check_memory`."""
+    return PROGRAM_BYTES + pixels * (BYTES_PER_PIXEL + images * BYTES_PER_PIXEL_OF_A_VIEW)
+
+
+def memory_bytes() -> int | None:
+    """The memory of this machine, or as much of it as we may hold; None where nobody tells."""
+    found = [limit for limit in map(_limit, _LIMITS) if limit is not None]
+    with contextlib.suppress(AttributeError, OSError, ValueError):
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    return min(found, default=None)
+
+
+def _limit(path: str) -> int | None:
+    try:
+        word = Path(path).read_text().strip()
+    except OSError:
+        return None
+    return int(word) if word.isdecimal() else None  # the newer way says "max"
+
+
+def _gigabytes(number: int) -> str:
+    return quoted(f"{-(-number // 10**9):,} GB")

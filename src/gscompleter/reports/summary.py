@@ -1,0 +1,297 @@
+"""What the rows of a run come to: means over its tasks, which tables and plots show."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gscompleter.completer import STAGES
+from gscompleter.errors import InputError
+from gscompleter.runs.methods import METHODS
+from gscompleter.runs.steps import scale_drift
+from gscompleter.runs.store import check_run, read_json, row_paths
+
+Row = dict[str, Any]
+"""What `evaluate` writes for a task and a method."""
+
+Step = dict[str, Any]
+"""One of its steps: `steps.Step` as JSON."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A number about a step, as a table shows it."""
+
+    key: str
+    title: str
+    digits: int
+    of: Callable[[Step], float | None]
+    """None where no truth exists."""
+    over_steps: Callable[[Sequence[float]], float | None] = statistics.fmean
+    """What is made of the steps of a task."""
+    over_tasks: Callable[[Sequence[float]], float] = statistics.fmean
+    """What is made of the tasks."""
+
+    def of_row(self, row: Row) -> float | None:
+        """The number of a task; None where no step has one."""
+        values = [value for step in row["steps"] if (value := self.of(step)) is not None]
+        return self.over_steps(values) if values else None
+
+
+def _target(key: str) -> Callable[[Step], float | None]:
+    return lambda step: step["scores"]["target_after"][key]
+
+
+def psnr_before(step: Step) -> float:
+    """PSNR at the target just before a step, in dB."""
+    return float(step["scores"]["target_before"]["psnr"])
+
+
+def psnr_after(step: Step) -> float:
+    """PSNR at the target just after a step, in dB."""
+    return float(step["scores"]["target_after"]["psnr"])
+
+
+def gain_of(step: Step) -> float:
+    """PSNR at the target after less before, in dB."""
+    return psnr_after(step) - psnr_before(step)
+
+
+def _after(key: str) -> Callable[[Step], float | None]:
+    return lambda step: None if step["scores"][key] is None else step["scores"][key]["after"]
+
+
+def _change(key: str) -> Callable[[Step], float | None]:
+    def change(step: Step) -> float | None:
+        both = step["scores"][key]
+        return None if both is None else both["after"] - both["before"]
+
+    return change
+
+
+def _worst_view(step: Step) -> float:
+    return min(view["after"] - view["before"] for view in step["scores"]["context_psnr"])
+
+
+def _views(key: str) -> Callable[[Step], float]:
+    return lambda step: statistics.fmean(view["after"] for view in step["scores"][key])
+
+
+def _score(key: str) -> Callable[[Step], float | None]:
+    return lambda step: step["scores"][key]
+
+
+def _of_step(key: str) -> Callable[[Step], float | None]:
+    return lambda step: step[key]
+
+
+GAIN = Column("gain", "gain", 2, gain_of)
+
+IMAGES = (
+    Column("psnr", "PSNR", 2, psnr_after),
+    GAIN,
+    Column("lowest_gain", "lowest gain", 2, gain_of, min, min),
+    Column("ssim", "SSIM", 3, _target("ssim")),
+    Column("lpips_vgg", "LPIPS (VGG)", 3, _target("lpips_vgg")),
+    Column("lpips_alex", "LPIPS (Alex)", 3, _target("lpips_alex")),
+    Column("hole_psnr", "in holes", 2, _score("hole_psnr")),
+    Column("observed_psnr", "outside", 2, _after("observed_psnr")),
+    Column("neighbours", "beside", 2, _after("neighbours_psnr")),
+    Column("neighbours_gain", "gain beside", 2, _change("neighbours_psnr")),
+    Column("context", "context", 2, _views("context_psnr")),
+    Column("context_ssim", "SSIM of context", 3, _views("context_ssim")),
+    Column("context_change", "worst context change", 2, _worst_view, min, min),
+)
+"""PSNR in dB: at the target; there in and outside of the holes of the scene before; beside the
+target; at the known views. The worst change is that of the known view that lost most."""
+
+GEOMETRY = (
+    Column("depth_observed", "AbsRel observed", 3, _score("depth_observed")),
+    Column("depth_hole", "AbsRel in holes", 3, _score("depth_hole")),
+    Column("depth_rim", "step at rim", 4, _score("depth_rim")),
+    Column("align_abs_rel", "AbsRel to context", 4, _score("align_abs_rel")),
+    Column("align_chamfer", "Chamfer to context", 4, _score("align_chamfer")),
+    Column("align_f_score", "F-score to context", 3, _score("align_f_score")),
+)
+"""Against true depth where it is known, and of what was added against the scene before. All lengths
+are shares of the depth."""
+
+SEQUENCE = (
+    Column("psnr_before", "PSNR before", 2, psnr_before),
+    Column("psnr_end", "PSNR at the end", 2, _of_step("psnr_end")),
+    Column("depth_scale", "depth scale", 3, _of_step("depth_scale")),
+    Column("scale_drift", "scale drift", 3, _of_step("depth_scale"), scale_drift),
+)
+"""What tells steps apart that build on each other: PSNR in dB at the target of each step, just
+before it and in the scene that the last one leaves; the scale of what was added."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A mean (or the lowest value) over the tasks that have the number."""
+
+    value: float | None
+    count: int
+
+
+@dataclass(frozen=True)
+class Summary:
+    """All that the tables show."""
+
+    methods: tuple[str, ...]
+    tasks: tuple[str, ...]
+    """Names of the tasks that there are rows of."""
+    common: tuple[str, ...]
+    """Names of the tasks that all methods finished."""
+    rows: Mapping[str, tuple[Row, ...]]
+    """By method, its rows of these tasks, in their order."""
+    sequences: Mapping[str, Mapping[str, Sequence[Step]]]
+    """By task of several steps and method, the steps as far as it came."""
+    gains: Mapping[int, Mapping[str, Cell]]
+    """By distance to the known views in frames, and by method: the mean gain in dB of a step."""
+    finished: Mapping[str, int]
+    """By method, the tasks it finished."""
+    failures: tuple[tuple[str, str, str], ...]
+    """Task, method, reason."""
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """All that may have a value."""
+        return IMAGES + GEOMETRY + (SEQUENCE if self.sequences else ())
+
+    @property
+    def num_steps(self) -> int:
+        """How many steps the tasks that all methods finished have together."""
+        return sum(len(row["steps"]) for row in next(iter(self.rows.values())))
+
+    def cell(self, method: str, column: Column) -> Cell:
+        """The entry of a table."""
+        return cell_of((column.of_row(row) for row in self.rows[method]), column)
+
+    def present(self, columns: Iterable[Column]) -> list[Column]:
+        """Those of `columns` that any method has a value in."""
+        return [c for c in columns if any(self.cell(m, c).count for m in self.methods)]
+
+    def seconds(self, method: str) -> dict[str, float]:
+        """By stage, the median wall time over the steps.
+
+        `reconstruct` is Ψ of the photographs, once for all methods of a task; `total` is without.
+        """
+        rows = self.rows[method]
+        if not rows:
+            return {}
+        steps = [step["seconds"] for row in rows for step in row["steps"]]
+        stages = sorted({stage for step in steps for stage in step}, key=stage_place)
+        medians = {s: statistics.median(step.get(s, 0.0) for step in steps) for s in stages}
+        return {"reconstruct": statistics.median(r["reconstruct_seconds"] for r in rows), **medians}
+
+    def peak_bytes(self, method: str) -> int | None:
+        """The most memory that any step took; None where no system told."""
+        peaks = (step["peak_bytes"] for row in self.rows[method] for step in row["steps"])
+        return max((peak for peak in peaks if peak is not None), default=None)
+
+
+def read_rows(out: Path) -> list[Row]:
+    """The rows of a run, in the order of tasks and methods.
+
+    Raises:
+        InputError: where there are none, or one is damaged.
+    """
+    check_run(out)
+    rows = [read_row(path) for path in row_paths(out)]
+    if not rows:
+        raise InputError(f"The run in {out} has no rows yet; let `evaluate` finish a case first.")
+    return sorted(rows, key=lambda row: (row["task"]["name"], *place_of(row["method"])))
+
+
+def read_row(path: Path) -> Row:
+    """What `evaluate` wrote for a task and a method.
+
+    Raises:
+        InputError: where it is damaged.
+    """
+    row = read_json(path)
+    try:
+        row["task"]["name"], row["error"], row["reconstruct_seconds"]
+        whole = isinstance(row["method"], str) and isinstance(row["steps"], list)
+    except (KeyError, TypeError):
+        whole = False
+    if not whole:
+        raise InputError(f"{path} is no row of scores; delete it and run again.")
+    return dict(row)
+
+
+def place_of(method: str) -> tuple[int, str]:
+    """What sorts methods into the order of the tables."""
+    return _place(method, list(METHODS))
+
+
+def stage_place(stage: str) -> tuple[int, str]:
+    """What sorts stages into the order in which they run."""
+    return _place(stage, ["reconstruct", *STAGES, "optimize"])
+
+
+def _place(name: str, order: Sequence[str]) -> tuple[int, str]:
+    return (order.index(name) if name in order else len(order), name)
+
+
+def summarize(rows: Sequence[Row]) -> Summary:
+    """Means over the tasks that all methods finished, so that they compare the same ones."""
+    methods = tuple(sorted({row["method"] for row in rows}, key=place_of))
+    tasks = tuple(sorted({row["task"]["name"] for row in rows}))
+    by_task: dict[str, dict[str, Row]] = {name: {} for name in tasks}
+    for row in rows:
+        by_task[row["task"]["name"]][row["method"]] = row
+    done = {
+        name: {m: row for m, row in found.items() if row["error"] is None}
+        for name, found in by_task.items()
+    }
+    common = tuple(name for name in tasks if len(done[name]) == len(methods))
+    chosen = {method: tuple(done[name][method] for name in common) for method in methods}
+    return Summary(
+        methods,
+        tasks,
+        common,
+        chosen,
+        {
+            name: {method: row["steps"] for method, row in found.items()}
+            for name, found in by_task.items()
+            if any(len(row["task"]["targets"]) > 1 for row in found.values())
+        },
+        gains_by_gap(chosen),
+        {method: sum(method in found for found in done.values()) for method in methods},
+        tuple((r["task"]["name"], r["method"], r["error"]) for r in rows if r["error"] is not None),
+    )
+
+
+def cell_of(numbers: Iterable[float | None], column: Column) -> Cell:
+    """What `column` makes of the numbers that are known."""
+    values = [value for value in numbers if value is not None]
+    return Cell(column.over_tasks(values) if values else None, len(values))
+
+
+def steps_with_gaps(row: Row) -> Iterator[tuple[int, Step]]:
+    """Each step with the frames from its target to the nearest known frame: k of n-k."""
+    known = list(row["task"]["context"])
+    for step in row["steps"]:
+        yield min(abs(step["frame"] - frame) for frame in known), step
+        known.append(step["frame"])
+
+
+def gains_by_gap(rows: Mapping[str, Sequence[Row]]) -> dict[int, dict[str, Cell]]:
+    """The mean gain of each method at each distance from the known views."""
+    found = {
+        method: [pair for row in chosen for pair in steps_with_gaps(row)]
+        for method, chosen in rows.items()
+    }
+    gaps = sorted({gap for pairs in found.values() for gap, _ in pairs})
+    return {
+        gap: {
+            method: cell_of((gain_of(step) for there, step in pairs if there == gap), GAIN)
+            for method, pairs in found.items()
+        }
+        for gap in gaps
+    }

@@ -1,0 +1,447 @@
+"""Mutated inputs of every kind, and what the commands say to them.
+
+    python tests/fuzz.py --count 1500 --seed 0
+
+Each mutation runs in a fork of one interpreter that has imported everything, under a time limit
+and an address-space limit. A traceback, a signal, an exit code other than 0 and 2, an error of more
+than a few lines, or a run that outlives its limit is a finding; `--only KIND:NUMBER` repeats one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+os.environ |= {"OMP_WAIT_POLICY": "PASSIVE", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+ADDRESS_SPACE = 8 << 30
+LONGEST_ERROR = 2500
+SIZE = 32
+
+NUMBERS: list[Any] = [
+    *(0, -1, 1, 2, 0.5, -0.5, 1e-300, 1e300, -1e300, 1e38, 1e-45, 1e20, 2**31, 2**63, 2**64),
+    *(10**9, 10**12, 10**399, float("nan"), float("inf"), -float("inf"), True, False, None),
+]
+STRINGS: list[Any] = ["", "²", "a" * 100_000, "../../..", "/dev/null", "nan", "0", "\0", "\ud800"]
+OBJECTS: list[Any] = [[], {}, [[]], [0] * 5000, {"a": {"b": []}}]
+ODD = NUMBERS + STRINGS + OBJECTS
+WORDS = ["", "²", "--2", "-1", "0", "1,2", "9" * 5000, "1e300", "nan", "inf", "1e-300", "/dev/null"]
+WORDS += ["99999999", str(2**64), "a" * 5000, "--", "-", "..", "1000000", "\udce4", "0.5", "None"]
+YAML = [
+    ".nan",
+    ".inf",
+    "-.5",
+    "1e400",
+    "9" * 400,
+    "2024-13-45",
+    "[" * 3000,
+    "&a [*a]",
+    "{a: {b: 1}}",
+]
+YAML += ["!!python/object:os.system x", "~", "'²'", "0", "1", "-1", "1000000000000", "yes", "''"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a mutation brought to light."""
+
+    name: str
+    command: list[str]
+    what: str
+
+
+Mutation = Callable[[Path, random.Random], list[str]]
+"""Changes the files of a folder; returns the words of the command."""
+
+
+# ---- what is mutated ----------------------------------------------------------------------------
+
+
+def build(folder: Path) -> None:
+    """One valid input of every kind."""
+    import numpy as np
+    import torch
+
+    from chunk_files import example, save_chunk
+    from gscompleter import save_ply
+    from gscompleter.data.scene import write_cameras
+    from scenes import Room, camera_at, gaussians_of, photographed, view_of
+
+    cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
+    views = [view_of(Room(), camera) for camera in cameras]
+    scene = photographed(folder / "scene", cameras)
+    index = json.loads((scene / "transforms.json").read_text())
+    for number, frame in enumerate(index["frames"]):
+        np.save(scene / f"{number}.npy", views[number].depth.numpy())
+        frame["depth_file_path"] = f"{number}.npy"
+    (scene / "transforms.json").write_text(json.dumps(index))
+    write_cameras(folder / "target.json", cameras[2:])
+    gaussians = gaussians_of(views[0])
+    save_ply(folder / "scene.ply", gaussians)
+    save_ply(folder / "small.ply", gaussians[:5])
+    (folder / "ascii.ply").write_bytes(as_ascii((folder / "small.ply").read_bytes()))
+    save_chunk(folder / "chunks" / "000000.torch", example("room", views=views))
+    row = {"scene": "scene", "context": [0, 1], "target": 2, "near": 0.5, "far": 20.0}
+    cases = {"resolution": [SIZE, SIZE], "cases": [{**row, "neighbours": [1]}]}
+    (folder / "cases.json").write_text(json.dumps(cases))
+    splits = {"room": {"context": [0, 1], "target": [2]}}
+    (folder / "index.json").write_text(json.dumps(splits))
+    shutil.copytree(scene, folder / "clips" / "room", ignore=shutil.ignore_patterns("*.json"))
+    lines = ["https://example.org"]
+    for number, camera in enumerate(cameras):
+        K, pose = camera.K / SIZE, torch.linalg.inv(camera.c2w)[:3].flatten()
+        os.rename(folder / f"clips/room/{number}.png", folder / f"clips/room/{number}.png")
+        values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0, 0, *pose]
+        lines.append(" ".join([str(number), *(f"{float(value):.6f}" for value in values)]))
+    (folder / "clips" / "room.txt").write_text("\n".join(lines) + "\n")
+    (folder / "config.yaml").write_text(
+        "margin: 0.25\nregistration:\n  iterations: 2\n  beta1: 0.5\naffine:\n  max_trials: 64\n"
+        "holes:\n  dilation: 1\n"
+    )
+    torch.save({"state_dict": {"encoder.a": torch.ones(3)}}, folder / "weights.ckpt")
+
+
+def as_ascii(data: bytes) -> bytes:
+    """Our binary .ply as an ASCII one."""
+    import numpy as np
+
+    head, body = data.split(b"end_header\n")
+    columns = head.count(b"property float")
+    rows = np.frombuffer(body, "<f4").reshape(-1, columns)
+    text = "\n".join(" ".join(map(str, row)) for row in rows)
+    head = head.replace(b"binary_little_endian", b"ascii")
+    return head + b"end_header\n" + text.encode() + b"\n"
+
+
+COMPLETE = ["complete", "scene", "--context", "0", "1", "--out", "out", "--quiet", "--target"]
+
+
+def in_json(path: str, command: Sequence[str]) -> Mutation:
+    """A value of a JSON file is replaced by an odd one, or its text is damaged."""
+
+    def mutate(folder: Path, chance: random.Random) -> list[str]:
+        file = folder / path
+        if chance.random() < 0.15:
+            damage(file, chance)
+            return list(command)
+        content = json.loads(file.read_text())
+        for _ in range(chance.choice([1, 1, 1, 2])):
+            content = replaced(content, chance)
+        sys.set_int_max_str_digits(0)
+        text = json.dumps(content)
+        file.write_text("[" * 5000 + text if chance.random() < 0.02 else text)
+        return list(command)
+
+    return mutate
+
+
+def replaced(content: Any, chance: random.Random) -> Any:
+    """`content` with one value somewhere in it replaced, removed or doubled."""
+    if not isinstance(content, (dict, list)) or not content or chance.random() < 0.08:
+        return chance.choice(ODD)
+    keys = list(content) if isinstance(content, dict) else range(len(content))
+    key = chance.choice(list(keys))
+    if chance.random() < 0.05:
+        del content[key]
+    else:
+        content[key] = replaced(content[key], chance)
+    return content
+
+
+def in_bytes(path: str, command: Sequence[str]) -> Mutation:
+    """Bytes of a file are cut, changed, doubled or replaced."""
+
+    def mutate(folder: Path, chance: random.Random) -> list[str]:
+        damage(folder / path, chance)
+        return list(command)
+
+    return mutate
+
+
+def damage(file: Path, chance: random.Random) -> None:
+    """Cut, change, double or replace some bytes of a file, or all of it."""
+    data = bytearray(file.read_bytes())
+    kind = chance.randrange(7)
+    at = chance.randrange(len(data))
+    if kind == 0:
+        del data[at:]
+    elif kind == 1:
+        for _ in range(chance.choice([1, 4, 64])):
+            data[chance.randrange(len(data))] = chance.randrange(256)
+    elif kind == 2:
+        data[at:at] = data[at // 2 : at]
+    elif kind == 3:
+        early = chance.randrange(min(len(data), 200))
+        data[early : early + 4] = chance.choice([b"\xff" * 4, b"\0" * 4, b"\x7f\xff\xff\xff"])
+    elif kind == 4:
+        digits = [match.span() for match in re.finditer(rb"\d+", bytes(data[:2000]))]
+        start, stop = chance.choice(digits or [(0, 0)])
+        data[start:stop] = chance.choice([b"0", b"-1", b"1" + b"0" * 12, b"9" * 4000, b"nan"])
+    elif kind == 5:
+        data[:] = chance.choice(
+            [b"", b"\0" * 100, b"PK\x03\x04", b"\x93NUMPY", b"ply\n", b"{", b"<html>"]
+        )
+    else:
+        data[at : at + 4] = chance.choice([b"\0\0\xc0\x7f", b"\0\0\x80\x7f", b"\xff\xff\x7f\x7f"])
+    file.write_bytes(bytes(data))
+
+
+def in_yaml(folder: Path, chance: random.Random) -> list[str]:
+    """A value of the settings is replaced by an odd one."""
+    from dataclasses import fields, is_dataclass
+
+    from gscompleter.config import CompleterConfig
+
+    file = folder / "config.yaml"
+    if chance.random() < 0.15:
+        damage(file, chance)
+    else:
+        stage = chance.choice([f.name for f in fields(CompleterConfig)])
+        settings = getattr(CompleterConfig(), stage)
+        name = chance.choice([f.name for f in fields(settings)]) if is_dataclass(settings) else ""
+        value = chance.choice(YAML)
+        file.write_text(f"{stage}:\n  {name}: {value}\n" if name else f"{stage}: {value}\n")
+    return [*COMPLETE, "2", "--near", "0.5", "--far", "20", "--config", "config.yaml"]
+
+
+def in_words(folder: Path, chance: random.Random) -> list[str]:
+    """A word of the command line is replaced by an odd one."""
+    options = {
+        "--context": ["0", "1"],
+        "--target": ["2"],
+        "--near": ["0.5"],
+        "--far": ["20"],
+        "--seed": ["0"],
+        "--resolution": [str(SIZE), str(SIZE)],
+        "--scene": ["scene.ply"],
+        "--config": ["default"],
+        "--reconstructor": ["plane-sweep"],
+        "--generator": ["warp-inpaint"],
+        "--weights": ["weights.ckpt"],
+    }
+    for _ in range(chance.choice([1, 1, 2])):
+        name = chance.choice(list(options))
+        options[name][chance.randrange(len(options[name]))] = chance.choice(WORDS)
+    if chance.random() < 0.8:
+        del options["--weights"]
+    if chance.random() < 0.5:
+        del options["--scene"]
+    words = [word for name, values in options.items() for word in (name, *values)]
+    return ["complete", "scene", *words, "--out", "out", "--quiet"]
+
+
+def in_weights(folder: Path, chance: random.Random) -> list[str]:
+    """A file of weights that holds something else."""
+    import torch
+
+    tensors: list[Any] = [
+        torch.empty(3, device="meta"),
+        torch.eye(3).to_sparse(),
+        torch.full((3,), float("nan")),
+        torch.ones(1).expand(10**6, 10**6),
+        torch.eye(3, dtype=torch.complex64),
+        *ODD,
+    ]
+    name = chance.choice(["encoder.a", "a" * 10_000, "decoder.a", ""])
+    if chance.random() < 0.5:
+        torch.save({"state_dict": {name: chance.choice(tensors)}}, folder / "weights.ckpt")
+    else:
+        damage(folder / "weights.ckpt", chance)
+    model = ["--reconstructor", "mvsplat-re10k", "--weights", "weights.ckpt"]
+    return [*COMPLETE, "2", "--near", "0.5", "--far", "20", *model]
+
+
+RANGE = ["--near", "0.5", "--far", "20"]
+SCORES = ["--methods", "context", "--out", "run", "--quiet"]
+KINDS: dict[str, Mutation] = {
+    "transforms": in_json("scene/transforms.json", [*COMPLETE, "2", *RANGE]),
+    "transforms-wide": in_json("scene/transforms.json", [*COMPLETE, "2"]),
+    "camera": in_json("target.json", [*COMPLETE, "target.json", *RANGE]),
+    "image": in_bytes("scene/1.png", [*COMPLETE, "2", *RANGE]),
+    "depth": in_bytes("scene/1.npy", [*COMPLETE, "2", *RANGE]),
+    "ply": in_bytes("scene.ply", [*COMPLETE, "2", *RANGE, "--scene", "scene.ply"]),
+    "small-ply": in_bytes("small.ply", [*COMPLETE, "2", "--scene", "small.ply"]),
+    "ascii-ply": in_bytes("ascii.ply", [*COMPLETE, "2", "--scene", "ascii.ply"]),
+    "cases": in_json("cases.json", ["evaluate", "cases.json", *SCORES]),
+    "index": in_json("index.json", ["evaluate", "chunks", "--protocol", "index.json", *SCORES]),
+    "chunk": in_bytes(
+        "chunks/000000.torch", ["index", "chunks", "--protocol", "n-1", "--out", "i"]
+    ),
+    "chunk-run": in_bytes(
+        "chunks/000000.torch", ["evaluate", "chunks", "--protocol", "n-1", "--limit", "1", *SCORES]
+    ),
+    "txt": in_bytes("clips/room.txt", ["index", "clips", "--protocol", "n-1", "--out", "i"]),
+    "yaml": in_yaml,
+    "words": in_words,
+    "weights": in_weights,
+}
+
+
+# ---- how it is run ------------------------------------------------------------------------------
+
+
+def in_child(work: Callable[[], None], log: Path) -> int:
+    """Run `work` in a fork of this process; returns the id of it."""
+    sys.stdout.flush()
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        os.setsid()
+        # Rust and C libraries write past sys.stderr.
+        with log.open("wb") as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+        work()
+        code = 0
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)
+
+
+def run_command(base: Path, folder: Path, kind: str, number: int, seed: int) -> None:
+    """Mutate a copy of the base and run the command on it, within limits."""
+    shutil.copytree(base, folder / "in")
+    os.chdir(folder / "in")
+    words = KINDS[kind](Path(), random.Random(f"{seed} {kind} {number}"))
+    sys.set_int_max_str_digits(4300)
+    Path("../words").write_bytes("\0".join(words).encode("utf-8", "surrogateescape"))
+    resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
+    sys.argv = ["gscompleter", *words]
+    from gscompleter.cli import main
+
+    main()
+
+
+def finding_of(status: int, outlived: bool, log: str, folder: Path) -> str | None:
+    """What is wrong about the end of a run, in a line; None where nothing is."""
+    if outlived:
+        return "outlives its limit"
+    if os.WIFSIGNALED(status):
+        return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
+    code = os.waitstatus_to_exitcode(status)
+    if "Traceback (most recent call last)" in log:
+        places = re.findall(r'File "[^"]*gscompleter/([^"]+)", line (\d+)', log)
+        last = log.strip().splitlines()[-1][:150]
+        return f"traceback at {':'.join(places[-1]) if places else '?'}: {last}"
+    if code not in (0, 2):
+        return f"exit {code}: {log.strip()[-150:]}"
+    if code == 2 and len(log) > LONGEST_ERROR and "╭" not in log:
+        return f"an error of {len(log):,} characters: {log[:80]!r}"
+    if code == 2 and (folder / "in" / "out").exists():
+        return "exit 2, and something was written"
+    return None
+
+
+@dataclass
+class Running:
+    """A fork at work."""
+
+    name: str
+    folder: Path
+    deadline: float
+
+
+def fuzz(
+    chosen: Sequence[tuple[str, int]], seed: int, limit_s: float, workers: int
+) -> list[Finding]:
+    """Run the mutations; what was found, in the order of their ends."""
+    import_everything()
+    findings: list[Finding] = []
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        base = root / "base"
+        base.mkdir()
+        _, status = os.waitpid(in_child(lambda: build(base), root / "log"), 0)
+        if status:
+            raise RuntimeError((root / "log").read_text())
+        waiting, running = list(reversed(chosen)), dict[int, Running]()
+        while waiting or running:
+            while waiting and len(running) < workers:
+                kind, number = waiting.pop()
+                folder = root / f"{kind}-{number}"
+                folder.mkdir()
+                work = lambda: run_command(base, folder, kind, number, seed)  # noqa: B023, E731
+                child = in_child(work, folder / "log")
+                running[child] = Running(f"{kind}:{number}", folder, time.monotonic() + limit_s)
+            findings += finished(running)
+            time.sleep(0.01)
+    return findings
+
+
+def finished(running: dict[int, Running]) -> list[Finding]:
+    """Take the forks that have ended, or must, out of `running`; what they found."""
+    findings = []
+    for child, run in list(running.items()):
+        outlived = time.monotonic() > run.deadline
+        if outlived:
+            os.killpg(child, signal.SIGKILL)
+        ended, status = os.waitpid(child, 0 if outlived else os.WNOHANG)
+        if not ended:
+            continue
+        del running[child]
+        log = (run.folder / "log").read_text(errors="replace")
+        what = finding_of(status, outlived, log, run.folder)
+        if what is not None:
+            written = run.folder / "words"
+            words = written.read_text(errors="replace").split("\0") if written.exists() else []
+            findings.append(Finding(run.name, [word[:60] for word in words], what))
+        shutil.rmtree(run.folder, ignore_errors=True)
+    return findings
+
+
+def import_everything() -> None:
+    """Once for all forks. Nothing is computed here: threads do not survive a fork."""
+    sys.path.insert(0, str(Path(__file__).parent))
+    import chunk_files  # noqa: F401  (its photographs are drawn in one thread)
+    import gscompleter.cli
+    import gscompleter.commands.complete
+    import gscompleter.commands.evaluate
+    import gscompleter.generators.warp_inpaint
+    import gscompleter.reconstructors.plane_sweep  # noqa: F401
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=1500)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--limit", type=float, default=60, help="seconds of one run")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
+    parser.add_argument("--only", help="KIND:NUMBER, as a finding names it")
+    given = parser.parse_args()
+    chosen = [(given.kinds[i % len(given.kinds)], i) for i in range(given.count)]
+    if given.only:
+        kind, number = given.only.split(":")
+        chosen = [(kind, int(number))]
+    start = time.monotonic()
+    findings = fuzz(chosen, given.seed, given.limit, given.workers)
+    for what, count in Counter(finding.what for finding in findings).most_common():
+        first = next(finding for finding in findings if finding.what == what)
+        print(f"{count:4d}  {first.name}  {what}\n      {' '.join(first.command)[:300]!r}")
+    seconds = time.monotonic() - start
+    print(f"{len(chosen)} mutations, {len(findings)} findings, {seconds:.0f} s")
+    sys.exit(1 if findings else 0)
+
+
+if __name__ == "__main__":
+    main()

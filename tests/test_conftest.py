@@ -1,0 +1,36 @@
+"""What `conftest.py` claims: while the tests run, every shape in an annotation is checked."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from pkgutil import walk_packages
+
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+
+import gscompleter
+from gscompleter.baselines.optimization import ssim_map
+from gscompleter.geometry import rotations_from
+from gscompleter.metrics.image import psnr
+
+MODULES = [
+    module.name
+    for module in walk_packages(gscompleter.__path__, "gscompleter.", onerror=pytest.fail)
+    if not module.name.startswith("gscompleter.kernels")
+]
+
+
+def test_every_module_but_the_compiled_ones_is_loaded_by_the_hook():
+    files = Path(gscompleter.__path__[0]).rglob("*.py")
+    assert len(MODULES) == sum("kernels" not in path.parts for path in files) - 1
+    plain = [name for name in MODULES if "jaxtyping" not in type(find_spec(name).loader).__module__]
+    assert plain == []
+
+
+@pytest.mark.parametrize(
+    ("function", "shapes"),
+    [(rotations_from, [(5, 3)]), (psnr, [(4, 4)] * 2), (ssim_map, [(4, 4, 3), (4, 5, 3)])],
+)
+def test_a_wrong_shape_is_refused(function, shapes):
+    with pytest.raises(TypeCheckError):
+        function(*(torch.zeros(shape) for shape in shapes))

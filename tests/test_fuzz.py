@@ -1,0 +1,14 @@
+"""A few of the mutations of `fuzz.py`, which by hand does thousands."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_mutated_inputs_end_in_a_sentence_or_a_result():
+    """In a process of its own, whose forks inherit no threads."""
+    script = Path(__file__).parent / "fuzz.py"
+    command = [sys.executable, str(script), "--count", "40", "--seed", "1", "--workers", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    assert "40 mutations, 0 findings" in done.stdout

@@ -1,0 +1,41 @@
+"""What cannot fit is refused in a sentence, before any of it is made."""
+
+import pytest
+
+from gscompleter import InputError
+from gscompleter.memory import check_memory, memory_bytes, needed_bytes
+
+
+@pytest.fixture
+def sixteen_gigabytes(monkeypatch) -> None:
+    monkeypatch.setattr("gscompleter.memory.memory_bytes", lambda: 16 * 10**9)
+
+
+@pytest.mark.parametrize(
+    "pixels", [10**12, 8000 * 8000, 16 * 10**6, 10**18, 10**400], ids=lambda n: f"{len(str(n))}"
+)
+def test_what_does_not_fit_is_refused_with_both_numbers(pixels, sixteen_gigabytes):
+    with pytest.raises(InputError, match=r"need about .* GB .* there are 16 GB") as error:
+        check_memory(pixels, 3)
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize(("pixels", "images"), [(256 * 256, 3), (512 * 768, 9), (10**6, 12)])
+def test_what_fits_is_not_refused(pixels, images, sixteen_gigabytes):
+    check_memory(pixels, images)
+
+
+def test_the_estimate_holds_what_was_measured_and_not_twice_as_much():
+    """Peak resident memory of `complete` on two photographs and one target."""
+    for pixels, measured in ((256 * 256, 771 * 10**6), (512 * 768, 2904 * 10**6)):
+        assert 0.95 * measured < needed_bytes(pixels, 3) < 2 * measured
+
+
+def test_a_container_may_hold_less_than_the_machine(tmp_path, monkeypatch):
+    (tmp_path / "memory.max").write_text("123456789\n")
+    monkeypatch.setattr("gscompleter.memory._LIMITS", (str(tmp_path / "memory.max"),))
+    assert memory_bytes() == 123456789
+    (tmp_path / "memory.max").write_text("max\n")
+    whole = memory_bytes()
+    assert whole is not None
+    assert whole > 10**9
