@@ -19,6 +19,7 @@ from gscompleter.data.frame import Frame, capital
 from gscompleter.data.image_folders import ImageFinder, with_photographs
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.json_numbers import array_of, number_of, size_of, text_of
+from gscompleter.data.limits import MAX_IN_PIXELS
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import made_rigid, pose_defect
 from gscompleter.errors import InputError, quoted
@@ -26,8 +27,6 @@ from gscompleter.io.json_file import begins_a_list, read_json
 
 NAME = "cameras.json"
 ADVICE = "export the cameras again"
-LARGEST = 1e12
-"""Of focal lengths in pixels, before they are compared with the size of the image."""
 
 
 def holds_camera_list(path: Path) -> bool:
@@ -69,7 +68,9 @@ def _frame(entry: Any, number: int, path: Path) -> Frame:
     title = f"camera {number} of {quoted(path)}"
     if not isinstance(entry, dict):
         raise InputError(f"{capital(title)} is no object with a position and a rotation; {ADVICE}.")
-    fx, fy = (number_of(entry, key, title, 1 / LARGEST, LARGEST) for key in ("fx", "fy"))
+    fx, fy = (
+        number_of(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
+    )
     name = text_of(entry, "img_name", title) or str(entry.get("id", number))
     intrinsics = Intrinsics(size_of(entry, title), (fx, fy))
     frame = Frame(name, title, _pose(entry, title), intrinsics, None)

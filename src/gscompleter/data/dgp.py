@@ -17,7 +17,7 @@ from jaxtyping import Float
 from gscompleter.data.frame import Frame
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.json_numbers import number_of, size_of, text_of
-from gscompleter.data.limits import MAX_COORDINATE
+from gscompleter.data.limits import MAX_COORDINATE, MAX_IN_PIXELS
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import rotation_of
 from gscompleter.errors import InputError, quoted
@@ -25,8 +25,6 @@ from gscompleter.io.json_file import read_json
 
 CALIBRATIONS = "calibration"
 ADVICE = "download the scene again"
-LARGEST = 1e12
-"""Of focal lengths and principal points in pixels, before they are compared with the image."""
 MAX_SNIFFED = 1 << 26
 """Bytes at the beginning of a file that tell whether it is a scene."""
 
@@ -101,8 +99,10 @@ def _is_camera(name: Any, entry: Any) -> bool:
 
 
 def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    fx, fy = (number_of(entry, key, title, 1 / LARGEST, LARGEST) for key in ("fx", "fy"))
-    cx, cy = (number_of(entry, key, title, -LARGEST, LARGEST) for key in ("cx", "cy"))
+    fx, fy = (
+        number_of(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
+    )
+    cx, cy = (number_of(entry, key, title, -MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("cx", "cy"))
     return Intrinsics(None, (fx, fy), (cx, cy))
 
 

@@ -11,6 +11,8 @@ from gscompleter.errors import InputError
 
 MAX_SIDE = 16_384
 """Largest width or height of an image, in pixels."""
+MAX_IN_PIXELS = 1e12
+"""Of focal lengths and principal points in pixels, before they are compared with the image."""
 MAX_COORDINATE = 1e9
 """Farthest a camera may stand from the origin along an axis, in scene units."""
 FOCAL_RANGE = (1e-3, 1e6)

@@ -16,7 +16,7 @@ from gscompleter.data.frame import Frame, capital
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.json_numbers import optional_number, text_of
 from gscompleter.data.lens import Distortion
-from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_SIDE
+from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.point_cloud import read_point_cloud
 from gscompleter.data.poses import made_rigid, pose_defect
@@ -37,8 +37,6 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 ANGLE_RANGE = (1e-5, 3.14159)
 """Of opening angles, in radians; below π."""
-LARGEST = 1e12
-"""Of numbers in pixels. They are compared with the size of the image once that is known."""
 
 Pair = tuple[float | None, float | None]
 
@@ -173,11 +171,11 @@ def _matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:
 
 
 def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def pair(*keys: str, low: float = -LARGEST, high: float = LARGEST) -> Pair:
+    def pair(*keys: str, low: float = -MAX_IN_PIXELS, high: float = MAX_IN_PIXELS) -> Pair:
         x, y = (optional_number(entry, key, title, low, high) for key in keys)
         return x, y
 
-    focal = pair("fl_x", "fl_y", low=1 / LARGEST)
+    focal = pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
     angle = pair("camera_angle_x", "camera_angle_y", low=ANGLE_RANGE[0], high=ANGLE_RANGE[1])
     if focal == angle == (None, None):
         raise InputError(

@@ -7,11 +7,8 @@ from dataclasses import dataclass
 
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.lens import Distortion, Projection
-from gscompleter.data.limits import MAX_COEFFICIENT, MAX_SIDE
+from gscompleter.data.limits import MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
 from gscompleter.errors import InputError, quoted
-
-LARGEST = 1e12
-"""Of focal lengths and principal points in pixels, before they are compared with the image."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ def intrinsics_of(
         )
     values = dict(zip(model.parameters, numbers, strict=True))
     for name, value in values.items():
-        limit = LARGEST if name in _CENTERS else MAX_COEFFICIENT
+        limit = MAX_IN_PIXELS if name in _CENTERS else MAX_COEFFICIENT
         if not abs(value) <= limit:
             raise InputError(
                 f"The parameter {name} of {title} is {value:g}; a number of at most {limit:g} is "
