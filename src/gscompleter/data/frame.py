@@ -15,7 +15,7 @@ from gscompleter.data.lens import Pinhole, undistorted
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.poses import pose_defect
 from gscompleter.errors import InputError, quoted
-from gscompleter.io.image import decode_pixels, decoded_size, image_size, read_pixels
+from gscompleter.io.image import decode_pixels, image_size, read_pixels
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Of image files, for names without one."""
@@ -54,11 +54,7 @@ class Frame:
             InputError: where it is not an image.
         """
         stored = self.stored()
-        if stored is None:
-            return None
-        if isinstance(stored, bytes):
-            return decoded_size(stored, capital(self.title))
-        return image_size(stored)
+        return None if stored is None else image_size(stored, capital(self.title))
 
     def size(self) -> tuple[int, int]:
         """Width and height of the photograph, or where there is none, what the file says.

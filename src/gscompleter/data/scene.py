@@ -61,9 +61,7 @@ def load_camera(
     Args:
         scene: As in `load_views`.
         frame: Number of the frame; may be left out where there is one only.
-        resolution: Height and width in pixels, as in `load_views`.
-        near: Smallest z-depth of the scene, in scene units, where known.
-        far: Largest z-depth of the scene, in scene units, where known.
+        resolution: As in `load_views`, and so `near` and `far`.
 
     Raises:
         InputError: where the scene or the frame is missing or impossible, and where there are
@@ -91,9 +89,7 @@ def load_cameras(
 
     Args:
         path: The JSON file, or a folder with a `transforms.json`.
-        resolution: Height and width in pixels, as in `load_views`.
-        near: Smallest z-depth of the scene, in scene units, where known.
-        far: Largest z-depth of the scene, in scene units, where known.
+        resolution: As in `load_views`, and so `near` and `far`.
         origin: Where the coordinates of the scene are counted from, which is
             `open_photographs(scene).origin`, in scene units.
 
@@ -124,10 +120,8 @@ def write_cameras(
     """
     frames = [_entry(camera) for camera in cameras]
     if file_paths is not None:
-        frames = [
-            {"file_path": file_path, **frame}
-            for file_path, frame in zip(file_paths, frames, strict=True)
-        ]
+        pairs = zip(file_paths, frames, strict=True)
+        frames = [{"file_path": file_path, **frame} for file_path, frame in pairs]
     content = {"camera_model": "PINHOLE", "frames": frames}
     with replacing(path) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())

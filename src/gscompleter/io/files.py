@@ -106,8 +106,7 @@ def check_output(path: Path | str, overwrite: bool = False) -> None:
         InputError: where `path` is a file, is a folder with something in it while `overwrite`
             is off, or cannot be created or written to.
     """
-    with contextlib.closing(_Draft(Path(path), overwrite)):
-        pass
+    _Draft(Path(path), overwrite).close()
 
 
 @contextlib.contextmanager
