@@ -61,8 +61,7 @@ def open_photographs(
     Args:
         path: A file or folder of one of `FORMATS` with a single scene in it.
         format: Name of its format; if left out, found by what lies there.
-        near: Smallest z-depth of the scene, in scene units, where known.
-        far: Largest z-depth of the scene, in scene units, where known.
+        near: As `Photographs` has it, and so `far`.
 
     Raises:
         InputError: where there is no scene or more than one, or its cameras cannot be read.

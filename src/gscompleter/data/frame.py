@@ -63,15 +63,14 @@ class Frame:
             InputError: where neither is known.
         """
         size = self.stored_size()
-        if size is not None:
-            return size
-        if self.intrinsics.size in (None, FRACTIONS):
+        if size is None and self.intrinsics.size != FRACTIONS:
+            size = self.intrinsics.size
+        if size is None:
             raise InputError(
                 f"The size of {self.title} is not known, because it has no image and no `w` and "
                 "`h`; add these, or its image."
             )
-        assert self.intrinsics.size is not None
-        return self.intrinsics.size
+        return size
 
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         """The photograph as it is stored.

@@ -69,10 +69,8 @@ class PosedPhotographs(Protocol):
         Lens distortion is removed: the undistorted image has the size of the photograph and no
         empty pixel, and the intrinsics follow (`lens.undistorted` says how).
 
-        Args:
-            frames: Numbers of frames.
-            resolution: Height and width in pixels: images are resized to cover it, then their
-                centre is cropped. Their own size if left out.
+        Images are resized to cover `resolution` (height and width in pixels), then their centre
+        is cropped. They keep their own size if it is left out.
 
         Raises:
             InputError: where a frame does not exist or cannot be read.
@@ -90,9 +88,7 @@ class PosedPhotographs(Protocol):
     def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
         """Why benchmarks leave the photographs out; None where they keep them.
 
-        Args:
-            size: Height and width that every photograph must have before it is resized, for
-                data sets of one size; any if left out.
+        In data sets of one `size` (height and width) every photograph must be stored in it.
         """
 
 
@@ -127,10 +123,7 @@ class Photographs:
 
     def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
         chosen = [self.frame(number) for number in frames]
-        return [
-            self._view(frame, number, resolution)
-            for number, frame in zip(frames, chosen, strict=True)
-        ]
+        return [self._view(frame, n, resolution) for n, frame in zip(frames, chosen, strict=True)]
 
     def mask(
         self, frame: int, resolution: tuple[int, int] | None = None
@@ -193,15 +186,10 @@ def fitted(
     size: tuple[int, int],
     resolution: tuple[int, int] | None,
 ) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """An image of a frame without lens distortion and at a resolution.
+    """The photograph of a frame without lens distortion and at a resolution (height, width).
 
-    Colours (uint8, [h, w, 3]) are blended; the values of depth maps and masks never are.
-
-    Args:
-        frame: The frame.
-        pixels: Its photograph, or a map of depth or of what is ignored, of any size.
-        size: Width and height of the photograph.
-        resolution: Height and width; those of the photograph if None.
+    Maps [h, w] of depth or of what is ignored are brought to its `size` (width, height) first.
+    Colours (uint8, [h, w, 3]) are blended; the values of maps never are.
 
     Raises:
         InputError: where the camera is impossible.

@@ -35,8 +35,7 @@ def load_views(
             else `open_photographs` opens.
         frames: Numbers of the frames, which are numbered in the order of their sorted
             `file_path`; all frames if left out. Only these are read.
-        resolution: Height and width in pixels: images are resized to cover it, then their
-            centre is cropped. Their own size if left out.
+        resolution: Height and width in pixels, as in `PosedPhotographs.views`.
         near: Smallest z-depth of the scene, in scene units, where known.
         far: Largest z-depth of the scene, in scene units, where known.
 
@@ -112,8 +111,7 @@ def write_cameras(
     Args:
         path: The JSON file.
         cameras: At least one camera.
-        file_paths: Where the image of each one lies, relative to the folder of the JSON file,
-            which makes it the `transforms.json` of a scene.
+        file_paths: Where their images lie, relative to its folder, for a scene's `transforms.json`.
 
     Raises:
         InputError: where the file cannot be written.

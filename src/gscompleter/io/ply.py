@@ -97,11 +97,7 @@ class Header:
 
 
 def read_header(file: BinaryIO, path: Path) -> Header:
-    """The header; `file` is left at the first byte of the data.
-
-    Raises:
-        InputError: where this is not a PLY file, or its header is broken.
-    """
+    """The header; `file` is left at the first byte of the data."""
     first = file.readline(512)
     if first.startswith(b"version https://git-lfs"):
         raise InputError(
@@ -217,8 +213,8 @@ def _ascii_vertices(
         next(lines, None)
     rows = [line.split() for _, line in zip(range(vertex.count), lines, strict=False)]
     width = len(vertex.properties)
-    if len(rows) < vertex.count or (rows and len(rows[-1]) < width):
-        whole = len(rows) - (1 if rows and len(rows[-1]) < width else 0)
+    whole = len(rows) - (1 if rows and len(rows[-1]) < width else 0)
+    if whole < vertex.count:
         raise _truncated(path, whole, vertex.count)
     try:
         table = np.array(rows, dtype=np.float64).reshape(vertex.count, width)
@@ -247,10 +243,8 @@ def _truncated(path: Path, found: int, expected: int, what: str = "Gaussian") ->
 def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """The Gaussians of a 3DGS .ply, of SH degree 0 to 3.
 
-    Args:
-        path: The file.
-        drop_nonfinite: Leave out Gaussians that hold NaN or infinity, or a rotation of zeros,
-            instead of refusing the file.
+    With `drop_nonfinite`, Gaussians that hold NaN or infinity, or a rotation of zeros, are left
+    out; else the file is refused.
 
     Raises:
         InputError: no such file, not a PLY, truncated, empty, not 3DGS, or with damaged values.
@@ -339,9 +333,10 @@ def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
 def _whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
     """`gaussians` where every value can be drawn."""
     assert gaussians.encoded is not None
-    good = torch.isfinite(gaussians.encoded).all(1) & torch.isfinite(gaussians.means).all(1)
-    good &= torch.isfinite(gaussians.sh).flatten(1).all(1) & torch.isfinite(gaussians.scales).all(1)
-    good &= torch.isfinite(gaussians.quats).all(1) & (gaussians.quats != 0).any(1)
+    good = (gaussians.quats != 0).any(1)
+    held = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, gaussians.encoded)
+    for values in held:
+        good &= values.isfinite().flatten(1).all(1)
     bad = int((~good).sum())
     if bad == 0:
         return gaussians
@@ -393,14 +388,10 @@ def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
 def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = None) -> None:
     """Write a standard 3DGS .ply, with `uchar generated` behind the standard properties.
 
-    Nothing is left under `path` unless all of it was written.
-
-    Args:
-        path: The file.
-        gaussians: What it is to hold.
-        provenance: Whether to write `generated`; by default, where anything was generated. Some
-            readers (gsply 0.4 is one) take every property for a float and misread rows that end
-            in a byte; False gives them the plain layout.
+    Nothing is left under `path` unless all of it was written. `provenance` says whether to write
+    `generated`; by default, where anything was generated. Some readers (gsply 0.4 is one) take
+    every property for a float and misread rows that end in a byte; False gives them the plain
+    layout.
 
     Raises:
         InputError: where the file cannot be written.

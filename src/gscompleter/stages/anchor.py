@@ -33,13 +33,12 @@ class AnchorChoice:
 
 def nearest_view(target: Camera, views: Sequence[View]) -> int:
     """Index of the view taken closest to `target`; of equals, the one turned least."""
-    return min(
-        range(len(views)),
-        key=lambda i: (
-            baseline_between(target, views[i].camera),
-            rotation_between(target, views[i].camera),
-        ),
-    )
+
+    def remoteness(index: int) -> tuple[float, float]:
+        camera = views[index].camera
+        return baseline_between(target, camera), rotation_between(target, camera)
+
+    return min(range(len(views)), key=remoteness)
 
 
 def select_anchor(
