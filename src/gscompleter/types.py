@@ -33,8 +33,8 @@ class Movable:
 
     def to(self: M, device: torch.device | str) -> M:
         """The same on `device`."""
-        parts = [(n, part) for n, part in vars(self).items() if isinstance(part, (Tensor, Movable))]
-        return replace(self, **{name: part.to(device) for name, part in parts})
+        parts = {n: part for n, part in vars(self).items() if isinstance(part, (Tensor, Movable))}
+        return replace(self, **{name: part.to(device) for name, part in parts.items()})
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,8 @@ class Gaussians(Movable):
 
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """The Gaussians at `index`: a boolean mask [n], integers [m] or a slice."""
-        columns = [(name, column) for name, column in vars(self).items() if column is not None]
-        return replace(self, **{name: column[index] for name, column in columns})
+        tensors = {name: part for name, part in vars(self).items() if part is not None}
+        return replace(self, **{name: tensor[index] for name, tensor in tensors.items()})
 
     @property
     def sh_degree(self) -> int:

@@ -70,18 +70,17 @@ def run_demo(options: DemoOptions) -> None:
     with output_folder(options.out, options.overwrite) as folder:
         scene = folder / "scene"
         write_motorcycle_scene(scene)
-        summary, completion = complete_folder(
-            CompleteOptions(
-                folder=scene,
-                context=(0, 1),
-                target=(str(scene / "targets.json"),),
-                out=folder / "completion",
-                resolution=RESOLUTION,
-                device=options.device,
-                seed=options.seed,
-                quiet=options.quiet,
-            ),
+        asked = CompleteOptions(
+            folder=scene,
+            context=(0, 1),
+            target=(str(scene / "targets.json"),),
+            out=folder / "completion",
+            resolution=RESOLUTION,
+            device=options.device,
+            seed=options.seed,
+            quiet=options.quiet,
         )
+        summary, completion = complete_folder(asked)
         images = folder / "completion" / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
         shown = strip([read_image(images / f"{name}.png") for name in names])

@@ -24,12 +24,7 @@ from gscompleter.reports.plots import PlotsNotAvailable, plots
 from gscompleter.reports.summary import Summary
 from gscompleter.reports.tables import score_cells, tables
 from gscompleter.runs.methods import methods_named
-from gscompleter.runs.protocols import (
-    ViewByView,
-    index_of,
-    parse_protocol,
-    write_evaluation_index,
-)
+from gscompleter.runs.protocols import ViewByView, index_of, parse_protocol, write_evaluation_index
 from gscompleter.runs.runner import RunConfig, evaluate
 from gscompleter.runs.store import row_paths
 from gscompleter.runs.tasks import Task, task_of, tasks_of

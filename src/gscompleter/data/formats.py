@@ -51,10 +51,7 @@ FORMATS = {
 
 
 def open_photographs(
-    path: Path | str,
-    format: str | None = None,
-    near: float | None = None,
-    far: float | None = None,
+    path: Path | str, format: str | None = None, near: float | None = None, far: float | None = None
 ) -> Photographs:
     """The photographs of one scene, with nothing read but its cameras.
 

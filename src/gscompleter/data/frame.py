@@ -26,7 +26,11 @@ DOWNSCALED = (2, 4, 8)
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One camera of a scene, with nothing of its photograph read."""
+    """One camera of a scene, with nothing of its photograph read.
+
+    Raises:
+        InputError: by its methods, where what they return is missing, damaged or impossible.
+    """
 
     name: str
     title: str
@@ -48,20 +52,12 @@ class Frame:
         return None if self.image is None else self.image()
 
     def stored_size(self) -> tuple[int, int] | None:
-        """Width and height of the photograph; None where there is none.
-
-        Raises:
-            InputError: where it is not an image.
-        """
+        """Width and height of the photograph; None where there is none."""
         stored = self.stored()
         return None if stored is None else image_size(stored, capital(self.title))
 
     def size(self) -> tuple[int, int]:
-        """Width and height of the photograph, or where there is none, what the file says.
-
-        Raises:
-            InputError: where neither is known.
-        """
+        """Width and height of the photograph, or where there is none, what the file says."""
         size = self.stored_size()
         if size is None and self.intrinsics.size != FRACTIONS:
             size = self.intrinsics.size
@@ -73,11 +69,7 @@ class Frame:
         return size
 
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The photograph as it is stored.
-
-        Raises:
-            InputError: where it is missing, damaged or not an image.
-        """
+        """The photograph as it is stored."""
         stored = self.stored()
         if stored is None:
             place = "restore it" if self.image is None else f"put it at {quoted(str(self.image))}"
@@ -102,11 +94,7 @@ class Frame:
         return defect
 
     def pinholes(self, width: int, height: int) -> tuple[Pinhole, Pinhole]:
-        """The intrinsics of a photograph of that size, with its distortion and without.
-
-        Raises:
-            InputError: where they or the pose are impossible.
-        """
+        """The intrinsics of a photograph of that size, with its distortion and without."""
         defect = self.defect(width, height)
         if defect is not None:
             raise self.unusable(defect)

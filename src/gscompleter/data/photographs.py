@@ -36,7 +36,11 @@ MAX_TRANSLATION = 1e3
 
 @runtime_checkable
 class PosedPhotographs(Protocol):
-    """A named sequence of photographs with known cameras, numbered from 0."""
+    """A named sequence of photographs with known cameras, numbered from 0.
+
+    Raises:
+        InputError: by its methods, where a frame does not exist, cannot be read or is impossible.
+    """
 
     @property
     def name(self) -> str:
@@ -57,11 +61,7 @@ class PosedPhotographs(Protocol):
         """Whether the photograph of a frame is there, or its camera only."""
 
     def camera(self, frame: int, resolution: tuple[int, int] | None = None) -> Camera:
-        """The camera of a frame, as `views` has it.
-
-        Raises:
-            InputError: where the frame does not exist, or its camera is impossible.
-        """
+        """The camera of a frame, as `views` has it."""
 
     def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
         """The photographs of `frames`, with depth where there is some. Only these are read.
@@ -71,19 +71,12 @@ class PosedPhotographs(Protocol):
 
         Images are resized to cover `resolution` (height and width in pixels), then their centre
         is cropped. They keep their own size if it is left out.
-
-        Raises:
-            InputError: where a frame does not exist or cannot be read.
         """
 
     def mask(
         self, frame: int, resolution: tuple[int, int] | None = None
     ) -> Bool[Tensor, "h w"] | None:
-        """True where the photograph of a frame is to be ignored; None where nothing is.
-
-        Raises:
-            InputError: where the frame does not exist or its mask cannot be read.
-        """
+        """True where the photograph of a frame is to be ignored; None where nothing is."""
 
     def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
         """Why benchmarks leave the photographs out; None where they keep them.
@@ -142,11 +135,7 @@ class Photographs:
         return None
 
     def frame(self, number: int) -> Frame:
-        """The frame of that number.
-
-        Raises:
-            InputError: where there is none.
-        """
+        """The frame of that number."""
         if not 0 <= number < len(self):
             raise InputError(
                 f"There is no frame {number} in {self.title}, whose frames are numbered 0 to "

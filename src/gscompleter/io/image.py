@@ -33,8 +33,7 @@ def read_image(path: Path | str) -> Float[Tensor, "h w 3"]:
 
 
 def write_image(
-    path: Path | str,
-    image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"],
+    path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"]
 ) -> None:
     """Write colours, or a grey image or mask, as an 8-bit PNG.
 

@@ -57,9 +57,6 @@ _BLOCK = 8192
 """Rows copied at a time: few enough to stay in the cache while one column follows another."""
 
 
-# ------------------------------------------------------------------------------------- header
-
-
 @dataclass(frozen=True)
 class Property:
     """One property of an element."""
@@ -88,16 +85,8 @@ class Element:
         return any(p.count_kind is not None for p in self.properties)
 
 
-@dataclass(frozen=True)
-class Header:
-    """What a PLY file says of itself."""
-
-    format: str
-    elements: list[Element]
-
-
-def read_header(file: BinaryIO, path: Path) -> Header:
-    """The header; `file` is left at the first byte of the data."""
+def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
+    """The format and the elements of a file, which is left at the first byte of the data."""
     first = file.readline(512)
     if first.startswith(b"version https://git-lfs"):
         raise InputError(
@@ -138,7 +127,7 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             f"{path} has the PLY format '{quoted(file_format)}'; ascii, "
             "binary_little_endian and binary_big_endian are known."
         )
-    return Header(file_format, elements)
+    return file_format, elements
 
 
 def _count(word: str) -> int:
@@ -153,17 +142,15 @@ def _property(words: list[str]) -> Property:
     return Property(words[1], _SCALARS[words[0]])
 
 
-# --------------------------------------------------------------------------------------- data
-
-
-def _read_vertices(file: BinaryIO, header: Header, vertex: Element, path: Path) -> np.ndarray:
-    """The rows of `vertex` as a structured array, whatever stands before it skipped."""
-    ahead = header.elements[: header.elements.index(vertex)]
+def _read_vertices(
+    file: BinaryIO, file_format: str, ahead: list[Element], vertex: Element, path: Path
+) -> np.ndarray:
+    """The rows of `vertex` as a structured array, what stands `ahead` of it skipped."""
     for element in ahead:
-        _check_claim(file, element, header.format, path)
-    if header.format == "ascii":
+        _check_claim(file, element, file_format, path)
+    if file_format == "ascii":
         return _ascii_vertices(file, ahead, vertex, path)
-    byte_order = _BYTE_ORDERS[header.format]
+    byte_order = _BYTE_ORDERS[file_format]
     for element in ahead:
         _skip(file, element, byte_order, path)
     dtype = vertex.dtype(byte_order)
@@ -237,9 +224,6 @@ def _truncated(path: Path, found: int, expected: int, what: str = "Gaussian") ->
     )
 
 
-# --------------------------------------------------------------------------------------- load
-
-
 def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """The Gaussians of a 3DGS .ply, of SH degree 0 to 3.
 
@@ -254,22 +238,23 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         if os.path.exists(path) and not os.path.isfile(path):
             raise InputError(f"{quoted(path)} is a directory or a device; a 3DGS .ply is needed.")
         with path.open("rb") as file:
-            header = read_header(file, path)
-            vertex = _gaussian_element(header, path)
-            vertices = _read_vertices(file, header, vertex, path)
+            file_format, elements = read_header(file, path)
+            vertex = _gaussian_element(elements, path)
+            ahead = elements[: elements.index(vertex)]
+            vertices = _read_vertices(file, file_format, ahead, vertex, path)
     except OSError as error:
         raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
     return _whole(_gaussians(vertices, vertex), path, drop_nonfinite)
 
 
-def _gaussian_element(header: Header, path: Path) -> Element:
+def _gaussian_element(elements: list[Element], path: Path) -> Element:
     """The vertex element, once it is known to hold Gaussians."""
-    found = {element.name: element for element in header.elements}
+    found = {element.name: element for element in elements}
     vertex = found.get("vertex")
     if vertex is None:
         raise InputError(f"{path} has no vertices; a 3DGS .ply is needed.")
     names = [p.name for p in vertex.properties]
-    for element in header.elements:
+    for element in elements:
         if len({p.name for p in element.properties}) < len(element.properties):
             raise InputError(
                 f"{path} has a broken header: a property of its element "
@@ -361,9 +346,6 @@ def _decoded_scales(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
 
 def _decoded_opacities(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
     return encoded[:, 3].double().sigmoid().float()
-
-
-# --------------------------------------------------------------------------------------- save
 
 
 def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:

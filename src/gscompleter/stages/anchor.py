@@ -9,13 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from gscompleter.config import AnchorConfig
-from gscompleter.generators import (
-    Generator,
-    ImageFunction,
-    Request,
-    Synthesis,
-    as_generator,
-)
+from gscompleter.generators import Generator, ImageFunction, Request, Synthesis, as_generator
 from gscompleter.geometry import baseline_between, inside, project, rotation_between
 from gscompleter.reconstructors import Reconstructor, reconstructed
 from gscompleter.types import Camera, Lift, SceneContext, View

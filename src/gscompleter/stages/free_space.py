@@ -62,9 +62,7 @@ def respect_free_space(
 
 
 def seen_through(
-    points: Float[Tensor, "n 3"],
-    cameras: Sequence[Camera],
-    renders: Sequence[Render],
+    points: Float[Tensor, "n 3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> Bool[Tensor, "n"]:
     """Which points stand before what some camera sees of the scene."""
     contradicted = torch.zeros(len(points), dtype=torch.bool, device=points.device)
