@@ -22,9 +22,11 @@ def pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
         return "its pose holds NaN or infinity"
     if np.abs(pose).max() > MAX_COORDINATE:
         return f"its pose holds {np.abs(pose).max():g}, which is above {MAX_COORDINATE:g}"
-    if _rigid_error(pose) > MAX_RIGID_ERROR:
+    rotation = pose[:3, :3]
+    errors = (rotation.T @ rotation - np.eye(3), pose[3] - [0, 0, 0, 1])
+    if max(np.abs(error).max() for error in errors) > MAX_RIGID_ERROR:
         return "its pose is not a rigid transform but scaled, sheared or projective"
-    if np.linalg.det(pose[:3, :3]) < 0:
+    if np.linalg.det(rotation) < 0:
         return "its pose is a reflection (its determinant is negative)"
     return None
 
@@ -46,9 +48,3 @@ def c2w_of(viewmat: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     An invalid one may have none. It stays as it is, for its defect to be found in it.
     """
     return viewmat if pose_defect(viewmat) is not None else np.linalg.inv(viewmat)
-
-
-def _rigid_error(pose: Float[np.ndarray, "4 4"]) -> float:
-    rotation = pose[:3, :3]
-    errors = (rotation.T @ rotation - np.eye(3), pose[3] - [0, 0, 0, 1])
-    return float(max(np.abs(error).max() for error in errors))

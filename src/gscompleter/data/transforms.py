@@ -77,7 +77,9 @@ def read_frames(scene: Path) -> list[Frame]:
             or the intrinsics of one are missing or impossible.
     """
     path = _json_path(scene)
-    content = _read_transforms(path)
+    content = read_json(path, "export the scene again")
+    if not isinstance(content, dict):
+        raise InputError(f"{path} is no transforms.json: it has to be an object with `frames`.")
     entries = content.get("frames")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} lists no frames; its `frames` has to be a list with cameras.")
@@ -89,13 +91,6 @@ def read_frames(scene: Path) -> list[Frame]:
 
 def _json_path(scene: Path) -> Path:
     return scene / NAME if os.path.isdir(scene) else scene
-
-
-def _read_transforms(path: Path) -> dict[str, Any]:
-    content = read_json(path, "export the scene again")
-    if not isinstance(content, dict):
-        raise InputError(f"{path} is no transforms.json: it has to be an object with `frames`.")
-    return content
 
 
 def _frame(
