@@ -96,11 +96,9 @@ def register_by_similarity(
     own = renderer.render(lifted, camera)
     theirs = renderer.render(scene, camera)
     both = own.depth_map().valid & theirs.depth_map().valid
-    ratio = (
-        (theirs.depth[both].median() / own.depth[both].median())
-        if both.any()
-        else own.depth.new_ones(())
-    )
+    ratio = own.depth.new_ones(())
+    if both.any():
+        ratio = theirs.depth[both].median() / own.depth[both].median()
     scale = ratio.detach().clone().requires_grad_()
     quaternion = scale.detach().new_tensor([1.0, 0.0, 0.0, 0.0]).requires_grad_()
     translation = torch.zeros(3, device=scale.device, requires_grad=True)

@@ -41,13 +41,11 @@ class Images:
 
     def scores(self) -> dict[str, float | None]:
         """PSNR (dB) and SSIM against the photograph; None where there is none."""
-        if self.truth is None:
-            return dict.fromkeys(("psnr_before", "psnr_after", "ssim_before", "ssim_after"))
+        images = {"before": self.before, "after": self.after}
         return {
-            "psnr_before": psnr(self.before, self.truth),
-            "psnr_after": psnr(self.after, self.truth),
-            "ssim_before": ssim(self.before, self.truth),
-            "ssim_after": ssim(self.after, self.truth),
+            f"{metric.__name__}_{when}": None if self.truth is None else metric(image, self.truth)
+            for metric in (psnr, ssim)
+            for when, image in images.items()
         }
 
 
