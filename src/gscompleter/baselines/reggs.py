@@ -16,12 +16,7 @@ from jaxtyping import Float
 from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
-from gscompleter.baselines.mixture_wasserstein import (
-    Mixture,
-    SinkhornConfig,
-    mixture_wasserstein,
-    reduced,
-)
+from gscompleter.baselines.mixture_wasserstein import Mixture, mixture_wasserstein, reduced
 from gscompleter.geometry import quats_product, rotations_from
 from gscompleter.progress import track
 from gscompleter.render import Renderer
@@ -46,8 +41,6 @@ class RegGSConfig:
     patience: int = 10
     """The mixture distance is left out for good once it is no smaller than the largest of its
     last values, so many of them."""
-    sinkhorn: SinkhornConfig = SinkhornConfig()
-    """The mixture distance."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +119,7 @@ def register_by_similarity(
         loss = config.colour_weight * colour + config.depth_weight * depth
         if compare_mixtures:
             distance = mixture_wasserstein(
-                scaled(small_lifted, scale), turned(small_scene, fit, camera), config.sinkhorn
+                scaled(small_lifted, scale), turned(small_scene, fit, camera)
             )
             recent = distances[-config.patience :]
             if len(distances) >= config.patience and distance.item() >= max(recent):

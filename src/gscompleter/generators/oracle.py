@@ -26,7 +26,7 @@ class Oracle:
     at_once: int = 1
 
     def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
-        """The photographs of the targets; an InputError where there is none."""
+        """The photographs of the targets, errors as those of `photograph`."""
         return [Synthesis(self.photograph(request.target)) for request in requests]
 
     def photograph(self, target: Camera) -> Float[Tensor, "h w 3"]:

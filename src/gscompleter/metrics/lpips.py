@@ -276,6 +276,10 @@ def read_weights(path: Path, file: WeightsFile) -> Mapping[str, Tensor]:
     return weights
 
 
+cached_lpips = lru_cache(maxsize=2)(load_lpips)
+"""`load_lpips`, which keeps the last two, as tables ask again and again."""
+
+
 @torch.no_grad()
 def lpips_if_available(
     image: Float[Tensor, "h w 3"],
@@ -285,13 +289,7 @@ def lpips_if_available(
 ) -> float | None:
     """LPIPS where its weights lie on this machine, else None; nothing is downloaded."""
     try:
-        metric = cached_lpips(network, folder)
+        metric = cached_lpips(network, folder, download=False)
     except WeightsNotAvailable:
         return None
     return float(metric(image, truth).item())
-
-
-@lru_cache(maxsize=2)
-def cached_lpips(network: NetworkName, folder: Path | None) -> Lpips:
-    """`load_lpips` without a download; the last two are kept, as tables ask again and again."""
-    return load_lpips(network, folder, download=False)

@@ -85,7 +85,8 @@ def summarize(
                     for key in ("scale", "shift", "inliers", "method")
                 },
                 **images.scores(),
-                "generated": provenance(result),
+                # the property of completed.ply that marks what this target added
+                "generated": int(result.added.generated[0]) if len(result.added) else None,
                 "added": len(result.added),
                 "notes": list(result.notes),
             }
@@ -96,11 +97,6 @@ def summarize(
         "gaussians": {"context": len(completion.context), "added": len(completion.added)},
         "seconds": dict(completion.seconds),
     }
-
-
-def provenance(result: TargetCompletion) -> int | None:
-    """The value of the property `generated` that marks what this target added."""
-    return int(result.added.generated[0]) if len(result.added) else None
 
 
 def write_report(
