@@ -128,11 +128,7 @@ def source_depth_named(name: str, device: str = "cpu") -> SourceDepth:
 
 @lru_cache(maxsize=1)
 def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth:
-    """A depth estimation model of transformers, for `PEField(depth=...)`.
-
-    Args:
-        path: A folder, USER/NAME or USER/NAME@COMMIT.
-        device: cpu or cuda.
+    """A depth estimation model of transformers from a folder, USER/NAME or USER/NAME@COMMIT.
 
     Raises:
         InputError: where packages are missing or the model cannot be had.
