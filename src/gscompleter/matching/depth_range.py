@@ -10,11 +10,7 @@ from jaxtyping import Float
 
 from gscompleter.errors import InputError
 from gscompleter.matching.features import features_of, matches
-from gscompleter.matching.stereo_image import (
-    StereoImage,
-    source_from_reference,
-    stereo_images,
-)
+from gscompleter.matching.stereo_image import StereoImage, source_from_reference, stereo_images
 from gscompleter.types import View
 
 MIN_MATCHES = 12

@@ -200,10 +200,7 @@ _FILES = (
     replace(MVSPLAT, name="mvsplat-acid", file="acid.ckpt"),
     # Retrained by VolSplat's authors. Whether their tensors are named as those above is not known.
     replace(
-        MVSPLAT,
-        name="mvsplat-re10k-6view",
-        file="mvsplat-re10k-baseline-256x256.ckpt",
-        **BASELINE,
+        MVSPLAT, name="mvsplat-re10k-6view", file="mvsplat-re10k-baseline-256x256.ckpt", **BASELINE
     ),
     DEPTHSPLAT,
     _depthsplat(

@@ -160,9 +160,7 @@ class DepthPredictor(nn.Module):
         self.regressor_residual.append(nn.Conv2d(channels, width, 1))
         self.depth_head.append(
             nn.Sequential(
-                padded_conv3x3(width, 2 * width),
-                nn.GELU(),
-                padded_conv3x3(2 * width, candidates),
+                padded_conv3x3(width, 2 * width), nn.GELU(), padded_conv3x3(2 * width, candidates)
             )
         )
 

@@ -72,13 +72,7 @@ class DepthSplat(PixelFeatures):
         )
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
-        """The Gaussians of all pixels.
-
-        Args:
-            images: In [0, 1], at least two views, with sides that are multiples of
-                `config.patch`.
-            cameras: Of the views.
-        """
+        """The Gaussians of all pixels; see `DepthPredictor` for the images."""
         depth, features = self.describe(images, cameras)
         raw = self.gaussian_head(features)
         flat = images.flatten(0, 1)

@@ -108,10 +108,7 @@ class DepthPredictor(nn.Module):
         return 1 / disparity, density.sigmoid(), raw
 
     def coarse_disparity(
-        self,
-        features: Float[Tensor, "n 128 p q"],
-        cameras: Cameras,
-        sources: Int[Tensor, "b v s"],
+        self, features: Float[Tensor, "n 128 p q"], cameras: Cameras, sources: Int[Tensor, "b v s"]
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n 1 h w"]]:
         """Expected inverse depth, and the probability of the best, at full resolution."""
         candidates = evenly_spaced(*cameras.inverse_range(), NUM_CANDIDATES)
@@ -134,12 +131,7 @@ class MVSplat(nn.Module):
         self.depth_predictor = DepthPredictor(config.depth_chunk)
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
-        """The Gaussians of all pixels.
-
-        Args:
-            images: In [0, 1], at least two views, with sides that are multiples of 16.
-            cameras: Of the views.
-        """
+        """The Gaussians of all pixels of at least two views, whose sides are multiples of 16."""
         b, v = images.shape[:2]
         sources = other_views(b, v, images.device)
         flat = images.flatten(0, 1)

@@ -100,12 +100,7 @@ class VolSplat(PixelFeatures):
         self.gaussian_head = GaussianHead(self.channels, sum(PARTS))
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> VoxelGaussians:
-        """The Gaussians of all voxels of one scene.
-
-        Args:
-            images: In [0, 1], at least two views, with sides that are multiples of
-                `config.patch`.
-            cameras: Of the views.
+        """The Gaussians of all voxels of one scene; see `DepthPredictor` for the images.
 
         Raises:
             InputError: depths that are not finite, or voxels spread too widely to be counted.

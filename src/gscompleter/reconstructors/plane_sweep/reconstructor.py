@@ -13,11 +13,7 @@ from jaxtyping import Float32
 from gscompleter.kernels import stereo
 from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.matching.features import features_of, matches
-from gscompleter.matching.stereo_image import (
-    StereoImage,
-    source_from_reference,
-    stereo_images,
-)
+from gscompleter.matching.stereo_image import StereoImage, source_from_reference, stereo_images
 from gscompleter.reconstructors.plane_sweep.aggregation import aggregate
 from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance
 from gscompleter.reconstructors.plane_sweep.confidence import confidence_of, consistent
