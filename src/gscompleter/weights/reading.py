@@ -43,11 +43,7 @@ def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
 
 
 def check_kind(path: Path, name: str) -> None:
-    """Find by its first and last bytes that a file is no file of weights at all.
-
-    Raises:
-        InputError: where it is missing, empty, a pointer, a web page, or cut off.
-    """
+    """Raise an InputError where a file is missing, empty, a pointer, a web page, or cut off."""
     if not os.path.isfile(path):
         raise InputError(f"There is no file {path}; {name} is needed there.")
     try:
@@ -67,7 +63,7 @@ def check_kind(path: Path, name: str) -> None:
     elif head.startswith(b"PK\x03\x04") and not is_archive(path):
         wrong = "ends too early, as after an interrupted download"
     if wrong:
-        raise InputError(f"{path} {wrong}; {_replace_it(path, name)}.")
+        raise _broken(path, wrong, name)
 
 
 def check_sha256(path: Path, expected: str, name: str) -> None:
@@ -85,10 +81,8 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
                 f"{path} is not the published file {name} but that of {other.name}; choose that "
                 f"model, or fetch {name}."
             )
-    raise InputError(
-        f"{path} is not the published file {name}: its SHA-256 begins with {digest[:8]} instead "
-        f"of {expected[:8]}; {_replace_it(path, name)}."
-    )
+    begins = f"its SHA-256 begins with {digest[:8]} instead of {expected[:8]}"
+    raise _broken(path, f"is not the published file {name}: {begins}", name)
 
 
 def sha256_of(path: Path) -> str:
@@ -109,11 +103,7 @@ def is_archive(path: Path) -> bool:
 
 
 def check_archive(path: Path, name: str) -> None:
-    """Compare the parts of a zip archive, as which torch saves, with their checksums.
-
-    Raises:
-        InputError: where one differs.
-    """
+    """Raise an InputError where a part of a zip archive differs from its checksum."""
     if not is_archive(path):
         return
     try:
@@ -122,7 +112,7 @@ def check_archive(path: Path, name: str) -> None:
     except Exception as error:  # an archive can be damaged in any way
         damaged = str(error)
     if damaged is not None:
-        raise InputError(f"{path} is damaged ({quoted(damaged)}); {_replace_it(path, name)}.")
+        raise _broken(path, f"is damaged ({quoted(damaged)})", name)
 
 
 def read_tensors(path: Path, name: str) -> Any:
@@ -138,15 +128,11 @@ def read_tensors(path: Path, name: str) -> Any:
     except pickle.UnpicklingError as error:
         found = re.search(r"GLOBAL (\S+)", str(error))
         if found is None:
-            raise InputError(
-                f"{path} holds no plain weights; {_replace_it(path, name)}."
-            ) from error
-        raise InputError(
-            f"{path} holds no plain weights but Python objects too ({quoted(found[1])}), and to "
-            f"load those may run any code; {_replace_it(path, name)}."
-        ) from error
+            raise _broken(path, "holds no plain weights", name) from error
+        objects = f"Python objects too ({quoted(found[1])}), and to load those may run any code"
+        raise _broken(path, f"holds no plain weights but {objects}", name) from error
     except Exception as error:  # a damaged pickle can fail in any way
-        raise InputError(f"{path} cannot be read by torch; {_replace_it(path, name)}.") from error
+        raise _broken(path, "cannot be read by torch", name) from error
 
 
 def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
@@ -211,9 +197,9 @@ def is_plain(tensor: Tensor) -> bool:
     return strided and not (tensor.is_meta or tensor.is_quantized or tensor.is_complex())
 
 
-def _replace_it(path: Path, name: str) -> str:
+def _broken(path: Path, wrong: str, name: str) -> InputError:
     # In the hub's cache the path is a link; without the file behind it, it is fetched anew.
-    return f"delete {path.resolve()} and fetch {name} again"
+    return InputError(f"{path} {wrong}; delete {path.resolve()} and fetch {name} again.")
 
 
 def _some(keys: list[str]) -> str:

@@ -13,6 +13,9 @@ from gscompleter.reconstructors.feed_forward.resampling import resized
 
 VIT = "vit"
 """Stands, among the names of maps that are joined, for the transformer's own."""
+CHANNELS = {"cnn0": 64, "cnn1": 96, "cnn2": 128, "matching0": 128, "matching1": 64, "disparity": 1}
+"""Of the maps they are joined with: of the encoder (finest first), of the multi-view transformer
+(coarsest first), and the inverse depth."""
 Layout = Sequence[Sequence[str]]
 """Names of the maps that are joined at 1/2, 1/4 and 1/8 of full resolution, in this order."""
 
@@ -100,7 +103,6 @@ class DptHead(nn.Module):
         widths: Sequence[int],
         features: int,
         layout: Layout,
-        channels: Mapping[str, int],
         out: nn.Module | None = None,
     ) -> None:
         """
@@ -109,7 +111,6 @@ class DptHead(nn.Module):
             widths: Channels of the four levels, finest first.
             features: Channels of the fused map.
             layout: Which maps are joined at the three finest levels.
-            channels: Of the maps that `layout` names.
             out: What follows the fusion, if anything does.
         """
         super().__init__()
@@ -124,7 +125,7 @@ class DptHead(nn.Module):
             ]
         )
         self.concat_projects = nn.ModuleList(
-            nn.Conv2d(sum(width if name == VIT else channels[name] for name in names), width, 1)
+            nn.Conv2d(sum(width if name == VIT else CHANNELS[name] for name in names), width, 1)
             for names, width in zip(layout, widths[:3], strict=True)
         )
         self.scratch = Scratch(widths, features, out)

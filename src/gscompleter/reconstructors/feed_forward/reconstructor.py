@@ -94,18 +94,15 @@ def reconstruction_of_voxels(
 ) -> Reconstruction:
     """The scene on the device of its views; its Gaussians belong to no particular pixel."""
     device = views[0].image.device
-    gaussians = observed(
-        predicted.means, predicted.quats, predicted.scales, predicted.opacities, predicted.sh
-    )
     depths = [
         crop.padded(depth, view.camera)
         for depth, view, crop in zip(predicted.depth.to(device), views, crops, strict=True)
     ]
-    return Reconstruction(gaussians.to(device), tuple(depths))
+    return Reconstruction(gaussians_of(predicted).to(device), tuple(depths))
 
 
-def gaussians_of(predicted: PixelGaussians) -> Gaussians:
-    """View by view, row by row, without the harmonics that nothing shows."""
+def gaussians_of(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
+    """Those of pixels view by view and row by row; without the harmonics that nothing shows."""
     return observed(
         predicted.means.flatten(0, -2),
         predicted.quats.flatten(0, -2),

@@ -86,8 +86,7 @@ class GaussianHead(nn.Module):
         self, features: Float[Tensor, "n channels_in"], grid: Grid
     ) -> Float[Tensor, "n channels_out"]:
         neighbours = neighbours_within(grid)
-        raw: Tensor = self.conv2(F.gelu(self.conv1(features, neighbours)), neighbours)
-        return raw
+        return self.conv2(F.gelu(self.conv1(features, neighbours)), neighbours)
 
 
 class VolSplat(PixelFeatures):
