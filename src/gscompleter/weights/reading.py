@@ -161,16 +161,17 @@ def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> d
     Raises:
         InputError: where there are none, or others than are known to lie beside them.
     """
+
+    def other(held: str) -> InputError:
+        return InputError(f"{path} holds {held}; give {weights.file}.")
+
     inner = content.get(weights.entry, content) if isinstance(content, Mapping) else None
     if not isinstance(inner, Mapping) or not all(isinstance(key, str) for key in inner):
-        raise InputError(f"{path} holds no named tensors; give {weights.file}.")
+        raise other("no named tensors")
     prefix = weights.prefix
     found = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
     if not found:
-        raise InputError(
-            f"{path} holds no tensors named {prefix}…, but {_some(list(inner))}; give "
-            f"{weights.file}."
-        )
+        raise other(f"no tensors named {prefix}…, but {_some(list(inner))}")
     unknown = [
         key
         for key, value in inner.items()
@@ -178,16 +179,11 @@ def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> d
         and not key.startswith(NOT_THE_ENCODERS)
     ]
     if unknown:
-        raise InputError(
-            f"{path} holds more than the network {weights.name}: {_some(unknown)}; give "
-            f"{weights.file}."
-        )
+        raise other(f"more than the network {weights.name}: {_some(unknown)}")
     odd = [key for key, value in found.items() if not is_plain(value)]
     if odd:
-        raise InputError(
-            f"{path} holds tensors without plain numbers ({_some(odd)}): empty shells, sparse or "
-            f"quantized ones; give {weights.file}."
-        )
+        kinds = "empty shells, sparse or quantized ones"
+        raise other(f"tensors without plain numbers ({_some(odd)}): {kinds}")
     return found
 
 

@@ -17,10 +17,16 @@ from gscompleter.reconstructors.feed_forward.cameras import Cameras, nearest_vie
 from gscompleter.reconstructors.feed_forward.cnn import ImageEncoder, normalised
 from gscompleter.reconstructors.feed_forward.cost_volume import cost_volume, evenly_spaced
 from gscompleter.reconstructors.feed_forward.dino import PATCH, DinoV2
-from gscompleter.reconstructors.feed_forward.dpt import CHANNELS, DptHead, Layout, padded_conv3x3
+from gscompleter.reconstructors.feed_forward.dpt import (
+    CHANNELS,
+    DptHead,
+    Layout,
+    padded_conv3x3,
+    two_padded_convolutions,
+)
 from gscompleter.reconstructors.feed_forward.resampling import enlarged, resized
 from gscompleter.reconstructors.feed_forward.transformer import MultiViewTransformer
-from gscompleter.reconstructors.feed_forward.unet import Steps, UNet, conv3x3
+from gscompleter.reconstructors.feed_forward.unet import UNet, conv3x3, refiner
 
 MAX_SOURCES = 2
 """Of more than three views each is matched with the two nearest, else with all others."""
@@ -142,23 +148,9 @@ class DepthPredictor(nn.Module):
         of_image, of_vit = CHANNELS[f"cnn{2 - scale}"], self.vit.channels // 2**scale
         channels = candidates + of_image + width + of_vit
         unet = UNet(width, levels=3 + scale, attention_level=2 + scale, pre_norm=True)
-        self.regressor.append(
-            Steps(
-                [
-                    conv3x3(channels, width),
-                    nn.GroupNorm(8, width),
-                    nn.GELU(),
-                    unet,
-                    conv3x3(width, width),
-                ]
-            )
-        )
+        self.regressor.append(refiner(channels, width, unet))
         self.regressor_residual.append(nn.Conv2d(channels, width, 1))
-        self.depth_head.append(
-            nn.Sequential(
-                padded_conv3x3(width, 2 * width), nn.GELU(), padded_conv3x3(2 * width, candidates)
-            )
-        )
+        self.depth_head.append(two_padded_convolutions(width, 2 * width, candidates))
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> DepthPrediction:
         """Depth and features of at least two views in [0, 1], their sides multiples of `patch`."""

@@ -25,6 +25,10 @@ def padded_conv3x3(channels: int, out: int) -> nn.Conv2d:
     return nn.Conv2d(channels, out, 3, 1, 1, padding_mode="replicate")
 
 
+def two_padded_convolutions(channels: int, width: int, out: int) -> nn.Sequential:
+    return nn.Sequential(padded_conv3x3(channels, width), nn.GELU(), padded_conv3x3(width, out))
+
+
 class ResidualUnit(nn.Module):
     """Two convolutions of what is positive, added to the input."""
 
