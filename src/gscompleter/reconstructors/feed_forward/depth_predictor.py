@@ -155,11 +155,8 @@ class DepthPredictor(nn.Module):
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> DepthPrediction:
         """Depth and features of at least two views in [0, 1], their sides multiples of `patch`."""
         b, v = images.shape[:2]
-        sources = (
-            nearest_views(cameras, MAX_SOURCES)
-            if v > MAX_SOURCES + 1
-            else other_views(b, v, images.device)
-        )
+        few = v <= MAX_SOURCES + 1
+        sources = other_views(b, v, images.device) if few else nearest_views(cameras, MAX_SOURCES)
         flat = normalised(images.flatten(0, 1))
         encoded = self.backbone(flat)
         matching = self.mv_pyramid(self.transformer(encoded[-1], sources))

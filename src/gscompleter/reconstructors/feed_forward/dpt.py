@@ -87,10 +87,8 @@ class Scratch(nn.Module):
         self.output_conv = nn.Identity() if out is None else out
 
     def forward(self, pyramid: Sequence[Float[Tensor, "n _ _ _"]]) -> Float[Tensor, "n c h w"]:
-        a = self.layer1_rn(pyramid[0])
-        b = self.layer2_rn(pyramid[1])
-        c = self.layer3_rn(pyramid[2])
-        d = self.layer4_rn(pyramid[3])
+        layers = (self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn)
+        a, b, c, d = (layer(x) for layer, x in zip(layers, pyramid, strict=True))
         x = self.refinenet4(d, c.shape[2:])
         x = self.refinenet3.fused(x, c, b.shape[2:])
         x = self.refinenet2.fused(x, b, a.shape[2:])
