@@ -14,6 +14,7 @@ from typing import Any, Literal
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, load_generator
+from gscompleter.memory import check_memory
 from gscompleter.progress import shown_on, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
@@ -142,7 +143,8 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
     """Read the photographs of a task, and read, or compute, the scene that all methods begin with.
 
     Raises:
-        InputError: where a photograph is damaged, other than that of a later target.
+        InputError: where a photograph is damaged, other than that of a later target, or there is
+            not enough memory.
         OutputError: where the scene cannot be saved.
     """
     views = photographs(task, task.context, config)
@@ -150,6 +152,8 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
     targets, error = readable_targets(task, config)
     if not targets:
         raise InputError(str(error))
+    images = [*views, *targets]
+    check_memory(max(v.camera.width * v.camera.height for v in images), len(images))
     models = config.models(targets)
     context = context_at(folder / "context.npz", views, models)
 
