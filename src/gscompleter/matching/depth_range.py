@@ -94,7 +94,7 @@ def triangulated(images: Sequence[StereoImage]) -> Float[np.ndarray, "n"]:
 
 def _inverse_depths(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
-) -> Float[np.ndarray, "m"]:
+) -> Float[np.ndarray, "k"]:
     """Inverse z-depths in `reference` of the matches that lie on their epipolar lines.
 
     A match that hardly moves tells nothing of depth.
