@@ -13,7 +13,7 @@ import torch
 
 from chunk_files import as_tensor, example, save_chunk
 from command import run
-from gscompleter import GSCompleter, InputError
+from gscompleter import GSCompleter, InputError, memory
 from gscompleter.completer import STAGES
 from gscompleter.data.cases import Case
 from gscompleter.io.image import read_image
@@ -410,3 +410,10 @@ def test_full_is_what_the_completer_does_by_itself(tasks):
     assert torch.equal(predicted.scene.opacities, alone.scene.opacities)
     reference = models.completer().reference(state, target.camera)
     assert torch.equal(reference.image, alone.targets[0].reference.image)
+
+
+def test_a_task_beyond_the_memory_is_a_row_that_says_so(tasks, tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "memory_bytes", lambda: 10**8)
+    assert evaluate(tasks[:1], ("full",), tmp_path / "out", CONFIG) == RowCounts(0, 1, 0)
+    (row,) = (tmp_path / "out" / "tasks").glob("*/full.json")
+    assert "of memory, and there are 1 GB; choose a smaller" in read_json(row)["error"]

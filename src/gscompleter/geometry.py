@@ -63,13 +63,8 @@ def rotation_between(a: Camera, b: Camera) -> float:
     """
     relative = (a.c2w[:3, :3].T @ b.c2w[:3, :3]).double()
     cos = (relative.trace() - 1) / 2
-    axis = torch.stack(
-        [
-            relative[2, 1] - relative[1, 2],
-            relative[0, 2] - relative[2, 0],
-            relative[1, 0] - relative[0, 1],
-        ]
-    )
+    skew = relative - relative.T
+    axis = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
     return torch.rad2deg(torch.atan2(axis.norm() / 2, cos)).item()
 
 
@@ -102,12 +97,11 @@ def same_camera(a: Camera, b: Camera) -> bool:
 def rotations_from(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
     """Rotation matrices of wxyz quaternions of any length but zero."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=-1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=-1),
-    ]
-    return torch.stack(rows, dim=-2)
+    return matrices(
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    )
 
 
 def quats_from(rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
@@ -117,15 +111,7 @@ def quats_from(rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
     y, z = 1 - r[0] + r[4] - r[8], 1 - r[0] - r[4] + r[8]
     a, b, c = r[7] - r[5], r[2] - r[6], r[3] - r[1]
     d, e, f = r[3] + r[1], r[2] + r[6], r[7] + r[5]
-    candidates = torch.stack(
-        [
-            torch.stack([w, a, b, c], dim=-1),
-            torch.stack([a, x, d, e], dim=-1),
-            torch.stack([b, d, y, f], dim=-1),
-            torch.stack([c, e, f, z], dim=-1),
-        ],
-        dim=-2,
-    )
+    candidates = matrices([w, a, b, c], [a, x, d, e], [b, d, y, f], [c, e, f, z])
     largest = torch.stack([w, x, y, z], dim=-1).argmax(-1)
     best = candidates.take_along_dim(largest[..., None, None], dim=-2)[..., 0, :]
     return torch.nn.functional.normalize(best, dim=-1)
@@ -136,10 +122,10 @@ def quats_product(
 ) -> Float[Tensor, "*n 4"]:
     """wxyz quaternions of the rotations `before` followed by the rotations `after`."""
     w, x, y, z = after.unbind(-1)
-    rows = [
-        torch.stack([w, -x, -y, -z], dim=-1),
-        torch.stack([x, w, -z, y], dim=-1),
-        torch.stack([y, z, w, -x], dim=-1),
-        torch.stack([z, -y, x, w], dim=-1),
-    ]
-    return (torch.stack(rows, dim=-2) @ before[..., None])[..., 0]
+    left = matrices([w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w])
+    return (left @ before[..., None])[..., 0]
+
+
+def matrices(*rows: list[Float[Tensor, "*n"]]) -> Float[Tensor, "*n r c"]:
+    """The matrices of which these are the entries, row by row."""
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
@@ -24,9 +24,21 @@ from gscompleter.coverage import COVERED
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
 
+M = TypeVar("M", bound="Movable")
+
 
 @dataclass(frozen=True)
-class Camera:
+class Movable:
+    """What holds tensors, or other such values, that lie on one device together."""
+
+    def to(self: M, device: torch.device | str) -> M:
+        """The same on `device`."""
+        parts = {n: part for n, part in vars(self).items() if isinstance(part, (Tensor, Movable))}
+        return replace(self, **{name: part.to(device) for name, part in parts.items()})
+
+
+@dataclass(frozen=True)
+class Camera(Movable):
     """A pinhole camera with OpenCV axes: x right, y down, z forward."""
 
     c2w: Float[Tensor, "4 4"]
@@ -79,9 +91,6 @@ class Camera:
         pixels = torch.nn.functional.pad(pixels, (0, 1), value=1.0)
         return pixels @ torch.linalg.inv(self.K).T @ self.c2w[:3, :3].T
 
-    def to(self, device: torch.device | str) -> Camera:
-        return replace(self, c2w=self.c2w.to(device), K=self.K.to(device))
-
 
 @dataclass(frozen=True)
 class Window:
@@ -102,7 +111,7 @@ class Window:
 
 
 @dataclass(frozen=True)
-class View:
+class View(Movable):
     """A photograph (or a synthesized image) and the camera that took it."""
 
     image: Float[Tensor, "h w 3"]
@@ -112,15 +121,9 @@ class View:
     depth: Float[Tensor, "h w"] | None = None
     """Measured z-depth in scene units, 0 where unknown. For scoring: no stage reads it."""
 
-    def to(self, device: torch.device | str) -> View:
-        depth = None if self.depth is None else self.depth.to(device)
-        return replace(
-            self, image=self.image.to(device), camera=self.camera.to(device), depth=depth
-        )
-
 
 @dataclass(frozen=True)
-class Gaussians:
+class Gaussians(Movable):
     """A set of n 3D Gaussians in the world frame, with their provenance."""
 
     means: Float[Tensor, "n 3"]
@@ -145,30 +148,12 @@ class Gaussians:
 
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """The Gaussians at `index`: a boolean mask [n], integers [m] or a slice."""
-        return Gaussians(
-            self.means[index],
-            self.quats[index],
-            self.scales[index],
-            self.opacities[index],
-            self.sh[index],
-            self.generated[index],
-            None if self.encoded is None else self.encoded[index],
-        )
+        tensors = {name: part for name, part in vars(self).items() if part is not None}
+        return replace(self, **{name: tensor[index] for name, tensor in tensors.items()})
 
     @property
     def sh_degree(self) -> int:
         return {1: 0, 4: 1, 9: 2, 16: 3}[self.sh.shape[1]]
-
-    def to(self, device: torch.device | str) -> Gaussians:
-        return Gaussians(
-            self.means.to(device),
-            self.quats.to(device),
-            self.scales.to(device),
-            self.opacities.to(device),
-            self.sh.to(device),
-            self.generated.to(device),
-            None if self.encoded is None else self.encoded.to(device),
-        )
 
 
 def observed(
@@ -192,17 +177,11 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
         raise ValueError("merge needs at least one set of Gaussians, got none")
     k = max(part.sh.shape[1] for part in parts)
     sh = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
-    encoded = None
-    if any(part.encoded is not None for part in parts):
-        unknown = float("nan")  # equal to nothing: the writer encodes these anew
-        encoded = torch.cat(
-            [
-                part.means.new_full((len(part), 4), unknown)
-                if part.encoded is None
-                else part.encoded
-                for part in parts
-            ]
-        )
+    unknown = float("nan")  # equal to nothing: the writer encodes these anew
+    encoded = [
+        part.means.new_full((len(part), 4), unknown) if part.encoded is None else part.encoded
+        for part in parts
+    ]
     return Gaussians(
         torch.cat([part.means for part in parts]),
         torch.cat([part.quats for part in parts]),
@@ -210,7 +189,7 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
         torch.cat([part.opacities for part in parts]),
         torch.cat(sh),
         torch.cat([part.generated for part in parts]),
-        encoded,
+        torch.cat(encoded) if any(part.encoded is not None for part in parts) else None,
     )
 
 

@@ -15,6 +15,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+EPSILON = 0.1
+"""Entropic regularisation, in squared units of length."""
+MAX_ITERATIONS = 100
+"""Most updates of the two potentials."""
+TOLERANCE = 1e-5
+"""Largest change of a potential at which it has converged."""
+
 
 @dataclass(frozen=True)
 class Mixture:
@@ -24,16 +31,6 @@ class Mixture:
     covariances: Float[Tensor, "n 3 3"]
     weights: Float[Tensor, "n"]
     """They sum to 1."""
-
-
-@dataclass(frozen=True)
-class SinkhornConfig:
-    epsilon: float = 0.1
-    """Entropic regularisation, in squared units of length."""
-    max_iterations: int = 100
-    """Most updates of the two potentials."""
-    tolerance: float = 1e-5
-    """Largest change of a potential at which it has converged."""
 
 
 def reduced(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
@@ -91,9 +88,7 @@ class _Root(torch.autograd.Function):
         return vectors @ inner @ vectors.transpose(-1, -2)
 
 
-def mixture_wasserstein(
-    a: Mixture, b: Mixture, config: SinkhornConfig = SinkhornConfig()
-) -> Float[Tensor, ""]:
+def mixture_wasserstein(a: Mixture, b: Mixture) -> Float[Tensor, ""]:
     """Σ plan * cost, differentiable in both mixtures.
 
     The plan's largest entry is scaled to 1, as RegGS has it, so that the value is larger than the
@@ -101,13 +96,13 @@ def mixture_wasserstein(
     """
     cost = pairwise_costs(a, b)
     log_a, log_b = (a.weights + 1e-10).log(), (b.weights + 1e-10).log()
-    log_kernel = -cost / config.epsilon
+    log_kernel = -cost / EPSILON
     log_u, log_v = torch.zeros_like(log_a), torch.zeros_like(log_b)
-    for _ in range(config.max_iterations):
+    for _ in range(MAX_ITERATIONS):
         log_u = log_a - torch.logsumexp(log_kernel + log_v[None], dim=1)
         before = log_v
         log_v = log_b - torch.logsumexp(log_kernel + log_u[:, None], dim=0)
-        if (log_v - before).abs().max() < config.tolerance:
+        if (log_v - before).abs().max() < TOLERANCE:
             break
     log_plan = log_u[:, None] + log_kernel + log_v[None]
     return ((log_plan - log_plan.max()).exp() * cost).sum()

@@ -20,7 +20,7 @@ from torch.nn.functional import conv2d
 from gscompleter.geometry import rotations_from
 from gscompleter.progress import track
 from gscompleter.render import Renderer
-from gscompleter.types import Camera, Gaussians, View, merge, observed
+from gscompleter.types import Camera, Gaussians, View, merge
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,8 @@ def optimize(
             dense = densified(state.gaussians(), crowded, extent, random, config)
             state = Parameters.of(dense, config, extent)
             slopes = counts = torch.zeros_like(dense.opacities)
-    return Optimized(state.gaussians(detached=True), tuple(losses))
+    with torch.no_grad():  # in which a slice of the leaves is none
+        return Optimized(state.gaussians()[:], tuple(losses))
 
 
 def round_numbers(config: OptimizationConfig) -> set[int]:
@@ -119,39 +120,25 @@ class Parameters:
     @staticmethod
     def of(scene: Gaussians, config: OptimizationConfig, extent: float) -> Parameters:
         """Leaves to optimise. Adam begins anew after each round of density control."""
-        means, quats, log_scales, logits, sh = (
-            value.detach().clone().requires_grad_()
-            for value in (
-                scene.means,
-                scene.quats,
-                scene.scales.clamp_min(1e-12).log(),
-                scene.opacities.logit(eps=1e-4),
-                scene.sh,
-            )
+        rates = (
+            (scene.means, config.position_rate * extent),
+            (scene.quats, config.rotation_rate),
+            (scene.scales.clamp_min(1e-12).log(), config.scale_rate),
+            (scene.opacities.logit(eps=1e-4), config.opacity_rate),
+            (scene.sh, config.colour_rate),
         )
+        leaves = [value.detach().clone().requires_grad_() for value, _ in rates]
         groups = [
-            {"params": [means], "lr": config.position_rate * extent},
-            {"params": [quats], "lr": config.rotation_rate},
-            {"params": [log_scales], "lr": config.scale_rate},
-            {"params": [logits], "lr": config.opacity_rate},
-            {"params": [sh], "lr": config.colour_rate},
+            {"params": [leaf], "lr": rate} for leaf, (_, rate) in zip(leaves, rates, strict=True)
         ]
         optimizer = torch.optim.Adam(groups, eps=1e-15)
+        means, quats, log_scales, logits, sh = leaves
         return Parameters(means, quats, log_scales, logits, sh, scene.generated, optimizer)
 
-    def gaussians(self, detached: bool = False) -> Gaussians:
-        made = observed(
-            means=self.means,
-            quats=self.quats,
-            scales=self.log_scales.exp(),
-            opacities=self.logits.sigmoid(),
-            sh=self.sh,
-        )
-        made = replace(made, generated=self.generated)
-        if not detached:
-            return made
-        names = ("means", "quats", "scales", "opacities", "sh")
-        return replace(made, **{name: getattr(made, name).detach() for name in names})
+    def gaussians(self) -> Gaussians:
+        """The scene, differentiable in the leaves."""
+        scales, opacities = self.log_scales.exp(), self.logits.sigmoid()
+        return Gaussians(self.means, self.quats, scales, opacities, self.sh, self.generated)
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:

@@ -16,12 +16,7 @@ from jaxtyping import Float
 from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
-from gscompleter.baselines.mixture_wasserstein import (
-    Mixture,
-    SinkhornConfig,
-    mixture_wasserstein,
-    reduced,
-)
+from gscompleter.baselines.mixture_wasserstein import Mixture, mixture_wasserstein, reduced
 from gscompleter.geometry import quats_product, rotations_from
 from gscompleter.progress import track
 from gscompleter.render import Renderer
@@ -46,8 +41,6 @@ class RegGSConfig:
     patience: int = 10
     """The mixture distance is left out for good once it is no smaller than the largest of its
     last values, so many of them."""
-    sinkhorn: SinkhornConfig = SinkhornConfig()
-    """The mixture distance."""
 
 
 @dataclass(frozen=True)
@@ -96,11 +89,9 @@ def register_by_similarity(
     own = renderer.render(lifted, camera)
     theirs = renderer.render(scene, camera)
     both = own.depth_map().valid & theirs.depth_map().valid
-    ratio = (
-        (theirs.depth[both].median() / own.depth[both].median())
-        if both.any()
-        else own.depth.new_ones(())
-    )
+    ratio = own.depth.new_ones(())
+    if both.any():
+        ratio = theirs.depth[both].median() / own.depth[both].median()
     scale = ratio.detach().clone().requires_grad_()
     quaternion = scale.detach().new_tensor([1.0, 0.0, 0.0, 0.0]).requires_grad_()
     translation = torch.zeros(3, device=scale.device, requires_grad=True)
@@ -128,7 +119,7 @@ def register_by_similarity(
         loss = config.colour_weight * colour + config.depth_weight * depth
         if compare_mixtures:
             distance = mixture_wasserstein(
-                scaled(small_lifted, scale), turned(small_scene, fit, camera), config.sinkhorn
+                scaled(small_lifted, scale), turned(small_scene, fit, camera)
             )
             recent = distances[-config.patience :]
             if len(distances) >= config.patience and distance.item() >= max(recent):

@@ -36,11 +36,7 @@ MAX_DIGITS = 9
 
 
 def run_completion(options: CompleteOptions) -> None:
-    """Complete the scene of `options.folder`, write `options.out` and say what was done.
-
-    Raises:
-        InputError: anything about the input that the user can mend; nothing is written then.
-    """
+    """Complete the scene of `options.folder`, write `options.out` and say what was done."""
     summary, completion = complete_folder(options)
     if not options.quiet:
         tell(summary, completion, options.out)
@@ -86,11 +82,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
 
 
 def completer_for(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
-    """The models that the options name, and the settings of the stages.
-
-    Raises:
-        InputError: where a name is unknown, or weights or packages are missing.
-    """
+    """The models that the options name, and the settings of the stages."""
     photographs = [
         View(target.photograph, target.camera, target.frame)
         for target in targets
@@ -149,11 +141,7 @@ def with_photograph(
 
 
 def check_sizes(cameras: Sequence[Camera]) -> None:
-    """Refuse images in which there is nothing to match and to score, and those beyond all memory.
-
-    Raises:
-        InputError: where there are such.
-    """
+    """Refuse images with nothing in them to match and to score, and those beyond all memory."""
     for camera in cameras:
         if min(camera.width, camera.height) < MIN_SIZE:
             raise InputError(
@@ -164,11 +152,7 @@ def check_sizes(cameras: Sequence[Camera]) -> None:
 
 
 def frame_number(word: str) -> int | None:
-    """The number that `word` writes, or None where it names a file.
-
-    Raises:
-        InputError: where it has more digits than there are frames anywhere.
-    """
+    """The number that `word` writes, or None where it names a file."""
     if re.fullmatch("-?[0-9]+", word) is None:
         return None
     if len(word) > MAX_DIGITS:
@@ -212,16 +196,15 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
         hole = f"{100 * row['hole_fraction']:.1f} %"
         scores = cell(row["psnr_before"]), cell(row["psnr_after"])
         table.add_row(name, hole, *scores, f"{len(target.added):,}")
-    console = Console()
+    console = Console(highlight=False)
     console.print(table)
     for note in notes:
-        console.print(note, highlight=False)
+        console.print(note)
     offset = [-row[3] for row in summary["frame"]["transform"][:3]]
     if any(offset):
         console.print(
             f"The coordinates are large against the baselines, so the result is relative to "
             f"{' '.join(map(str, offset))}; summary.json has the transform.",
-            highlight=False,
             soft_wrap=True,
         )
     counts = summary["gaussians"]
@@ -229,6 +212,5 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
     console.print(
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
         f"{out / 'completed.ply'}",
-        highlight=False,
         soft_wrap=True,
     )

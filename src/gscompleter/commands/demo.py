@@ -17,7 +17,7 @@ from skimage.data import stereo_motorcycle
 from gscompleter.commands.complete import complete_folder, tell
 from gscompleter.commands.options import CompleteOptions, DemoOptions
 from gscompleter.data.scene import write_cameras
-from gscompleter.io.files import check_output, output_folder
+from gscompleter.io.files import output_folder
 from gscompleter.io.image import read_image, write_image
 from gscompleter.reports.completion import strip
 from gscompleter.types import Camera
@@ -35,13 +35,8 @@ RESOLUTION = (250, 370)
 
 def motorcycle_cameras(width: int, height: int) -> tuple[Camera, Camera]:
     """The left and the right camera, in metres; the left one is the world frame."""
-    K = torch.tensor(
-        [
-            [FOCAL_PX, 0.0, PRINCIPAL_POINT_PX[0]],
-            [0.0, FOCAL_PX, PRINCIPAL_POINT_PX[1]],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    K = torch.diag(torch.tensor([FOCAL_PX, FOCAL_PX, 1.0]))
+    K[:2, 2] = torch.tensor(PRINCIPAL_POINT_PX)
     left = Camera(torch.eye(4), K, width, height)
     K_right = K.clone()
     K_right[0, 2] += PRINCIPAL_POINT_DX_PX
@@ -71,37 +66,29 @@ def write_motorcycle_scene(folder: Path) -> None:
 
 
 def run_demo(options: DemoOptions) -> None:
-    """Write the scene, complete it for both targets, and put before and after side by side.
-
-    Raises:
-        InputError: where the output folder cannot be written.
-    """
-    check_output(options.out, options.overwrite)
+    """Write the scene, complete it for both targets, and put before and after side by side."""
     with output_folder(options.out, options.overwrite) as folder:
         scene = folder / "scene"
         write_motorcycle_scene(scene)
-        summary, completion = complete_folder(
-            CompleteOptions(
-                folder=scene,
-                context=(0, 1),
-                target=(str(scene / "targets.json"),),
-                out=folder / "completion",
-                resolution=RESOLUTION,
-                device=options.device,
-                seed=options.seed,
-                quiet=options.quiet,
-            ),
+        asked = CompleteOptions(
+            folder=scene,
+            context=(0, 1),
+            target=(str(scene / "targets.json"),),
+            out=folder / "completion",
+            resolution=RESOLUTION,
+            device=options.device,
+            seed=options.seed,
+            quiet=options.quiet,
         )
+        summary, completion = complete_folder(asked)
         images = folder / "completion" / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
-        write_image(
-            folder / "before_after.png", strip([read_image(images / f"{n}.png") for n in names])
-        )
+        shown = strip([read_image(images / f"{name}.png") for name in names])
+        write_image(folder / "before_after.png", shown)
     if not options.quiet:
         tell(summary, completion, options.out / "completion")
-        Console().print(
+        Console(highlight=False).print(
             f"Before and after, beyond the left and the right camera: "
             f"{options.out / 'before_after.png'}",
-            highlight=False,
             soft_wrap=True,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -24,33 +24,23 @@ from gscompleter.reports.plots import PlotsNotAvailable, plots
 from gscompleter.reports.summary import Summary
 from gscompleter.reports.tables import score_cells, tables
 from gscompleter.runs.methods import methods_named
-from gscompleter.runs.protocols import (
-    ViewByView,
-    index_of,
-    parse_protocol,
-    write_evaluation_index,
-)
+from gscompleter.runs.protocols import ViewByView, index_of, parse_protocol, write_evaluation_index
 from gscompleter.runs.runner import RunConfig, evaluate
 from gscompleter.runs.store import row_paths
 from gscompleter.runs.tasks import Task, task_of, tasks_of
 
 
 def run_evaluation(options: EvaluateOptions) -> None:
-    """Run the methods on the cases, write rows, tables and plots, and say what was done.
-
-    Raises:
-        InputError: anything about the input that the user can mend.
-    """
+    """Run the methods on the cases, write rows, tables and plots, and say what was done."""
     if not options.paths:
         raise InputError("No data was named; give a cases.json, or scenes with --protocol.")
-    console = Console(stderr=True, quiet=options.quiet)
+    console = Console(stderr=True, quiet=options.quiet, highlight=False)
     methods = methods_named(options.methods)
     shard = parse_shard(options.shard)
     check_resolution(options.resolution)
     skipped: list[Skipped] = []
     tasks = chosen_tasks(options, skipped)
-    for clip in skipped:
-        console.print(f"Left out {clip.name}: {clip.reason}.", highlight=False)
+    tell_skipped(skipped, console)
     config = RunConfig(
         reconstructor=options.reconstructor,
         weights=None if options.weights is None else str(options.weights),
@@ -62,10 +52,7 @@ def run_evaluation(options: EvaluateOptions) -> None:
     )
     with shown_on(None if options.quiet else console):
         counts = evaluate(tasks, methods, options.out, config, shard, options.again)
-    console.print(
-        f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}.",
-        highlight=False,
-    )
+    console.print(f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}.")
     # An empty shard, where there are more shards than cases, has nothing to show.
     if counts.done + counts.failed + counts.skipped > 0:
         show(options.out, options.quiet, num_rows=len(tasks) * len(methods))
@@ -81,11 +68,7 @@ def source_of(options: EvaluateOptions) -> dict[str, Any]:
 
 
 def run_tables(options: TablesOptions) -> None:
-    """Write the tables and plots of a run and print them.
-
-    Raises:
-        InputError: where there is no run.
-    """
+    """Write the tables and plots of a run and print them."""
     show(options.out, options.quiet, options.fid)
 
 
@@ -94,9 +77,6 @@ def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> N
 
     Where other shards finished meanwhile and all `num_rows` rows are there, it does so once more:
     of shards that end at the same moment, none can leave tables behind that lack rows of another.
-
-    Raises:
-        InputError: where there is no run.
     """
     seen, there = None, rows_there(out)
     while seen is None or (there != seen and len(there) >= num_rows):
@@ -123,11 +103,7 @@ def draw(summary: Summary, out: Path, quiet: bool) -> None:
 
 
 def run_index(options: IndexOptions) -> None:
-    """Write the evaluation index of a protocol on a data set.
-
-    Raises:
-        InputError: anything about the input that the user can mend.
-    """
+    """Write the evaluation index of a protocol on a data set."""
     if options.out.exists() and not options.overwrite:
         raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
     skipped: list[Skipped] = []
@@ -135,38 +111,30 @@ def run_index(options: IndexOptions) -> None:
     index = index_of(protocol, usable(open_clips(options.path), skipped))
     index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
     write_evaluation_index(options.out, index)
-    if options.quiet:
-        return
-    console = Console()
-    for clip in skipped:
-        console.print(f"Left out {clip.name}: {clip.reason}.", highlight=False)
+    console = Console(quiet=options.quiet, highlight=False)
+    tell_skipped(skipped, console)
     targets = sum(len(split.targets) for splits in index.scenes.values() for split in splits)
     console.print(
         f"{targets} cases in {len(index.scenes)} scenes, {len(index.skipped)} scenes skipped: "
         f"{options.out}",
-        highlight=False,
         soft_wrap=True,
     )
 
 
 def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped]) -> list[Task]:
-    """The tasks that the options ask for; clips that are left out go to `skipped`.
-
-    Raises:
-        InputError: where there are none to be found, or a protocol is needed or wrong.
-    """
+    """The tasks that the options ask for; clips that are left out go to `skipped`."""
     if not options.protocol:
         files = [cases_file(path) for path in options.paths]
         cases = [case for file in files for case in read_cases(file)][: options.limit]
-        resolution = options.resolution
-        if resolution is not None:
-            cases = [replace(case, resolution=resolution) for case in cases]
-        return [task_of(case) for case in cases]
+        return [
+            task_of(replace(case, resolution=options.resolution or case.resolution))
+            for case in cases
+        ]
     return list(islice(tasks_in_clips(options, skipped), options.limit))
 
 
 def tasks_in_clips(options: EvaluateOptions, skipped: list[Skipped]) -> Iterator[Task]:
-    """The tasks that the protocols find in the data, clip by clip; the rest as `chosen_tasks`."""
+    """The tasks that the protocols find in the data, clip by clip."""
     protocols = [parse_protocol(text) for text in options.protocol]
     for path in options.paths:
         for clip in usable(open_clips(path), skipped):
@@ -177,11 +145,7 @@ def tasks_in_clips(options: EvaluateOptions, skipped: list[Skipped]) -> Iterator
 
 
 def cases_file(path: Path) -> Path:
-    """The cases.json that `path` is or holds.
-
-    Raises:
-        InputError: where it is and holds none.
-    """
+    """The cases.json that `path` is or holds."""
     if not os.path.exists(path):
         raise InputError(
             f"There is no '{quoted(path)}'; name a cases.json, or scenes with --protocol."
@@ -196,11 +160,7 @@ def cases_file(path: Path) -> Path:
 
 
 def parse_shard(text: str | None) -> tuple[int, int]:
-    """`i/n` as numbers.
-
-    Raises:
-        InputError: where it is not of that form.
-    """
+    """`i/n` as numbers."""
     if text is None:
         return 0, 1
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
@@ -209,6 +169,12 @@ def parse_shard(text: str | None) -> tuple[int, int]:
             f"--shard is '{quoted(text)}'; give it as i/n, as in 0/4 for the first of four."
         )
     return int(match[1]), int(match[2])
+
+
+def tell_skipped(skipped: Sequence[Skipped], console: Console) -> None:
+    """Say which clips were left out, and why."""
+    for clip in skipped:
+        console.print(f"Left out {clip.name}: {clip.reason}.")
 
 
 def tell(summary: Summary, out: Path) -> None:
@@ -220,12 +186,9 @@ def tell(summary: Summary, out: Path) -> None:
         table.add_row(column.title, *(row[number] for row in cells))
     if summary.common:
         table.add_row("seconds", *(f"{summary.seconds(m)['total']:.1f}" for m in summary.methods))
-    console = Console()
+    console = Console(highlight=False)
     console.print(table)
     for case, method, reason in summary.failures:
-        console.print(f"Failed: {case}, {method}: {reason}", highlight=False, markup=False)
-    console.print(
-        f"Over {len(summary.common)} of {len(summary.tasks)} cases: {out / 'tables.md'}",
-        highlight=False,
-        soft_wrap=True,
-    )
+        console.print(f"Failed: {case}, {method}: {reason}", markup=False)
+    over = f"Over {len(summary.common)} of {len(summary.tasks)} cases"
+    console.print(f"{over}: {out / 'tables.md'}", soft_wrap=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any, cast
 
 from tyro.constructors import (
@@ -37,7 +37,7 @@ class GeneratorOptions:
         """
         kind = settings_class(self.name)
         for setting, value in self.given.items():
-            knowing = generators_with(setting)
+            knowing = [name for name, kind in GENERATORS.items() if hasattr(kind, setting)]
             if self.name not in knowing:
                 raise InputError(
                     f"The generator {self.name!r} knows no {setting} ({quoted(value)}); leave that "
@@ -50,13 +50,6 @@ class GeneratorOptions:
         """The generator and all its settings, for `summary.json`."""
         settings = asdict(self.settings())
         return {"generator": self.name, **{PREFIX + name: settings[name] for name in settings}}
-
-
-def generators_with(setting: str) -> list[str]:
-    """The names of the generators that know a setting."""
-    return [
-        name for name, kind in GENERATORS.items() if setting in (one.name for one in fields(kind))
-    ]
 
 
 def generator_flags(info: StructTypeInfo) -> StructConstructorSpec | None:

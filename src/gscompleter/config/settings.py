@@ -80,15 +80,11 @@ def told(settings: object, where: str = "", prefix: str = "") -> Iterator[None]:
 
 def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """`values` with `changes`, mappings within mappings alike."""
-    return {
-        **values,
-        **{
-            name: merged(values[name], change)
-            if isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
-            else change
-            for name, change in changes.items()
-        },
-    }
+    result = dict(values)
+    for name, change in changes.items():
+        nested = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
+        result[name] = merged(values[name], change) if nested else change
+    return result
 
 
 def sentence_on(wrong: ErrorDetails, name: str, settings: object) -> str:

@@ -37,20 +37,10 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
     return (clip for format, place in scenes for clip in format.open(place))
 
 
-def usable(
-    clips: Iterable[PosedPhotographs],
-    skipped: list[Skipped],
-    size: tuple[int, int] | None = None,
-) -> Iterator[PosedPhotographs]:
-    """The scenes that benchmarks keep, one at a time; the others are appended to `skipped`.
-
-    Args:
-        clips: The scenes of a data set.
-        skipped: Where those that are left out are recorded.
-        size: As in `PosedPhotographs.reason_to_skip`.
-    """
+def usable(clips: Iterable[PosedPhotographs], skipped: list[Skipped]) -> Iterator[PosedPhotographs]:
+    """The scenes that benchmarks keep, one at a time; the others are appended to `skipped`."""
     for clip in clips:
-        reason = clip.reason_to_skip(size)
+        reason = clip.reason_to_skip()
         if reason is None:
             yield clip
         else:

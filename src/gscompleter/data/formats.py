@@ -69,18 +69,14 @@ FORMATS = {
 
 
 def open_photographs(
-    path: Path | str,
-    format: str | None = None,
-    near: float | None = None,
-    far: float | None = None,
+    path: Path | str, format: str | None = None, near: float | None = None, far: float | None = None
 ) -> Photographs:
     """The photographs of one scene, with nothing read but its cameras.
 
     Args:
         path: A file or folder of one of `FORMATS` with a single scene in it.
         format: Name of its format; if left out, found by what lies there.
-        near: Smallest z-depth of the scene, in scene units, where known.
-        far: Largest z-depth of the scene, in scene units, where known.
+        near: As `Photographs` has it, and so `far`.
 
     Raises:
         InputError: where there is no scene or more than one, or its cameras cannot be read.

@@ -15,7 +15,7 @@ from gscompleter.data.lens import Pinhole, undistorted
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.poses import pose_defect
 from gscompleter.errors import InputError, quoted
-from gscompleter.io.image import decode_pixels, decoded_size, image_size, read_pixels
+from gscompleter.io.image import decode_pixels, image_size, read_pixels
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Of image files, for names without one."""
@@ -26,7 +26,11 @@ DOWNSCALED = (2, 4, 8)
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One camera of a scene, with nothing of its photograph read."""
+    """One camera of a scene, with nothing of its photograph read.
+
+    Raises:
+        InputError: by its methods, where what they return is missing, damaged or impossible.
+    """
 
     name: str
     title: str
@@ -48,41 +52,24 @@ class Frame:
         return None if self.image is None else self.image()
 
     def stored_size(self) -> tuple[int, int] | None:
-        """Width and height of the photograph; None where there is none.
-
-        Raises:
-            InputError: where it is not an image.
-        """
+        """Width and height of the photograph; None where there is none."""
         stored = self.stored()
-        if stored is None:
-            return None
-        if isinstance(stored, bytes):
-            return decoded_size(stored, capital(self.title))
-        return image_size(stored)
+        return None if stored is None else image_size(stored, capital(self.title))
 
     def size(self) -> tuple[int, int]:
-        """Width and height of the photograph, or where there is none, what the file says.
-
-        Raises:
-            InputError: where neither is known.
-        """
+        """Width and height of the photograph, or where there is none, what the file says."""
         size = self.stored_size()
-        if size is not None:
-            return size
-        if self.intrinsics.size in (None, FRACTIONS):
+        if size is None and self.intrinsics.size != FRACTIONS:
+            size = self.intrinsics.size
+        if size is None:
             raise InputError(
                 f"The size of {self.title} is not known, because it has no image and no `w` and "
                 "`h`; add these, or its image."
             )
-        assert self.intrinsics.size is not None
-        return self.intrinsics.size
+        return size
 
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The photograph as it is stored.
-
-        Raises:
-            InputError: where it is missing, damaged or not an image.
-        """
+        """The photograph as it is stored."""
         stored = self.stored()
         if stored is None:
             place = "restore it" if self.image is None else f"put it at {quoted(str(self.image))}"
@@ -107,11 +94,7 @@ class Frame:
         return defect
 
     def pinholes(self, width: int, height: int) -> tuple[Pinhole, Pinhole]:
-        """The intrinsics of a photograph of that size, with its distortion and without.
-
-        Raises:
-            InputError: where they or the pose are impossible.
-        """
+        """The intrinsics of a photograph of that size, with its distortion and without."""
         defect = self.defect(width, height)
         if defect is not None:
             raise self.unusable(defect)

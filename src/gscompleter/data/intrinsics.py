@@ -64,10 +64,7 @@ def pinhole_defect(pinhole: Pinhole) -> str | None:
 
 def opening_angle(pinhole: Pinhole) -> float:
     """The larger of a camera's two opening angles, in degrees."""
-    sides = (
-        (pinhole.fl_x, pinhole.cx, pinhole.width),
-        (pinhole.fl_y, pinhole.cy, pinhole.height),
-    )
+    sides = ((pinhole.fl_x, pinhole.cx, pinhole.width), (pinhole.fl_y, pinhole.cy, pinhole.height))
     return math.degrees(
         max(math.atan(c / focal) + math.atan((side - c) / focal) for focal, c, side in sides)
     )

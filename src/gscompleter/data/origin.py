@@ -43,12 +43,7 @@ def frame_from_photographs(origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, 
 def told_from(
     origin: Float[np.ndarray, "3"], scene: Gaussians, cameras: Sequence[Camera]
 ) -> Gaussians:
-    """A scene in the photographs' own frame, told from `origin`; as it is where that is zero.
-
-    Args:
-        origin: In scene units.
-        scene: Gaussians in the photographs' own frame.
-        cameras: Those that look at it, told from `origin`.
+    """A scene in the photographs' own frame, told from `origin` (scene units) as `cameras` are.
 
     Raises:
         InputError: where float32 is too coarse so far from zero for what the cameras show.

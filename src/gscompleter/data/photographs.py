@@ -36,7 +36,11 @@ MAX_TRANSLATION = 1e3
 
 @runtime_checkable
 class PosedPhotographs(Protocol):
-    """A named sequence of photographs with known cameras, numbered from 0."""
+    """A named sequence of photographs with known cameras, numbered from 0.
+
+    Raises:
+        InputError: by its methods, where a frame does not exist, cannot be read or is impossible.
+    """
 
     @property
     def name(self) -> str:
@@ -57,11 +61,7 @@ class PosedPhotographs(Protocol):
         """Whether the photograph of a frame is there, or its camera only."""
 
     def camera(self, frame: int, resolution: tuple[int, int] | None = None) -> Camera:
-        """The camera of a frame, as `views` has it.
-
-        Raises:
-            InputError: where the frame does not exist, or its camera is impossible.
-        """
+        """The camera of a frame, as `views` has it."""
 
     def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
         """The photographs of `frames`, with depth where there is some. Only these are read.
@@ -69,23 +69,14 @@ class PosedPhotographs(Protocol):
         Lens distortion is removed: the undistorted image has the size of the photograph and no
         empty pixel, and the intrinsics follow (`lens.undistorted` says how).
 
-        Args:
-            frames: Numbers of frames.
-            resolution: Height and width in pixels: images are resized to cover it, then their
-                centre is cropped. Their own size if left out.
-
-        Raises:
-            InputError: where a frame does not exist or cannot be read.
+        Images are resized to cover `resolution` (height and width in pixels), then their centre
+        is cropped. They keep their own size if it is left out.
         """
 
     def mask(
         self, frame: int, resolution: tuple[int, int] | None = None
     ) -> Bool[Tensor, "h w"] | None:
-        """True where the photograph of a frame is to be ignored; None where nothing is.
-
-        Raises:
-            InputError: where the frame does not exist or its mask cannot be read.
-        """
+        """True where the photograph of a frame is to be ignored; None where nothing is."""
 
     def points(self) -> Float[Tensor, "n 3"] | None:
         """Points on the surfaces of the scene, told from `origin`; None where none are known.
@@ -97,9 +88,7 @@ class PosedPhotographs(Protocol):
     def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
         """Why benchmarks leave the photographs out; None where they keep them.
 
-        Args:
-            size: Height and width that every photograph must have before it is resized, for
-                data sets of one size; any if left out.
+        In data sets of one `size` (height and width) every photograph must be stored in it.
         """
 
 
@@ -138,10 +127,7 @@ class Photographs:
 
     def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
         chosen = [self.frame(number) for number in frames]
-        return [
-            self._view(frame, number, resolution)
-            for number, frame in zip(frames, chosen, strict=True)
-        ]
+        return [self._view(frame, n, resolution) for n, frame in zip(frames, chosen, strict=True)]
 
     def mask(
         self, frame: int, resolution: tuple[int, int] | None = None
@@ -165,11 +151,7 @@ class Photographs:
         return None
 
     def frame(self, number: int) -> Frame:
-        """The frame of that number.
-
-        Raises:
-            InputError: where there is none.
-        """
+        """The frame of that number."""
         if not 0 <= number < len(self):
             raise InputError(
                 f"There is no frame {number} in {self.title}, whose frames are numbered 0 to "
@@ -209,15 +191,10 @@ def fitted(
     size: tuple[int, int],
     resolution: tuple[int, int] | None,
 ) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """An image of a frame without lens distortion and at a resolution.
+    """The photograph of a frame without lens distortion and at a resolution (height, width).
 
-    Colours (uint8, [h, w, 3]) are blended; the values of depth maps and masks never are.
-
-    Args:
-        frame: The frame.
-        pixels: Its photograph, or a map of depth or of what is ignored, of any size.
-        size: Width and height of the photograph.
-        resolution: Height and width; those of the photograph if None.
+    Maps [h, w] of depth or of what is ignored are brought to its `size` (width, height) first.
+    Colours (uint8, [h, w, 3]) are blended; the values of maps never are.
 
     Raises:
         InputError: where the camera is impossible.

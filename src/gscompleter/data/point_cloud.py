@@ -21,13 +21,14 @@ def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:
     """
     try:
         with path.open("rb") as file:
-            header = read_header(file, path)
-            vertex = next((e for e in header.elements if e.name == "vertex"), None)
+            file_format, elements = read_header(file, path)
+            vertex = next((e for e in elements if e.name == "vertex"), None)
             if vertex is None or not _is_table(vertex):
                 raise InputError(
                     f"{quoted(path)} holds no points with x, y and z; export them again."
                 )
-            vertices = read_vertices(file, header, vertex, path)
+            ahead = elements[: elements.index(vertex)]
+            vertices = read_vertices(file, file_format, ahead, vertex, path)
     except OSError as error:
         raise InputError(
             f"{quoted(path)} cannot be read: {error.strerror}; correct the path."

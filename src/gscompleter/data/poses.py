@@ -24,9 +24,11 @@ def pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
         return "its pose holds NaN or infinity"
     if np.abs(pose).max() > MAX_COORDINATE:
         return f"its pose holds {np.abs(pose).max():g}, which is above {MAX_COORDINATE:g}"
-    if _rigid_error(pose) > MAX_RIGID_ERROR:
+    rotation = pose[:3, :3]
+    errors = (rotation.T @ rotation - np.eye(3), pose[3] - [0, 0, 0, 1])
+    if max(np.abs(error).max() for error in errors) > MAX_RIGID_ERROR:
         return "its pose is not a rigid transform but scaled, sheared or projective"
-    if np.linalg.det(pose[:3, :3]) < 0:
+    if np.linalg.det(rotation) < 0:
         return "its pose is a reflection (its determinant is negative)"
     return None
 
@@ -63,9 +65,3 @@ def rotation_of(quaternion: Sequence[float]) -> Float[np.ndarray, "3 3"]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def _rigid_error(pose: Float[np.ndarray, "4 4"]) -> float:
-    rotation = pose[:3, :3]
-    errors = (rotation.T @ rotation - np.eye(3), pose[3] - [0, 0, 0, 1])
-    return float(max(np.abs(error).max() for error in errors))

@@ -36,8 +36,7 @@ def load_views(
             else `open_photographs` opens.
         frames: Numbers of the frames, which are numbered in the order of their sorted
             `file_path`; all frames if left out. Only these are read.
-        resolution: Height and width in pixels: images are resized to cover it, then their
-            centre is cropped. Their own size if left out.
+        resolution: Height and width in pixels, as in `PosedPhotographs.views`.
         near: Smallest z-depth of the scene, in scene units, where known.
         far: Largest z-depth of the scene, in scene units, where known.
 
@@ -62,9 +61,7 @@ def load_camera(
     Args:
         scene: As in `load_views`.
         frame: Number of the frame; may be left out where there is one only.
-        resolution: Height and width in pixels, as in `load_views`.
-        near: Smallest z-depth of the scene, in scene units, where known.
-        far: Largest z-depth of the scene, in scene units, where known.
+        resolution: As in `load_views`, and so `near` and `far`.
 
     Raises:
         InputError: where the scene or the frame is missing or impossible, and where there are
@@ -94,9 +91,7 @@ def load_cameras(
         path: A JSON file of the form of nerfstudio's `transforms.json`, of Inria's `cameras.json`
             or of SuperSplat's poses, a folder with a `transforms.json`, or the images.txt or
             images.bin of a COLMAP model.
-        resolution: Height and width in pixels, as in `load_views`. SuperSplat's poses need it.
-        near: Smallest z-depth of the scene, in scene units, where known.
-        far: Largest z-depth of the scene, in scene units, where known.
+        resolution: As in `load_views`, and so `near` and `far`. SuperSplat's poses need it.
         origin: Where the coordinates of the scene are counted from, which is
             `open_photographs(scene).origin`, in scene units.
 
@@ -119,18 +114,15 @@ def write_cameras(
     Args:
         path: The JSON file.
         cameras: At least one camera.
-        file_paths: Where the image of each one lies, relative to the folder of the JSON file,
-            which makes it the `transforms.json` of a scene.
+        file_paths: Where their images lie, relative to its folder, for a scene's `transforms.json`.
 
     Raises:
         InputError: where the file cannot be written.
     """
     frames = [_entry(camera) for camera in cameras]
     if file_paths is not None:
-        frames = [
-            {"file_path": file_path, **frame}
-            for file_path, frame in zip(file_paths, frames, strict=True)
-        ]
+        pairs = zip(file_paths, frames, strict=True)
+        frames = [{"file_path": file_path, **frame} for file_path, frame in pairs]
     content = {"camera_model": "PINHOLE", "frames": frames}
     with replacing(path) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())

@@ -36,8 +36,6 @@ MAX_OFFSET = 0.25
 """Largest number added to a channel that counts as a colour shift."""
 MIN_PIXELS = 200
 """Fewest observed pixels that say anything."""
-ROUNDS = 5
-"""Fits of the shift; each leaves out what disagrees with the one before."""
 
 
 @dataclass(frozen=True)
@@ -104,13 +102,12 @@ def compare(
     ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
     share = known.float().mean().item()
     if not image.isfinite().all():
-        inf = float("inf")
-        return Agreement(ones, zeros, inf, LEAST, share, False, image)
+        return Agreement(ones, zeros, float("inf"), LEAST, share, False, image)
     if int(known.sum()) < MIN_PIXELS:
         return Agreement(ones, zeros, 0.0, LEAST, share, True, image)
     ours = smoothed(image, known, BLUR)[known]
     theirs = smoothed(observed, known, BLUR)[known]
-    gain, offset = robust_affine(ours, theirs, ROUNDS)
+    gain, offset = robust_affine(ours, theirs)
     residual = quantile((gain * ours + offset - theirs).abs().mean(dim=-1), QUANTILE)
     plain = theirs - theirs.median(dim=0).values
     contrast = quantile(plain.abs().mean(dim=-1), QUANTILE)

@@ -26,19 +26,11 @@ class Oracle:
     at_once: int = 1
 
     def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
-        """The photographs of the targets.
-
-        Raises:
-            InputError: where there is none.
-        """
+        """The photographs of the targets, errors as those of `photograph`."""
         return [Synthesis(self.photograph(request.target)) for request in requests]
 
     def photograph(self, target: Camera) -> Float[Tensor, "h w 3"]:
-        """The image that the camera took.
-
-        Raises:
-            InputError: where it took none.
-        """
+        """The image that the camera took; an InputError where it took none."""
         for photograph in self.photographs:
             if same_camera(photograph.camera, target):
                 return photograph.image.to(target.K.device)

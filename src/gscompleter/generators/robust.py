@@ -6,9 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+ROUNDS = 5
+"""Fits of the line; each leaves out what disagrees with the one before."""
+
 
 def robust_affine(
-    x: Float[Tensor, "n c"], y: Float[Tensor, "n c"], rounds: int = 5
+    x: Float[Tensor, "n c"], y: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
     """`gain` and `offset` of each channel with `y = gain * x + offset`, by trimmed least squares.
 
@@ -18,7 +21,7 @@ def robust_affine(
     """
     gain = torch.ones_like(x[0])
     offset = (y - x).median(dim=0).values
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         error = (gain * x + offset - y).abs()
         usual = 1.4826 * error.median(dim=0).values
         weight = (error <= 2.5 * usual.clamp_min(1e-3)).to(x)

@@ -11,6 +11,8 @@ from torch import Tensor
 
 BLUR = 1.5
 """Standard deviation, in pixels of its level, of the blur on every level of the pyramid."""
+REACH = 0.7
+"""Standard deviation of what a pixel averages over, as a share of its distance from the known."""
 
 
 def distance_to_known(known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -20,12 +22,12 @@ def distance_to_known(known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 
 
 def continued(
-    values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"], reach: float = 0.7
+    values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w c"]:
     """`values` where `weight` is positive, and weighted means of what lies around elsewhere.
 
-    A pixel averages over a neighbourhood whose standard deviation is `reach` times its distance
-    from what is known: just beyond the border it continues the nearest values, far away it tends
+    A pixel averages over a neighbourhood that grows with its distance from what is known: just
+    beyond the border it continues the nearest values, far away it tends
     to the mean. Averages grow with distance evenly in all directions, which a pyramid that fills
     its blocks (`push_pull`) does not do.
     """
@@ -35,15 +37,14 @@ def continued(
     weighted = torch.cat([values * weight[..., None], weight[..., None]], dim=-1).numpy()
     layers = mean_pyramid(np.ascontiguousarray(weighted, np.float32))
 
-    size = reach * distance_to_known(known).numpy()
+    size = REACH * distance_to_known(known).numpy()
     level = np.log2(np.maximum(size / BLUR, 1.0)).clip(0, len(layers) - 1)
     below = np.minimum(level.astype(np.int64), max(len(layers) - 2, 0))
     above = np.minimum(below + 1, len(layers) - 1)
     share = (level - below)[..., None].astype(np.float32)
     rows, columns = np.indices(level.shape)
     mixed = (1 - share) * layers[below, rows, columns] + share * layers[above, rows, columns]
-    means = torch.from_numpy(mixed)
-    return torch.where(known[..., None], values, means)
+    return torch.where(known[..., None], values, torch.from_numpy(mixed))
 
 
 def mean_pyramid(weighted: Float32[ndarray, "h w c"]) -> Float32[ndarray, "levels h w values"]:

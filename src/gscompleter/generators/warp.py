@@ -73,16 +73,15 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
     return Warped(image.clamp(0, 1), known, scene.depth, tuple(factors))
 
 
-def with_unexplained(
-    warped: Warped, guess: Float[Tensor, "h w"], target: Camera, context: SceneContext
-) -> Warped:
+def with_unexplained(warped: Warped, target: Camera, context: SceneContext) -> Warped:
     """`warped`, and in its holes what photographs show although the scene has a hole there too.
 
     A scene may lack surfaces that were photographed: captured from too few sides, or trimmed. Their
-    depth is unknown, so they are carried over at `guess`, the depth [h, w] in scene units that
-    continues what surrounds the hole. Only photographs whose own view of the scene is empty in
-    that direction take part: elsewhere they show what stands before the hole.
+    depth is unknown, so they are carried over at the depth that continues what surrounds the hole.
+    Only photographs whose own view of the scene is empty in that direction take part: elsewhere
+    they show what stands before the hole. Something must be known.
     """
+    guess = background_first(warped)[1].exp().to(warped.depth.device)
     points = unproject(guess, target)
     colour = torch.zeros_like(warped.image)
     total = torch.zeros_like(guess)
@@ -103,19 +102,16 @@ def with_unexplained(
     )
 
 
-def background_first(
-    warped: Warped,
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+def background_first(warped: Warped) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
     """The image and its log-depth, continued smoothly beyond what is known.
 
     A hole beside an object is where the object hid what stands behind it, so the farther side of
     its border counts more: with the square of its depth.
     """
     warped = warped.to("cpu")
-    known = warped.known
-    middle = warped.depth[known].median()
+    middle = warped.depth[warped.known].median()
     relative = (warped.depth / middle).clamp(0.1, 10.0)
-    weight = relative**2 * known
+    weight = relative**2 * warped.known
     log_depth = relative.log()[..., None]
     layers = continued(torch.cat([warped.image, log_depth], dim=-1), weight)
     return layers[..., :3], layers[..., 3] + middle.log()

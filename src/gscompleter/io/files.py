@@ -52,9 +52,7 @@ def replacing(path: Path | str, first_stays: bool = False) -> Iterator[BinaryIO]
     It lies beside `path` under a temporary name until then, so that a reader never sees half a
     file and an existing one survives every failure.
 
-    Args:
-        path: The file.
-        first_stays: Leave the file that another process made of that name meanwhile.
+    With `first_stays`, a file that another process made of that name meanwhile is left.
 
     Raises:
         InputError: where the file cannot be written: no permission, no space, a folder.
@@ -106,8 +104,7 @@ def check_output(path: Path | str, overwrite: bool = False) -> None:
         InputError: where `path` is a file, is a folder with something in it while `overwrite`
             is off, or cannot be created or written to.
     """
-    with contextlib.closing(_Draft(Path(path), overwrite)):
-        pass
+    _Draft(Path(path), overwrite).close()
 
 
 @contextlib.contextmanager
@@ -227,22 +224,14 @@ def _finish_abandoned(target: Path) -> None:
 
 
 def _finish(draft: Path) -> None:
-    """Move everything in `draft` to the folder it lies in, or nothing; what it replaces is lost.
-
-    Raises:
-        OSError: where a rename fails.
-    """
+    """Move everything in `draft` to the folder it lies in, or nothing; what it replaces is lost."""
     target, replaced = draft.parent, draft / _REPLACED
     entries = set(os.listdir(draft)) - {_REPLACED}
     names = sorted(entries, key=lambda name: (name == SUMMARY, name))
     replaced.mkdir(exist_ok=True)
-    moves = [
-        (target / name, replaced / name)
-        for name in reversed(names)
-        if os.path.lexists(target / name)
-    ]
-    moves += [(draft / name, target / name) for name in names]
-    _rename_all(moves)
+    old = [name for name in reversed(names) if os.path.lexists(target / name)]
+    moves = [(target / name, replaced / name) for name in old]
+    _rename_all(moves + [(draft / name, target / name) for name in names])
     remove(replaced)
 
 
@@ -259,11 +248,7 @@ def _may_change_places(folder: Path) -> bool:
 
 
 def _exchange(one: Path, other: Path) -> None:
-    """Let two entries of a file system change names in one step, as Linux can.
-
-    Raises:
-        OSError: where the system or the file system cannot.
-    """
+    """Let two entries of a file system change names in one step, as Linux can."""
     here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of <fcntl.h> and <linux/fs.h>
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None or rename(here, bytes(one), here, bytes(other), exchange) != 0:

@@ -36,8 +36,7 @@ def read_image(path: Path | str) -> Float[Tensor, "h w 3"]:
 
 
 def write_image(
-    path: Path | str,
-    image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"],
+    path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"]
 ) -> None:
     """Write colours, or a grey image or mask, as an 8-bit PNG.
 
@@ -57,13 +56,17 @@ def as_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:
     return torch.from_numpy(pixels.astype(np.float32) / 255)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, from the first bytes of the file.
+def image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
+    """Width and height in pixels, from the first bytes of an image file.
+
+    Args:
+        stored: The file, or its bytes.
+        name: What error messages call the latter.
 
     Raises:
         InputError: where it is missing or not an image.
     """
-    with _opened(path) as image:
+    with _decoded(stored, name) if isinstance(stored, bytes) else _opened(stored) as image:
         return image.size
 
 
@@ -93,26 +96,12 @@ def read_pixels(path: Path | str) -> UInt8[np.ndarray, "h w 3"]:
 def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
     """The image that the bytes of a PNG or JPEG file hold, as `read_pixels` has it.
 
-    Args:
-        data: The bytes.
-        name: What error messages call the image.
-
     Raises:
-        InputError: where they are truncated or no image.
+        InputError: where they are truncated or no image; `name` is what it calls them.
     """
     with _decoded(data, name) as image:
         told = f"{quoted(name)} is damaged"
         return _checked(lambda: _over_black(image), told, "copy its file again")
-
-
-def decoded_size(data: bytes, name: str) -> tuple[int, int]:
-    """Width and height of an image in memory, from the first of its bytes.
-
-    Raises:
-        InputError: where they are no image.
-    """
-    with _decoded(data, name) as image:
-        return image.size
 
 
 def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:

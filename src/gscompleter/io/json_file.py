@@ -16,9 +16,7 @@ MAX_DIGITS = 20
 def read_json(path: Path, advice: str) -> Any:
     """The content of a JSON file, with or without a byte order mark.
 
-    Args:
-        path: The file.
-        advice: What to do where it is no JSON, as in "download it again".
+    Where it is no JSON, the error gives `advice` on what to do, as in "download it again".
 
     Raises:
         InputError: where it cannot be read, is no JSON, or holds an integer beyond 64 bits.

@@ -57,9 +57,6 @@ _BLOCK = 8192
 """Rows copied at a time: few enough to stay in the cache while one column follows another."""
 
 
-# ------------------------------------------------------------------------------------- header
-
-
 @dataclass(frozen=True)
 class Property:
     """One property of an element."""
@@ -88,20 +85,8 @@ class Element:
         return any(p.count_kind is not None for p in self.properties)
 
 
-@dataclass(frozen=True)
-class Header:
-    """What a PLY file says of itself."""
-
-    format: str
-    elements: list[Element]
-
-
-def read_header(file: BinaryIO, path: Path) -> Header:
-    """The header; `file` is left at the first byte of the data.
-
-    Raises:
-        InputError: where this is not a PLY file, or its header is broken.
-    """
+def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
+    """The format and the elements of a file, which is left at the first byte of the data."""
     first = file.readline(512)
     if first.startswith(b"version https://git-lfs"):
         raise InputError(
@@ -142,7 +127,7 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             f"{path} has the PLY format '{quoted(file_format)}'; ascii, "
             "binary_little_endian and binary_big_endian are known."
         )
-    return Header(file_format, elements)
+    return file_format, elements
 
 
 def _count(word: str) -> int:
@@ -157,17 +142,15 @@ def _property(words: list[str]) -> Property:
     return Property(words[1], _SCALARS[words[0]])
 
 
-# --------------------------------------------------------------------------------------- data
-
-
-def read_vertices(file: BinaryIO, header: Header, vertex: Element, path: Path) -> np.ndarray:
-    """The rows of `vertex` as a structured array, whatever stands before it skipped."""
-    ahead = header.elements[: header.elements.index(vertex)]
+def read_vertices(
+    file: BinaryIO, file_format: str, ahead: list[Element], vertex: Element, path: Path
+) -> np.ndarray:
+    """The rows of `vertex` as a structured array, what stands `ahead` of it skipped."""
     for element in ahead:
-        _check_claim(file, element, header.format, path)
-    if header.format == "ascii":
+        _check_claim(file, element, file_format, path)
+    if file_format == "ascii":
         return _ascii_vertices(file, ahead, vertex, path)
-    byte_order = _BYTE_ORDERS[header.format]
+    byte_order = _BYTE_ORDERS[file_format]
     for element in ahead:
         _skip(file, element, byte_order, path)
     dtype = vertex.dtype(byte_order)
@@ -217,8 +200,8 @@ def _ascii_vertices(
         next(lines, None)
     rows = [line.split() for _, line in zip(range(vertex.count), lines, strict=False)]
     width = len(vertex.properties)
-    if len(rows) < vertex.count or (rows and len(rows[-1]) < width):
-        whole = len(rows) - (1 if rows and len(rows[-1]) < width else 0)
+    whole = len(rows) - (1 if rows and len(rows[-1]) < width else 0)
+    if whole < vertex.count:
         raise _truncated(path, whole, vertex.count)
     try:
         table = np.array(rows, dtype=np.float64).reshape(vertex.count, width)
@@ -241,16 +224,11 @@ def _truncated(path: Path, found: int, expected: int, what: str = "Gaussian") ->
     )
 
 
-# --------------------------------------------------------------------------------------- load
-
-
 def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """The Gaussians of a 3DGS .ply, of SH degree 0 to 3.
 
-    Args:
-        path: The file.
-        drop_nonfinite: Leave out Gaussians that hold NaN or infinity, or a rotation of zeros,
-            instead of refusing the file.
+    With `drop_nonfinite`, Gaussians that hold NaN or infinity, or a rotation of zeros, are left
+    out; else the file is refused.
 
     Raises:
         InputError: no such file, not a PLY, truncated, empty, not 3DGS, or with damaged values.
@@ -260,22 +238,23 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         if os.path.exists(path) and not os.path.isfile(path):
             raise InputError(f"{quoted(path)} is a directory or a device; a 3DGS .ply is needed.")
         with path.open("rb") as file:
-            header = read_header(file, path)
-            vertex = _gaussian_element(header, path)
-            vertices = read_vertices(file, header, vertex, path)
+            file_format, elements = read_header(file, path)
+            vertex = _gaussian_element(elements, path)
+            ahead = elements[: elements.index(vertex)]
+            vertices = read_vertices(file, file_format, ahead, vertex, path)
     except OSError as error:
         raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
     return _whole(_gaussians(vertices, vertex), path, drop_nonfinite)
 
 
-def _gaussian_element(header: Header, path: Path) -> Element:
+def _gaussian_element(elements: list[Element], path: Path) -> Element:
     """The vertex element, once it is known to hold Gaussians."""
-    found = {element.name: element for element in header.elements}
+    found = {element.name: element for element in elements}
     vertex = found.get("vertex")
     if vertex is None:
         raise InputError(f"{path} has no vertices; a 3DGS .ply is needed.")
     names = [p.name for p in vertex.properties]
-    for element in header.elements:
+    for element in elements:
         if len({p.name for p in element.properties}) < len(element.properties):
             raise InputError(
                 f"{path} has a broken header: a property of its element "
@@ -339,9 +318,10 @@ def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
 def _whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
     """`gaussians` where every value can be drawn."""
     assert gaussians.encoded is not None
-    good = torch.isfinite(gaussians.encoded).all(1) & torch.isfinite(gaussians.means).all(1)
-    good &= torch.isfinite(gaussians.sh).flatten(1).all(1) & torch.isfinite(gaussians.scales).all(1)
-    good &= torch.isfinite(gaussians.quats).all(1) & (gaussians.quats != 0).any(1)
+    good = (gaussians.quats != 0).any(1)
+    held = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, gaussians.encoded)
+    for values in held:
+        good &= values.isfinite().flatten(1).all(1)
     bad = int((~good).sum())
     if bad == 0:
         return gaussians
@@ -368,9 +348,6 @@ def _decoded_opacities(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
     return encoded[:, 3].double().sigmoid().float()
 
 
-# --------------------------------------------------------------------------------------- save
-
-
 def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
     """Log-scales and logit opacities as they go into a file, always finite.
 
@@ -393,14 +370,10 @@ def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
 def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = None) -> None:
     """Write a standard 3DGS .ply, with `uchar generated` behind the standard properties.
 
-    Nothing is left under `path` unless all of it was written.
-
-    Args:
-        path: The file.
-        gaussians: What it is to hold.
-        provenance: Whether to write `generated`; by default, where anything was generated. Some
-            readers (gsply 0.4 is one) take every property for a float and misread rows that end
-            in a byte; False gives them the plain layout.
+    Nothing is left under `path` unless all of it was written. `provenance` says whether to write
+    `generated`; by default, where anything was generated. Some readers (gsply 0.4 is one) take
+    every property for a float and misread rows that end in a byte; False gives them the plain
+    layout.
 
     Raises:
         InputError: where the file cannot be written.

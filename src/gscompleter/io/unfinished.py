@@ -26,11 +26,7 @@ MARK = ".gscompleter-"
 
 
 def create_file(folder: Path) -> tuple[Path, BinaryIO]:
-    """A new file in `folder`, locked until it is closed.
-
-    Raises:
-        OSError: where it cannot be made.
-    """
+    """A new file in `folder`, locked until it is closed."""
     while True:
         path = folder / _new_name()
         file = path.open("xb")
@@ -40,11 +36,7 @@ def create_file(folder: Path) -> tuple[Path, BinaryIO]:
 
 
 def create_folder(folder: Path) -> tuple[Path, int]:
-    """A new folder in `folder`, and the descriptor that locks it until it is closed.
-
-    Raises:
-        OSError: where it cannot be made.
-    """
+    """A new folder in `folder`, and the descriptor that locks it until it is closed."""
     while True:
         path = folder / _new_name()
         path.mkdir()

@@ -23,11 +23,8 @@ def _patch_cost(image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_
     The shift is written to `bias`. Pixels of the patch outside of the image do not count.
     """
     h, w = image.shape[0], image.shape[1]
-    total = np.float32(0)
-    square = np.float32(0)
-    d0 = np.float32(0)
-    d1 = np.float32(0)
-    d2 = np.float32(0)
+    total = square = np.float32(0)
+    d0 = d1 = d2 = np.float32(0)
     for dy in range(max(-radius, -y), min(radius, h - 1 - y) + 1):
         for dx in range(max(-radius, -x), min(radius, w - 1 - x) + 1):
             a = weight[y + dy, x + dx]
@@ -54,9 +51,10 @@ def _patch_cost(image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_
 
 
 @njit(cache=True, fastmath={"contract"})
-def _prior(log_depth, expected, distance, diagonal, depth_penalty, distance_penalty):
+def _prior(nearer, dy, dx, diagonal, depth_penalty, distance_penalty):
     """What a source costs for lying before the expected depth, and for being far away."""
-    nearer = max(expected - log_depth, np.float32(0))
+    distance = np.float32(np.sqrt(float(dy**2 + dx**2)))
+    nearer = max(nearer, np.float32(0))
     return depth_penalty * min(nearer * nearer, np.float32(1)) + (
         distance_penalty * min(distance / diagonal, np.float32(1))
     )
@@ -102,19 +100,16 @@ def search(
     n = queries.shape[0]
     num_sources, H, W = usable.shape
     h, w = query_at.shape
-    diagonal = np.float32(np.sqrt(H * H + W * W))
+    penalties = (np.float32(np.sqrt(H * H + W * W)), depth_penalty, distance_penalty)
     cost = np.empty(n, np.float32)
     shift = np.empty((n, 3), np.float32)
     for i in prange(n):
         bias = np.empty(3, np.float32)
         y, x = queries[i, 0], queries[i, 1]
         s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
-        away = np.float32(np.sqrt(float((sy - y) ** 2 + (sx - x) ** 2)))
         cost[i] = _patch_cost(
             image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias
-        ) + _prior(
-            log_depth[s, sy, sx], expected[i], away, diagonal, depth_penalty, distance_penalty
-        )
+        ) + _prior(expected[i] - log_depth[s, sy, sx], sy - y, sx - x, *penalties)
         shift[i] = bias
 
     for pass_number in range(rounds):
@@ -162,30 +157,11 @@ def search(
                     continue
                 if s == field[i, 0] and sy == field[i, 1] and sx == field[i, 2]:
                     continue
-                away = np.float32(np.sqrt(float((sy - y) ** 2 + (sx - x) ** 2)))
-                prior = _prior(
-                    log_depth[s, sy, sx],
-                    expected[i],
-                    away,
-                    diagonal,
-                    depth_penalty,
-                    distance_penalty,
-                )
+                prior = _prior(expected[i] - log_depth[s, sy, sx], sy - y, sx - x, *penalties)
                 if prior >= best:
                     continue
                 proposed = prior + _patch_cost(
-                    image,
-                    weight,
-                    y,
-                    x,
-                    sources,
-                    s,
-                    sy,
-                    sx,
-                    radius,
-                    max_bias,
-                    bias_penalty,
-                    bias,
+                    image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias
                 )
                 if proposed < best:
                     best = proposed
@@ -207,10 +183,7 @@ def vote(shape, pixels, query_at, vote_weight, sources, field, shift, radius):
     totals = np.zeros(pixels.shape[0], np.float32)
     for p in prange(pixels.shape[0]):
         y, x = pixels[p, 0], pixels[p, 1]
-        total = np.float32(0)
-        r = np.float32(0)
-        g = np.float32(0)
-        b = np.float32(0)
+        total = r = g = b = np.float32(0)
         for dy in range(max(-radius, -y), min(radius, h - 1 - y) + 1):
             for dx in range(max(-radius, -x), min(radius, w - 1 - x) + 1):
                 q = query_at[y + dy, x + dx]

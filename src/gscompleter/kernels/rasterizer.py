@@ -52,8 +52,8 @@ NUM_GRADIENT_COLUMNS = 10
 class Pinhole(NamedTuple):
     """A camera, as the kernels want it."""
 
-    rotation: np.ndarray
-    """Camera from world [3, 3], float32."""
+    rotation: tuple[np.float32, ...]
+    """Camera from world, nine numbers row by row."""
     center: np.ndarray
     """Camera centre in the world [3], float32."""
     intrinsics: np.ndarray
@@ -338,14 +338,7 @@ def _undraw(wanted):
             green and blue.
         """
         signature = types.void(
-            types.int64,
-            types.int64,
-            types.int32,
-            state,
-            last,
-            row_limit,
-            sums,
-            splat,
+            types.int64, types.int64, types.int32, state, last, row_limit, sums, splat
         )
 
         def generate(context, builder, signature, arguments):
@@ -453,21 +446,6 @@ def _applied(a, x, y, z):
     )
 
 
-@njit(cache=True)
-def _matrix(array):
-    return (
-        array[0, 0],
-        array[0, 1],
-        array[0, 2],
-        array[1, 0],
-        array[1, 1],
-        array[1, 2],
-        array[2, 0],
-        array[2, 1],
-        array[2, 2],
-    )
-
-
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _unit(quats, i):
     """Quaternion i brought to length 1, and the factor that did it."""
@@ -554,19 +532,11 @@ def _flattened(axes, jacobian):
 
 # Spherical harmonics in the basis and with the signs of 3DGS, see render/spherical_harmonics.py.
 _C0, _C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
-_C2XY, _C2Z, _C2XX = (
-    np.float32(value) for value in (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-)
-_C3A, _C3XYZ, _C3B, _C3Z, _C3XX = (
-    np.float32(value)
-    for value in (
-        0.5900435899266435,
-        2.890611442640554,
-        0.4570457994644658,
-        0.3731763325901154,
-        1.445305721320277,
-    )
-)
+_C2XY, _C2Z = np.float32(1.0925484305920792), np.float32(0.31539156525252005)
+_C2XX = np.float32(0.5462742152960396)
+_C3A, _C3XYZ = np.float32(0.5900435899266435), np.float32(2.890611442640554)
+_C3B, _C3Z = np.float32(0.4570457994644658), np.float32(0.3731763325901154)
+_C3XX = np.float32(1.445305721320277)
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
@@ -639,8 +609,7 @@ def project(begin, end, gaussians, pinhole, splats, boxes):
     box encloses the pixels where the alpha of a splat of this opacity reaches 1/255.
     """
     means, quats, scales, opacities, sh = gaussians
-    center, near = pinhole.center, pinhole.near
-    view = _matrix(pinhole.rotation)
+    view, center, near = pinhole.rotation, pinhole.center, pinhole.near
     fx, fy, cx, cy = pinhole.intrinsics
     least_x, largest_x, least_y, largest_y = _tangent_limits(pinhole)
     width, height = np.float32(pinhole.width), np.float32(pinhole.height)
@@ -650,10 +619,7 @@ def project(begin, end, gaussians, pinhole, splats, boxes):
     for i in range(begin, end):
         boxes[i, 0] = boxes[i, 1] = boxes[i, 2] = boxes[i, 3] = 0
         x, y, z = _applied(
-            view,
-            means[i, 0] - center[0],
-            means[i, 1] - center[1],
-            means[i, 2] - center[2],
+            view, means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         )
         # Conditions are written so that NaN fails them.
         if not (z > near and z < np.inf and opacities[i] >= MIN_ALPHA):
@@ -952,22 +918,11 @@ def composite(begin, end, context, new, frame):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def composite_backward(
-    begin,
-    end,
-    context,
-    new,
-    frame,
-    d_image,
-    d_depth,
-    d_alpha,
-    slots,
-    opacity_only,
-    gradients,
-    written,
+    begin, end, context, new, frame, slopes, slots, opacity_only, gradients, written
 ):
     """Walk the tiles begin..end back to front and sum up the gradients of the new layer's entries.
 
-    d_image [h, w, 3], d_depth [h, w], d_alpha [h, w]: gradients of the frame.
+    slopes: gradients of the frame's image [h, w, 3], depth [h, w] and alpha [h, w].
     slots [e] int32: slot of each entry of `new`.
     gradients [slots, 10] float32, or [slots, 1] where `opacity_only`: columns SUM to SUM_RED + 2.
     written [slots] bool: set for the slots, and only those, that receive a gradient.
@@ -975,6 +930,7 @@ def composite_backward(
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     _, depths, alphas, transmittances, lasts, used, _ = frame
+    d_image, d_depth, d_alpha = slopes
     height, width = alphas.shape
     tiles_x = (width + TILE - 1) // TILE
     state = _aligned(TILE * 7 * TILE).reshape((TILE, 7, TILE))
@@ -1073,8 +1029,7 @@ def project_backward(
     """
     means, quats, scales, opacities, sh = gaussians
     d_means, d_quats, d_scales, d_opacities, d_sh = slopes
-    center = pinhole.center
-    view = _matrix(pinhole.rotation)
+    view, center = pinhole.rotation, pinhole.center
     from_view = _transposed(view)
     fx, fy = pinhole.intrinsics[0], pinhole.intrinsics[1]
     least_x, largest_x, least_y, largest_y = _tangent_limits(pinhole)
@@ -1108,10 +1063,7 @@ def project_backward(
         radial = direction_x * d_dx + direction_y * d_dy + direction_z * d_dz
 
         x, y, z = _applied(
-            view,
-            means[i, 0] - center[0],
-            means[i, 1] - center[1],
-            means[i, 2] - center[2],
+            view, means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         )
         inverse_z = one / z
         tan_x, tan_y = x * inverse_z, y * inverse_z

@@ -255,27 +255,13 @@ def _sweep_half(costs, large_x, large_y, large_d, large_u, small, down, total):
             low = _step(cost, along[s % 2], low, along[1 - s % 2], out, small, large_x[y, edge])
             # The row before lies at y - 1 on the way down and at y + 1 on the way up.
             upper = max(y - 1, 0) if down else min(y, h - 2)
-            left = max(x - 1, 0)
-            right = min(x, w - 2)
-            if down:
-                from_left, from_right = large_d[upper, left], large_u[upper, right]
-            else:
-                from_left, from_right = large_u[upper, left], large_d[upper, right]
+            of_left, of_right = (large_d, large_u) if down else (large_u, large_d)
+            from_left, from_right = of_left[upper, max(x - 1, 0)], of_right[upper, min(x, w - 2)]
+            larges = (from_left, large_y[upper, x], from_right)
             for path in range(3):
-                shift = path - 1
-                large = large_y[upper, x]
-                if shift < 0:
-                    large = from_left
-                elif shift > 0:
-                    large = from_right
+                before, lowest = rows[then, path, x + path], lows[then, path, x + path]
                 lows[now, path, x + 1] = _step(
-                    cost,
-                    rows[then, path, x + 1 + shift],
-                    lows[then, path, x + 1 + shift],
-                    rows[now, path, x + 1],
-                    out,
-                    small,
-                    large,
+                    cost, before, lowest, rows[now, path, x + 1], out, small, larges[path]
                 )
 
 

@@ -3,10 +3,8 @@
 import numpy as np
 from numba import njit, prange
 
-PRIMAL_STEP = 0.25
-SLOPE_STEP = 0.2
-DUAL_STEP = 1 / 3
-SLOPE_DUAL_STEP = 0.5
+PRIMAL_STEP, SLOPE_STEP = np.float32(0.25), np.float32(0.2)
+DUAL_STEP, SLOPE_DUAL_STEP = np.float32(1 / 3), np.float32(0.5)
 """Steps of the four variables: inverse row sums of the operator, as in Pock and Chambolle 2011."""
 
 
@@ -31,24 +29,22 @@ def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations
     ahead, slopes_ahead = heights.copy(), slopes.copy()
     steps = np.zeros((2, h, w), np.float32)
     bends = np.zeros((4, h, w), np.float32)
-    primal, slope_step = np.float32(PRIMAL_STEP), np.float32(SLOPE_STEP)
-    dual, slope_dual = np.float32(DUAL_STEP), np.float32(SLOPE_DUAL_STEP)
     for _ in range(iterations):
         for y in prange(h):
             for x in range(w):
                 b0, b1, b2, b3 = bends[0, y, x], bends[1, y, x], bends[2, y, x], bends[3, y, x]
                 if x < w - 1:
                     rise = ahead[y, x + 1] - ahead[y, x] - slopes_ahead[0, y, x]
-                    value = steps[0, y, x] + dual * rise
+                    value = steps[0, y, x] + DUAL_STEP * rise
                     steps[0, y, x] = min(max(value, -across[y, x]), across[y, x])
-                    b0 += slope_dual * (slopes_ahead[0, y, x + 1] - slopes_ahead[0, y, x])
-                    b2 += slope_dual * (slopes_ahead[1, y, x + 1] - slopes_ahead[1, y, x])
+                    b0 += SLOPE_DUAL_STEP * (slopes_ahead[0, y, x + 1] - slopes_ahead[0, y, x])
+                    b2 += SLOPE_DUAL_STEP * (slopes_ahead[1, y, x + 1] - slopes_ahead[1, y, x])
                 if y < h - 1:
                     rise = ahead[y + 1, x] - ahead[y, x] - slopes_ahead[1, y, x]
-                    value = steps[1, y, x] + dual * rise
+                    value = steps[1, y, x] + DUAL_STEP * rise
                     steps[1, y, x] = min(max(value, -down[y, x]), down[y, x])
-                    b1 += slope_dual * (slopes_ahead[0, y + 1, x] - slopes_ahead[0, y, x])
-                    b3 += slope_dual * (slopes_ahead[1, y + 1, x] - slopes_ahead[1, y, x])
+                    b1 += SLOPE_DUAL_STEP * (slopes_ahead[0, y + 1, x] - slopes_ahead[0, y, x])
+                    b3 += SLOPE_DUAL_STEP * (slopes_ahead[1, y + 1, x] - slopes_ahead[1, y, x])
                 length = np.sqrt(b0 * b0 + b1 * b1 + b2 * b2 + b3 * b3)
                 shorter = one / max(one, length / bend)
                 bends[0, y, x], bends[1, y, x] = b0 * shorter, b1 * shorter
@@ -67,8 +63,8 @@ def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations
                     turn0 -= bends[1, y - 1, x]
                     turn1 -= bends[3, y - 1, x]
                 before = heights[y, x]
-                pull = primal * weight[y, x]
-                miss = before + primal * push - data[y, x]
+                pull = PRIMAL_STEP * weight[y, x]
+                miss = before + PRIMAL_STEP * push - data[y, x]
                 if abs(miss) <= pull + tolerance:
                     miss *= tolerance / (tolerance + pull)
                 else:
@@ -76,7 +72,7 @@ def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations
                 heights[y, x] = data[y, x] + miss
                 ahead[y, x] = two * heights[y, x] - before
                 v0, v1 = slopes[0, y, x], slopes[1, y, x]
-                slopes[0, y, x] = v0 + slope_step * (steps[0, y, x] + turn0)
-                slopes[1, y, x] = v1 + slope_step * (steps[1, y, x] + turn1)
+                slopes[0, y, x] = v0 + SLOPE_STEP * (steps[0, y, x] + turn0)
+                slopes[1, y, x] = v1 + SLOPE_STEP * (steps[1, y, x] + turn1)
                 slopes_ahead[0, y, x] = two * slopes[0, y, x] - v0
                 slopes_ahead[1, y, x] = two * slopes[1, y, x] - v1

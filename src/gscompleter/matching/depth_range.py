@@ -9,12 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.errors import InputError
-from gscompleter.matching.features import features_of, matches
-from gscompleter.matching.stereo_image import (
-    StereoImage,
-    source_from_reference,
-    stereo_images,
-)
+from gscompleter.matching.features import Pixels, features_of, matches
+from gscompleter.matching.stereo_image import StereoImage, source_from_reference, stereo_images
 from gscompleter.types import View
 
 MIN_MATCHES = 12
@@ -97,11 +93,8 @@ def triangulated(images: Sequence[StereoImage]) -> Float[np.ndarray, "n"]:
 
 
 def _inverse_depths(
-    reference: StereoImage,
-    source: StereoImage,
-    pixels: Float[np.ndarray, "n 2"],
-    matched: Float[np.ndarray, "n 2"],
-) -> Float[np.ndarray, "m"]:
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> Float[np.ndarray, "k"]:
     """Inverse z-depths in `reference` of the matches that lie on their epipolar lines.
 
     A match that hardly moves tells nothing of depth.

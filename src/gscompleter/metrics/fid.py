@@ -50,11 +50,7 @@ def fid(
 
 # The class is unknown without the optional package.
 def load_metric():  # type: ignore[no-untyped-def]
-    """The metric of torchmetrics, for images in [0, 1].
-
-    Raises:
-        InputError: where torchmetrics is missing or its weights cannot be had.
-    """
+    """The metric of torchmetrics, for images in [0, 1]; errors as those of `fid`."""
     try:
         # Here and not above: the package brings torchvision along.
         from torchmetrics.image.fid import FrechetInceptionDistance

@@ -32,15 +32,14 @@ primitives and well below the depth of a room."""
 
 
 def abs_rel(
-    depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]
+    depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]
 ) -> float | None:
     """Absolute relative error: mean(|depth - truth| / truth), without unit; 0 is best.
 
     Over the pixels of `where` with known (positive) truth; None where there is none. No scale
     is fitted beforehand: a wrong scale is one of the errors that registration has to remove.
     """
-    known = where & (truth > 0)
-    if not known.any():
+    if truth is None or not (known := where & (truth > 0)).any():
         return None
     d, t = depth[known].double(), truth[known].double()
     return ((d - t).abs() / t).mean().item()
@@ -76,11 +75,7 @@ class CloudDistances:
 
 
 def cloud_distances(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> CloudDistances:
-    """Exact nearest-neighbour distances between two point sets, both ways.
-
-    Raises:
-        InputError: where a set is empty or holds a point that is not finite.
-    """
+    """Exact nearest-neighbour distances between two point sets, both ways, as by `nearest`."""
     return CloudDistances(nearest(a, b), nearest(b, a))
 
 
@@ -128,10 +123,7 @@ class Alignment:
 
 @torch.no_grad()
 def alignment(
-    added: Gaussians,
-    context: Gaussians,
-    target: Camera,
-    renderer: Renderer,
+    added: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
 ) -> Alignment:
     """AbsRel, Chamfer distance and F-score between what one target added and the context.
 

@@ -127,18 +127,6 @@ NETWORKS: dict[str, Network] = {
 }
 
 
-class LinearWeights(nn.Module):
-    """w_l: one weight per channel, as a 1 x 1 convolution without bias."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        # The published names count the dropout that stood in front during training.
-        self.model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
-
-    def forward(self, x: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 1 h w"]:
-        return self.model(x)
-
-
 class Lpips(nn.Module):
     """The metric as a module; `load_lpips` fills it with the published weights."""
 
@@ -150,12 +138,12 @@ class Lpips(nn.Module):
         self.network = network
         self.features = backbone(network)
         for i, channels in enumerate(network.channels):
-            self.add_module(f"lin{i}", LinearWeights(channels))
+            # w_l. The published names count the dropout that stood in front during training.
+            model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
+            self.add_module(f"lin{i}", nn.ModuleDict({"model": model}))
         # ImageNet's mean and deviation, for colours in [-1, 1].
-        for name, values in (
-            ("shift", (-0.030, -0.088, -0.188)),
-            ("scale", (0.458, 0.448, 0.450)),
-        ):
+        statistics = {"shift": (-0.030, -0.088, -0.188), "scale": (0.458, 0.448, 0.450)}
+        for name, values in statistics.items():
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
     def forward(
@@ -176,7 +164,8 @@ class Lpips(nn.Module):
             )
         pairs = zip(self.unit_features(image.clamp(0, 1)), self.unit_features(truth), strict=True)
         terms = [
-            self.get_submodule(f"lin{i}")((a - b).square()).mean() for i, (a, b) in enumerate(pairs)
+            self.get_submodule(f"lin{i}.model")((a - b).square()).mean()
+            for i, (a, b) in enumerate(pairs)
         ]
         return torch.stack(terms).sum()
 
@@ -233,14 +222,9 @@ def load_lpips(
     if network not in NETWORKS:
         raise InputError(f"There is no LPIPS network {network!r}; choose {' or '.join(NETWORKS)}.")
     wanted = NETWORKS[network]
-    paths = [
-        locate(file, wanted, folder, download and folder is None)
-        for file in (wanted.backbone, wanted.linear)
-    ]
-    of_backbone, of_linear = (
-        read_weights(path, file)
-        for path, file in zip(paths, (wanted.backbone, wanted.linear), strict=True)
-    )
+    files = (wanted.backbone, wanted.linear)
+    paths = [locate(file, wanted, folder, download and folder is None) for file in files]
+    of_backbone, of_linear = map(read_weights, paths, files)
     metric = Lpips(wanted)
     # The classifier behind the features is not part of the metric, nor are later layers.
     weights = {k: v for k, v in of_backbone.items() if k.startswith("features.")} | dict(of_linear)
@@ -259,10 +243,9 @@ def place_of(file: WeightsFile, folder: Path | None) -> Path:
 
 
 def locate(file: WeightsFile, network: Network, folder: Path | None, download: bool) -> Path:
-    """The path of a weights file that exists, after a download where that is allowed.
+    """The path of a weights file, after a download where that is allowed and needed.
 
-    Raises:
-        WeightsNotAvailable: where there is none.
+    Raises WeightsNotAvailable where there is none.
     """
     path = place_of(file, folder)
     if path.is_file():
@@ -284,17 +267,17 @@ def locate(file: WeightsFile, network: Network, folder: Path | None, download: b
 
 
 def read_weights(path: Path, file: WeightsFile) -> Mapping[str, Tensor]:
-    """The tensors of a file, once its hash is the expected one; never any other object.
-
-    Raises:
-        InputError: where the file is another one, is damaged, or holds more than tensors.
-    """
+    """The tensors of a file with the expected hash, else an InputError; never any other object."""
     check_kind(path, file.name)
     check_sha256(path, file.sha256, file.name)
     weights = read_tensors(path, file.name)
     if not isinstance(weights, Mapping):
         raise InputError(f"{path} holds no named weights; fetch it again.")
     return weights
+
+
+cached_lpips = lru_cache(maxsize=2)(load_lpips)
+"""`load_lpips`, which keeps the last two, as tables ask again and again."""
 
 
 @torch.no_grad()
@@ -306,13 +289,7 @@ def lpips_if_available(
 ) -> float | None:
     """LPIPS where its weights lie on this machine, else None; nothing is downloaded."""
     try:
-        metric = cached_lpips(network, folder)
+        metric = cached_lpips(network, folder, download=False)
     except WeightsNotAvailable:
         return None
     return float(metric(image, truth).item())
-
-
-@lru_cache(maxsize=2)
-def cached_lpips(network: NetworkName, folder: Path | None) -> Lpips:
-    """`load_lpips` without a download; the last two are kept, as tables ask again and again."""
-    return load_lpips(network, folder, download=False)

@@ -18,6 +18,9 @@ from gscompleter.types import Camera, Gaussians, Render, View
 
 Image = Float[Tensor, "h w 3"]
 
+MIN_PIXELS = 50
+"""Fewest pixels that a difference or a ratio of depths is a median of."""
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -71,14 +74,14 @@ class Scores:
     """AbsRel at the target against the true depth, where the context covers it."""
     depth_hole: float | None
     """The same where the context has a hole and the completion fills it."""
-    depth_rim: float | None
+    depth_rim: float | None = None
     """Median relative difference of depth between what was added, drawn alone, and the context,
     where both cover the target: the step at the border of the holes."""
-    align_abs_rel: float | None
+    align_abs_rel: float | None = None
     """AbsRel of what was added against the context (`geometry.alignment`)."""
-    align_chamfer: float | None
+    align_chamfer: float | None = None
     """Chamfer distance between the two, as a share of the median depth at the target."""
-    align_f_score: float | None
+    align_f_score: float | None = None
     """F-score between the two."""
 
 
@@ -124,12 +127,8 @@ def score(
         neighbours_psnr=mean_change(_changes(beside, psnr)),
         context_psnr=_changes(context, psnr),
         context_ssim=_changes(context, ssim),
-        depth_observed=_abs_rel(now.depth, target.depth, ~holes & covered),
-        depth_hole=_abs_rel(now.depth, target.depth, holes & covered),
-        depth_rim=None,
-        align_abs_rel=None,
-        align_chamfer=None,
-        align_f_score=None,
+        depth_observed=abs_rel(now.depth, target.depth, ~holes & covered),
+        depth_hole=abs_rel(now.depth, target.depth, holes & covered),
     )
     if added is not None and len(added) > 0:
         aligned = alignment(added, before, target.camera, renderer)
@@ -154,19 +153,15 @@ def quality(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Qua
 
 
 def rim_error(
-    added: Gaussians,
-    context: Render,
-    target: Camera,
-    renderer: Renderer,
-    min_pixels: int = 50,
+    added: Gaussians, context: Render, target: Camera, renderer: Renderer
 ) -> float | None:
     """Median of |D_added - D_context| / D_context where both cover the target.
 
-    None where fewer than `min_pixels` are covered by both.
+    None where fewer than `MIN_PIXELS` are covered by both.
     """
     alone = renderer.render(added, target).depth_map()
     both = alone.valid & context.depth_map().valid
-    if both.sum() < min_pixels:
+    if both.sum() < MIN_PIXELS:
         return None
     return ((alone.depth - context.depth).abs() / context.depth)[both].median().item()
 
@@ -205,10 +200,3 @@ def _changes(
     drawn: Sequence[tuple[Image, Image, Image]], metric: Callable[[Image, Image], float]
 ) -> tuple[Change, ...]:
     return tuple(Change(metric(was, image), metric(now, image)) for was, now, image in drawn)
-
-
-def _abs_rel(
-    depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]
-) -> float | None:
-    """`abs_rel` over `where`; None where no truth is known."""
-    return None if truth is None else abs_rel(depth, truth, where)

@@ -70,8 +70,8 @@ class CpuView:
 
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; only `new` is projected, sorted and binned."""
-        tensors = (new.means, new.quats, new.scales, new.opacities, new.sh)
-        return Render(*_Composite.apply(self, *(t.to("cpu", torch.float32) for t in tensors)))
+        tensors = (getattr(new, name).to("cpu", torch.float32) for name in GaussianArrays._fields)
+        return Render(*_Composite.apply(self, *tensors))
 
     def plan(self, new: Gaussians) -> OpacityRender:
         """Project, sort and bin `new` once, with boxes that hold for every opacity."""
@@ -95,13 +95,8 @@ class Binned:
     """Where the gradients of each Gaussian start, and the end [n + 1]."""
 
 
-@dataclass(frozen=True)
-class EntryGradients:
-    """Gradients of the entries of the tiles' lists, by slot."""
-
-    values: Float32[ndarray, "entries columns"]
-    written: Bool[ndarray, "entries"]
-    """Which of the values hold something."""
+EntryGradients = tuple[Float32[ndarray, "entries columns"], Bool[ndarray, "entries"]]
+"""Gradients of the entries of the tiles' lists, by slot, and which of them hold something."""
 
 
 @dataclass(frozen=True)
@@ -154,11 +149,8 @@ class Viewpoint:
         sizes = np.zeros(n, np.int32)
         counts = np.zeros((len(chunks), self.tiles), np.int32)
         seen = (order, depths, boxes, depth_limits, self.tiles_x, rectangles, sizes)
-        run(
-            self.threads,
-            rasterizer.count_entries,
-            [(*chunk, *seen, count) for chunk, count in zip(chunks, counts, strict=True)],
-        )
+        counting = [(*chunk, *seen, count) for chunk, count in zip(chunks, counts, strict=True)]
+        run(self.threads, rasterizer.count_entries, counting)
         slot_start = np.zeros(n + 1, np.int64)
         np.cumsum(sizes, out=slot_start[1:])
         if slot_start[-1] > MAX_ENTRIES:
@@ -168,15 +160,12 @@ class Viewpoint:
             )
         tile_start = rasterizer.places_of(counts)
         entries, slots = np.empty(tile_start[-1], np.int32), np.empty(tile_start[-1], np.int32)
-        filled = (order, depths, depth_limits, self.tiles_x, rectangles, slot_start)
-        run(
-            self.threads,
-            rasterizer.fill_entries,
-            [
-                (*chunk, *filled, places, entries, slots)
-                for chunk, places in zip(chunks, counts, strict=True)
-            ],
-        )
+        known = (order, depths, depth_limits, self.tiles_x, rectangles, slot_start)
+        filling = [
+            (*chunk, *known, places, entries, slots)
+            for chunk, places in zip(chunks, counts, strict=True)
+        ]
+        run(self.threads, rasterizer.fill_entries, filling)
         layer = Layer(splats, gaussians.opacities, boxes, tile_start, entries)
         return Binned(layer, slots, slot_start)
 
@@ -207,22 +196,12 @@ class Viewpoint:
 
         One column is enough where only opacities are wanted.
         """
-        gradients = EntryGradients(
-            np.empty((len(new.slots), columns), np.float32), np.zeros(len(new.slots), np.bool_)
-        )
-        self.share(
-            rasterizer.composite_backward,
-            self.tiles,
-            context,
-            new.layer,
-            frame,
-            *map(float32, slopes),
-            new.slots,
-            columns == 1,
-            gradients.values,
-            gradients.written,
-        )
-        return gradients
+        values = np.empty((len(new.slots), columns), np.float32)
+        written = np.zeros(len(new.slots), np.bool_)
+        drawn = (context, new.layer, frame, tuple(map(float32, slopes)))
+        received = (new.slots, columns == 1, values, written)
+        self.share(rasterizer.composite_backward, self.tiles, *drawn, *received)
+        return values, written
 
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
         """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time."""
@@ -251,17 +230,9 @@ class _Composite(torch.autograd.Function):
         gaussians = GaussianArrays(*map(float32, ctx.saved_tensors[:5]))
         gradients = view.viewpoint.composite_backward(view.layer, binned, frame, slopes)
         result = GaussianArrays(*map(np.zeros_like, gaussians))
-        view.viewpoint.share(
-            rasterizer.project_backward,
-            len(gaussians.means),
-            gaussians,
-            view.viewpoint.pinhole,
-            binned.layer.splats,
-            binned.slot_start,
-            gradients.values,
-            gradients.written,
-            result,
-        )
+        drawn = (gaussians, view.viewpoint.pinhole, binned.layer.splats, binned.slot_start)
+        n = len(gaussians.means)
+        view.viewpoint.share(rasterizer.project_backward, n, *drawn, *gradients, result)
         return None, *map(torch.from_numpy, result)
 
 
@@ -284,15 +255,8 @@ class _Planned(torch.autograd.Function):
         opacities = float32(ctx.saved_tensors[0])
         gradients = view.viewpoint.composite_backward(view.layer, binned, frame, slopes, columns=1)
         result = np.zeros_like(opacities)
-        view.viewpoint.share(
-            rasterizer.opacity_backward,
-            len(opacities),
-            opacities,
-            binned.slot_start,
-            gradients.values,
-            gradients.written,
-            result,
-        )
+        arguments = (opacities, binned.slot_start, *gradients, result)
+        view.viewpoint.share(rasterizer.opacity_backward, len(opacities), *arguments)
         return None, None, torch.from_numpy(result)
 
 
@@ -310,7 +274,7 @@ def pinhole_of(camera: Camera) -> Pinhole:
     K = camera.K.detach().to("cpu", torch.float64)
     c2w = camera.c2w.detach().to("cpu", torch.float64)
     return Pinhole(
-        rotation=float32(torch.linalg.inv(c2w[:3, :3])),
+        rotation=tuple(float32(torch.linalg.inv(c2w[:3, :3])).ravel()),
         center=float32(c2w[:3, 3]),
         intrinsics=float32(torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])),
         near=np.float32(max(camera.near_plane, 0.0)),
@@ -329,13 +293,7 @@ def length_of(gaussians: GaussianArrays) -> int:
 
 def arrays_of(gaussians: Gaussians) -> GaussianArrays:
     """The Gaussians as the kernels want them, without gradients."""
-    return GaussianArrays(
-        float32(gaussians.means),
-        float32(gaussians.quats),
-        float32(gaussians.scales),
-        float32(gaussians.opacities),
-        float32(gaussians.sh),
-    )
+    return GaussianArrays(*(float32(getattr(gaussians, name)) for name in GaussianArrays._fields))
 
 
 def render_of(frame: Frame) -> Render:

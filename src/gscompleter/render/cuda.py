@@ -15,16 +15,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.render import OpacityRender
+from gscompleter.render import OpacityRender, Renderer
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
 
 @runtime_checkable
-class Drawing(Protocol):
+class Drawing(Renderer, Protocol):
     """What a frozen view asks of a renderer."""
-
-    def render(self, gaussians: Gaussians, camera: Camera) -> Render: ...
 
     def visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
         """Which of the Gaussians can reach the image, whatever stands before them."""

@@ -41,13 +41,11 @@ class Images:
 
     def scores(self) -> dict[str, float | None]:
         """PSNR (dB) and SSIM against the photograph; None where there is none."""
-        if self.truth is None:
-            return dict.fromkeys(("psnr_before", "psnr_after", "ssim_before", "ssim_after"))
+        images = {"before": self.before, "after": self.after}
         return {
-            "psnr_before": psnr(self.before, self.truth),
-            "psnr_after": psnr(self.after, self.truth),
-            "ssim_before": ssim(self.before, self.truth),
-            "ssim_after": ssim(self.after, self.truth),
+            f"{metric.__name__}_{when}": None if self.truth is None else metric(image, self.truth)
+            for metric in (psnr, ssim)
+            for when, image in images.items()
         }
 
 
@@ -87,7 +85,8 @@ def summarize(
                     for key in ("scale", "shift", "inliers", "method")
                 },
                 **images.scores(),
-                "generated": provenance(result),
+                # the property of completed.ply that marks what this target added
+                "generated": int(result.added.generated[0]) if len(result.added) else None,
                 "added": len(result.added),
                 "notes": list(result.notes),
             }
@@ -98,11 +97,6 @@ def summarize(
         "gaussians": {"context": len(completion.context), "added": len(completion.added)},
         "seconds": dict(completion.seconds),
     }
-
-
-def provenance(result: TargetCompletion) -> int | None:
-    """The value of the property `generated` that marks what this target added."""
-    return int(result.added.generated[0]) if len(result.added) else None
 
 
 def write_report(

@@ -42,14 +42,11 @@ def plots(summary: Summary, out: Path) -> list[Path]:
     ]
     if not summary.common:
         return drawn
-    drawn.append(save_plot(out / "gain_by_hole.png", lambda a: draw_gain_by_hole(a, summary)))
+    drawn.append(save_plot(out / "gain_by_hole.png", draw_gain_by_hole, summary))
     if len(summary.gains) > 1:
-        drawn.append(
-            save_plot(out / "gain_by_distance.png", lambda a: draw_gain_by_distance(a, summary))
-        )
+        drawn.append(save_plot(out / "gain_by_distance.png", draw_gain_by_distance, summary))
     height = 1.5 + 0.28 * len(summary.methods)
-    drawn.append(save_plot(out / "seconds.png", lambda a: draw_seconds(a, summary), height))
-    return drawn
+    return [*drawn, save_plot(out / "seconds.png", draw_seconds, summary, height)]
 
 
 CURVES: tuple[tuple[str, Callable[[Step], float | None]], ...] = (
@@ -61,12 +58,7 @@ CURVES: tuple[tuple[str, Callable[[Step], float | None]], ...] = (
 
 
 def save_curves(path: Path, steps: Mapping[str, Sequence[Step]]) -> Path:
-    """A PNG of each method's steps in one sequence.
-
-    Raises:
-        PlotsNotAvailable: where matplotlib is missing.
-        InputError: where the file cannot be written.
-    """
+    """A PNG of each method's steps in one sequence; errors as those of `plots`."""
     figure = new_figure(7.0)
     panels = figure.subplots(len(CURVES), sharex=True)
     for axes, (title, of) in zip(panels, CURVES, strict=True):
@@ -83,15 +75,15 @@ def save_curves(path: Path, steps: Mapping[str, Sequence[Step]]) -> Path:
     return _write(figure, path)
 
 
-def save_plot(path: Path, draw: Callable[[Axes], None], height: float = 4.5) -> Path:
-    """A PNG of what `draw` draws, 8 inches wide. The same values give the same bytes.
+def save_plot(
+    path: Path, draw: Callable[[Axes, Summary], None], summary: Summary, height: float = 4.5
+) -> Path:
+    """A PNG of what `draw` draws, 8 inches wide; errors as those of `plots`.
 
-    Raises:
-        PlotsNotAvailable: where matplotlib is missing.
-        InputError: where the file cannot be written.
+    The same values give the same bytes.
     """
     figure = new_figure(height)
-    draw(figure.add_subplot())
+    draw(figure.add_subplot(), summary)
     figure.legend(loc="outside right upper", fontsize="small")
     return _write(figure, path)
 
@@ -103,11 +95,7 @@ def _write(figure: Figure, path: Path) -> Path:
 
 
 def new_figure(height: float) -> Figure:
-    """An empty figure that needs no display.
-
-    Raises:
-        PlotsNotAvailable: where matplotlib is missing.
-    """
+    """An empty figure that needs no display; PlotsNotAvailable where matplotlib is missing."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -135,9 +123,7 @@ def draw_gain_by_hole(axes: Axes, summary: Summary) -> None:
             label=method,
             **_style(number),
         )
-    axes.axhline(0, color="black", linewidth=0.8)
-    axes.set_xlabel("hole at the target (% of its pixels)")
-    _finish_gain(axes)
+    _finish_gain(axes, "hole at the target (% of its pixels)")
 
 
 def draw_gain_by_distance(axes: Axes, summary: Summary) -> None:
@@ -149,10 +135,8 @@ def draw_gain_by_distance(axes: Axes, summary: Summary) -> None:
             if (value := cells[method].value) is not None
         }
         axes.plot(list(gains), list(gains.values()), linewidth=1, label=method, **_style(number))
-    axes.axhline(0, color="black", linewidth=0.8)
     axes.set_xticks(list(summary.gains))
-    axes.set_xlabel("frames from the target to the nearest context frame")
-    _finish_gain(axes)
+    _finish_gain(axes, "frames from the target to the nearest context frame")
 
 
 def draw_seconds(axes: Axes, summary: Summary) -> None:
@@ -177,6 +161,8 @@ def _style(number: int) -> dict[str, Any]:
     return {"color": f"C{number % 10}", "marker": marker, "markersize": 5, "alpha": 0.8}
 
 
-def _finish_gain(axes: Axes) -> None:
+def _finish_gain(axes: Axes, label: str) -> None:
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set_xlabel(label)
     axes.set_ylabel("gain at the target (dB PSNR)")
     axes.grid(alpha=0.3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +42,6 @@ class Column:
         return self.over_steps(values) if values else None
 
 
-def _target(key: str) -> Callable[[Step], float | None]:
-    return lambda step: step["scores"]["target_after"][key]
-
-
 def psnr_before(step: Step) -> float:
     """PSNR at the target just before a step, in dB."""
     return float(step["scores"]["target_before"]["psnr"])
@@ -60,8 +57,11 @@ def gain_of(step: Step) -> float:
     return psnr_after(step) - psnr_before(step)
 
 
-def _after(key: str) -> Callable[[Step], float | None]:
-    return lambda step: None if step["scores"][key] is None else step["scores"][key]["after"]
+def _at(*path: str) -> Callable[[Step], float | None]:
+    """What lies there in the scores of a step; None where a score on the way is None."""
+    return lambda step: reduce(
+        lambda found, key: None if found is None else found[key], path, step["scores"]
+    )
 
 
 def _change(key: str) -> Callable[[Step], float | None]:
@@ -80,10 +80,6 @@ def _views(key: str) -> Callable[[Step], float]:
     return lambda step: statistics.fmean(view["after"] for view in step["scores"][key])
 
 
-def _score(key: str) -> Callable[[Step], float | None]:
-    return lambda step: step["scores"][key]
-
-
 def _of_step(key: str) -> Callable[[Step], float | None]:
     return lambda step: step[key]
 
@@ -94,12 +90,12 @@ IMAGES = (
     Column("psnr", "PSNR", 2, psnr_after),
     GAIN,
     Column("lowest_gain", "lowest gain", 2, gain_of, min, min),
-    Column("ssim", "SSIM", 3, _target("ssim")),
-    Column("lpips_vgg", "LPIPS (VGG)", 3, _target("lpips_vgg")),
-    Column("lpips_alex", "LPIPS (Alex)", 3, _target("lpips_alex")),
-    Column("hole_psnr", "in holes", 2, _score("hole_psnr")),
-    Column("observed_psnr", "outside", 2, _after("observed_psnr")),
-    Column("neighbours", "beside", 2, _after("neighbours_psnr")),
+    Column("ssim", "SSIM", 3, _at("target_after", "ssim")),
+    Column("lpips_vgg", "LPIPS (VGG)", 3, _at("target_after", "lpips_vgg")),
+    Column("lpips_alex", "LPIPS (Alex)", 3, _at("target_after", "lpips_alex")),
+    Column("hole_psnr", "in holes", 2, _at("hole_psnr")),
+    Column("observed_psnr", "outside", 2, _at("observed_psnr", "after")),
+    Column("neighbours", "beside", 2, _at("neighbours_psnr", "after")),
     Column("neighbours_gain", "gain beside", 2, _change("neighbours_psnr")),
     Column("context", "context", 2, _views("context_psnr")),
     Column("context_ssim", "SSIM of context", 3, _views("context_ssim")),
@@ -109,12 +105,12 @@ IMAGES = (
 target; at the known views. The worst change is that of the known view that lost most."""
 
 GEOMETRY = (
-    Column("depth_observed", "AbsRel observed", 3, _score("depth_observed")),
-    Column("depth_hole", "AbsRel in holes", 3, _score("depth_hole")),
-    Column("depth_rim", "step at rim", 4, _score("depth_rim")),
-    Column("align_abs_rel", "AbsRel to context", 4, _score("align_abs_rel")),
-    Column("align_chamfer", "Chamfer to context", 4, _score("align_chamfer")),
-    Column("align_f_score", "F-score to context", 3, _score("align_f_score")),
+    Column("depth_observed", "AbsRel observed", 3, _at("depth_observed")),
+    Column("depth_hole", "AbsRel in holes", 3, _at("depth_hole")),
+    Column("depth_rim", "step at rim", 4, _at("depth_rim")),
+    Column("align_abs_rel", "AbsRel to context", 4, _at("align_abs_rel")),
+    Column("align_chamfer", "Chamfer to context", 4, _at("align_chamfer")),
+    Column("align_f_score", "F-score to context", 3, _at("align_f_score")),
 )
 """Against true depth where it is known, and of what was added against the scene before. All lengths
 are shares of the depth."""
@@ -158,9 +154,15 @@ class Summary:
     """Task, method, reason."""
 
     @property
+    def groups(self) -> dict[str, tuple[Column, ...]]:
+        """By the title of their table, the columns that may have a value."""
+        groups = {"Images": IMAGES, "Geometry": GEOMETRY}
+        return {**groups, "Sequences": SEQUENCE} if self.sequences else groups
+
+    @property
     def columns(self) -> tuple[Column, ...]:
-        """All that may have a value."""
-        return IMAGES + GEOMETRY + (SEQUENCE if self.sequences else ())
+        """Those of all groups."""
+        return tuple(column for group in self.groups.values() for column in group)
 
     @property
     def num_steps(self) -> int:
@@ -208,11 +210,7 @@ def read_rows(out: Path) -> list[Row]:
 
 
 def read_row(path: Path) -> Row:
-    """What `evaluate` wrote for a task and a method.
-
-    Raises:
-        InputError: where it is damaged.
-    """
+    """What `evaluate` wrote for a task and a method; an InputError where it is damaged."""
     row = read_json(path)
     try:
         row["task"]["name"], row["error"], row["reconstruct_seconds"]

@@ -17,9 +17,7 @@ from gscompleter.io.files import replacing
 from gscompleter.io.image import read_image
 from gscompleter.metrics.fid import fid
 from gscompleter.reports.summary import (
-    GEOMETRY,
     IMAGES,
-    SEQUENCE,
     Cell,
     Column,
     Step,
@@ -118,10 +116,7 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def score_markdown(summary: Summary, fids: Fid) -> str:
     """Scores, what they are over, what failed, and each step of tasks of several."""
     parts = [scope(summary)]
-    groups = {"Images": IMAGES, "Geometry": GEOMETRY}
-    if summary.sequences:
-        groups["Sequences"] = SEQUENCE
-    for title, columns in groups.items():
+    for title, columns in summary.groups.items():
         chosen = summary.present(columns)
         if chosen:
             head = ["method", *(column.title for column in chosen)]
@@ -167,11 +162,9 @@ def gain_markdown(summary: Summary) -> str:
     """The gain against the distance from the known views."""
     counts = {gap: max(c.count for c in cells.values()) for gap, cells in summary.gains.items()}
     head = ["method", *(f"{gap} ({counts[gap]})" for gap in summary.gains)]
+    gains = summary.gains.items()
     rows = [
-        [
-            method,
-            *(shown_cell(cells[method], 2, counts[gap]) for gap, cells in summary.gains.items()),
-        ]
+        [method, *(shown_cell(cells[method], 2, counts[gap]) for gap, cells in gains)]
         for method in summary.methods
     ]
     return (
@@ -202,7 +195,7 @@ def step_cells(step: Step) -> list[str]:
 def score_latex(summary: Summary) -> str:
     """The tables of scores for LaTeX with booktabs."""
     blocks = [f"% Over the {len(summary.common)} of {len(summary.tasks)} cases that all finished."]
-    for group in (IMAGES, GEOMETRY, SEQUENCE if summary.sequences else ()):
+    for group in summary.groups.values():
         columns = summary.present(group)
         if columns:
             blocks.append(_tabular(summary, columns))

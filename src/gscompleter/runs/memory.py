@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
-
-_CLEAR = Path("/proc/self/clear_refs")
-_STATUS = Path("/proc/self/status")
 
 
 class Peak:
@@ -31,20 +28,13 @@ def peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
     on_gpu = torch.device(device).type == "cuda"
     if on_gpu:
         torch.cuda.reset_peak_memory_stats()
-    told = on_gpu or _reset()
+        yield peak
+        peak.bytes = torch.cuda.max_memory_allocated()
+        return
+    told = False
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+        told = True
     yield peak
-    if told:
-        peak.bytes = torch.cuda.max_memory_allocated() if on_gpu else _most_resident()
-
-
-def _reset() -> bool:
-    try:
-        _CLEAR.write_text("5")
-    except OSError:
-        return False
-    return True
-
-
-def _most_resident() -> int | None:
-    match = re.search(r"VmHWM:\s*([0-9]+) kB", _STATUS.read_text())
-    return None if match is None else 1024 * int(match[1])
+    if told and (most := re.search(r"VmHWM:\s*([0-9]+) kB", Path("/proc/self/status").read_text())):
+        peak.bytes = 1024 * int(most[1])

@@ -78,15 +78,9 @@ def completed_with(config: str) -> Method:
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         completer = models.completer(config)
         done = completer.advance(completer.begin(state.views, state.scene), target)
-        (result,) = done.targets
-        return Prediction(
-            done.scene,
-            result.added,
-            done.seconds,
-            result.anchor,
-            result.anchor_fallback,
-            result.notes,
-        )
+        (made,) = done.targets
+        told = (made.anchor, made.anchor_fallback, made.notes)
+        return Prediction(done.scene, made.added, done.seconds, *told)
 
     return method
 
@@ -174,7 +168,7 @@ def methods_named(names: Sequence[str]) -> tuple[str, ...]:
     """The methods that `names`, of methods or of groups, stand for, each once.
 
     Raises:
-        InputError: where a name is of neither, or there is none.
+        InputError: as `check_methods`.
     """
     found = [method for name in names for method in GROUPS.get(name, (name,))]
     chosen = tuple(dict.fromkeys(found))
@@ -183,13 +177,8 @@ def methods_named(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def check_methods(names: Sequence[str], steps: int = 1) -> None:
-    """Refuse names of no method, none at all, the same one twice, and what cannot do `steps`.
-
-    Raises:
-        InputError: where there is one.
-    """
-    names_of_all = [*GROUPS, *(name for name in METHODS if not name.startswith("paper/"))]
-    known = ", ".join(names_of_all)
+    """Raise an InputError for names of no method, none, one twice, and what cannot do `steps`."""
+    known = ", ".join([*GROUPS, *(name for name in METHODS if not name.startswith("paper/"))])
     if not names:
         raise InputError(f"No method was named; choose one or more of {known}.")
     for name in names:

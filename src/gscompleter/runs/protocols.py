@@ -134,8 +134,15 @@ class ViewByView:
     def reason_to_skip(self, clip: PosedPhotographs) -> str | None:
         """Why a clip has no split; None where it has one."""
         needed = 2 * self.k + 1
-        short = f"it has {len(clip)} frames, and {self.name} needs {needed}"
-        return short if len(clip) < needed else None
+        if len(clip) >= needed:
+            return None
+        return f"it has {len(clip)} frames, and {self.name} needs {needed}"
+
+
+_PATTERNS: dict[str, type[Extrapolation | ViewByView]] = {
+    "n-([0-9]{1,6})(?:-stride-([0-9]{1,6}))?": Extrapolation,
+    "sequence-([0-9]{1,6})(?:-steps-([0-9]{1,6}))?": ViewByView,
+}
 
 
 def parse_protocol(text: str) -> EvaluationProtocol:
@@ -145,12 +152,9 @@ def parse_protocol(text: str) -> EvaluationProtocol:
     Raises:
         InputError: where it is none of these, or the index is damaged.
     """
-    match = re.fullmatch(r"n-([0-9]{1,6})(?:-stride-([0-9]{1,6}))?", text)
-    if match:
-        return Extrapolation(int(match[1]), None if match[2] is None else int(match[2]))
-    match = re.fullmatch(r"sequence-([0-9]{1,6})(?:-steps-([0-9]{1,6}))?", text)
-    if match:
-        return ViewByView(int(match[1]), None if match[2] is None else int(match[2]))
+    for pattern, kind in _PATTERNS.items():
+        if match := re.fullmatch(pattern, text):
+            return kind(*(int(number) for number in match.groups() if number is not None))
     if text == "stress":
         return StressTest()
     if os.path.isfile(text):
@@ -251,11 +255,8 @@ def _splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
 
 def _frames(row: dict[str, Any], key: str, scene: str, path: Path) -> tuple[int, ...]:
     frames = row.get(key)
-    if (
-        not isinstance(frames, list)
-        or not frames
-        or not all(type(frame) is int and frame >= 0 for frame in frames)
-    ):
+    whole = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
+    if not whole or not frames:
         raise InputError(
             f"The `{key}` of the scene {scene} in {path} is {quoted(frames)}; a list of frame "
             "numbers, at least one, is needed."

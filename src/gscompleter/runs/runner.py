@@ -14,11 +14,12 @@ from typing import Any, Literal
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, load_generator
+from gscompleter.memory import check_memory
 from gscompleter.progress import shown_on, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.runs.methods import Models, check_methods
-from gscompleter.runs.steps import Prepared, Step, attempt, complete_task, read_back
+from gscompleter.runs.steps import Prepared, Step, attempt, complete_task, kept
 from gscompleter.runs.store import (
     VERSION,
     SavedContext,
@@ -142,7 +143,8 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
     """Read the photographs of a task, and read, or compute, the scene that all methods begin with.
 
     Raises:
-        InputError: where a photograph is damaged, other than that of a later target.
+        InputError: where a photograph is damaged, other than that of a later target, or there is
+            not enough memory.
         OutputError: where the scene cannot be saved.
     """
     views = photographs(task, task.context, config)
@@ -150,6 +152,8 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
     targets, error = readable_targets(task, config)
     if not targets:
         raise InputError(str(error))
+    images = [*views, *targets]
+    check_memory(max(v.camera.width * v.camera.height for v in images), len(images))
     models = config.models(targets)
     context = context_at(folder / "context.npz", views, models)
 
@@ -168,11 +172,7 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
 
 
 def photographs(task: Task, frames: tuple[int, ...], config: RunConfig) -> list[View]:
-    """Photographs of `frames`, which they are numbered by.
-
-    Raises:
-        InputError: where one is damaged.
-    """
+    """Photographs of `frames`, numbered by them; an InputError where one is damaged."""
     return [
         replace(view.to(config.device), frame=frame)
         for view, frame in zip(task.load(frames), frames, strict=True)
@@ -191,33 +191,25 @@ def readable_targets(task: Task, config: RunConfig) -> tuple[list[View], str | N
 
 
 def context_at(path: Path, views: Sequence[View], models: Models) -> SavedContext:
-    """The scene that is saved at `path`, where it is computed and saved first if need be.
+    """The scene that is saved at `path`, else what Ψ makes of the views, as by `kept`.
 
-    It is read back in any case, so that a run that was stopped goes on with the very same tensors.
-
-    Raises:
-        InputError: fewer than two views, or none that make a stereo pair.
-        OutputError: where it cannot be saved.
+    Raises InputError for fewer than two views, or none that make a stereo pair.
     """
     device = views[0].image.device if views else "cpu"
-    saved = load_context(path, device)
-    if saved is not None:
-        return saved
-    begun = models.completer().begin(views)
-    camera = begun.views[0].camera
-    assert camera.near is not None
-    assert camera.far is not None
-    made = SavedContext(begun.scene, camera.near, camera.far, begun.seconds["total"])
-    save_context(path, made)
-    return read_back(load_context(path, device), path)
+
+    def save() -> None:
+        begun = models.completer().begin(views)
+        camera = begun.views[0].camera
+        assert camera.near is not None
+        assert camera.far is not None
+        made = SavedContext(begun.scene, camera.near, camera.far, begun.seconds["total"])
+        save_context(path, made)
+
+    return kept(path, lambda: load_context(path, device), save)
 
 
 def row_of(task: Task, method: str, prepared: Prepared | str, folder: Path) -> dict[str, Any]:
-    """What a method came to on a task; `prepared` may be the reason why it came to nothing.
-
-    Raises:
-        OutputError: where a result cannot be written.
-    """
+    """What a method came to on a task; `prepared` may be the reason why it came to nothing."""
     steps: tuple[Step, ...] = ()
     error: str | None
     if isinstance(prepared, str):
@@ -243,11 +235,7 @@ def row_of(task: Task, method: str, prepared: Prepared | str, folder: Path) -> d
 def check_evaluation(
     tasks: Sequence[Task], methods: Sequence[str], config: RunConfig, shard: tuple[int, int]
 ) -> None:
-    """See that a run is possible before anything is written.
-
-    Raises:
-        InputError: where it is not.
-    """
+    """Raise an InputError, before anything is written, where a run is impossible."""
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
     check_shard(shard)
     check_tasks(tasks)
@@ -256,11 +244,7 @@ def check_evaluation(
 
 
 def check_shard(shard: tuple[int, int]) -> None:
-    """Refuse shards that do not exist.
-
-    Raises:
-        InputError: where it does not.
-    """
+    """Raise an InputError for a shard that does not exist."""
     number, count = shard
     if not 0 <= number < count:
         raise InputError(
@@ -269,11 +253,7 @@ def check_shard(shard: tuple[int, int]) -> None:
 
 
 def check_tasks(tasks: Sequence[Task]) -> None:
-    """Refuse no task at all, and two that would be written to one place.
-
-    Raises:
-        InputError: where there are such.
-    """
+    """Raise an InputError for no task at all, and for two that would be written to one place."""
     if not tasks:
         raise InputError(
             "There is no case to run: no clip has the frames that the protocol asks for; choose a "

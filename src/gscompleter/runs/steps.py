@@ -21,7 +21,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.metrics.image import psnr
-from gscompleter.metrics.scores import Drawings, Scores, Truth, score
+from gscompleter.metrics.scores import MIN_PIXELS, Drawings, Scores, Truth, score
 from gscompleter.render import Renderer
 from gscompleter.runs.memory import peak_memory
 from gscompleter.runs.methods import METHODS, Models, Prediction, numbered
@@ -37,9 +37,6 @@ from gscompleter.stages.anchor import lift
 from gscompleter.types import Camera, Completion, DepthMap, Gaussians, View
 
 T = TypeVar("T")
-
-MIN_PIXELS = 50
-"""Fewest pixels that a depth scale is a median of."""
 
 
 @dataclass(frozen=True)
@@ -147,32 +144,32 @@ def advanced(
 def predicted(
     method: str, state: Completion, target: Camera, number: int, models: Models, path: Path
 ) -> Prediction:
-    """What is saved at `path`, else what `method` makes of the step, which is saved there.
+    """What is saved at `path`, else what `method` makes of the step, as by `kept`."""
+
+    def save() -> None:
+        with peak_memory(state.scene.means.device) as peak:
+            made = METHODS[method](state, target, models)
+        made = numbered(made, number, state.scene)
+        save_prediction(path, replace(made, peak_bytes=peak.bytes))
+
+    return kept(path, lambda: load_prediction(path, state.scene), save)
+
+
+def kept(path: Path, load: Callable[[], T | None], save: Callable[[], None]) -> T:
+    """What `load` finds at `path`, where `save` computes and writes it first if need be.
 
     It is read back in any case, so that a run that was stopped goes on with the very same tensors.
 
     Raises:
         OutputError: where it cannot be saved.
     """
-    saved = load_prediction(path, state.scene)
-    if saved is not None:
-        return saved
-    with peak_memory(state.scene.means.device) as peak:
-        made = METHODS[method](state, target, models)
-    made = replace(numbered(made, number, state.scene), peak_bytes=peak.bytes)
-    save_prediction(path, made)
-    return read_back(load_prediction(path, state.scene), path)
-
-
-def read_back(saved: T | None, path: Path) -> T:
-    """What was saved at `path` a moment ago.
-
-    Raises:
-        OutputError: where nothing whole is there.
-    """
-    if saved is None:
+    found = load()
+    if found is None:
+        save()
+        found = load()
+    if found is None:
         raise OutputError(f"{path} cannot be read back; look whether the disk is sound.")
-    return saved
+    return found
 
 
 def step_of(

@@ -121,11 +121,7 @@ def check_run(out: Path) -> None:
 
 
 def settings_of(out: Path) -> dict[str, Any]:
-    """What `out` says of its run.
-
-    Raises:
-        InputError: where that cannot be read, or is of another version.
-    """
+    """What `out` says of its run; an InputError where that is damaged or of another version."""
     found = read_json(out / RUN, "name another folder")
     version = found.get("version") if isinstance(found, dict) else None
     if version != VERSION:
@@ -168,11 +164,7 @@ class SavedContext:
 
 
 def save_context(path: Path, context: SavedContext) -> None:
-    """Write the scene that all methods begin with.
-
-    Raises:
-        OutputError: where it cannot be written.
-    """
+    """Write the scene that all methods begin with, as by `write_arrays`."""
     numbers = np.array([context.seconds, context.near, context.far], dtype=np.float64)
     write_arrays(path, {**_arrays_of(context.gaussians), "seconds_near_far": numbers})
 
@@ -187,11 +179,7 @@ def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
-    """Write what differs from the scene before: what was added, or else the whole scene.
-
-    Raises:
-        OutputError: where it cannot be written.
-    """
+    """Write what differs from the scene before: what was added, or else the whole scene."""
     whole = prediction.added is None
     write_arrays(
         path,
@@ -254,41 +242,25 @@ def load_arrays(path: Path) -> Arrays | None:
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
-    """All at once, so that no reader sees half a file.
-
-    Raises:
-        OutputError: where it cannot be written.
-    """
+    """All at once, so that no reader sees half a file; an OutputError where that cannot be."""
     with _writing(path), replacing(path) as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def write_json(path: Path, content: Any, first_stays: bool = False) -> None:
-    """All at once, so that a file that is there is complete. Arguments as those of `replacing`.
-
-    Raises:
-        OutputError: where it cannot be written.
-    """
+    """All at once, like `write_arrays`; arguments as those of `replacing`."""
     with _writing(path), replacing(path, first_stays) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
-    """A picture among the results.
-
-    Raises:
-        OutputError: where it cannot be written.
-    """
+    """A picture among the results; an OutputError where it cannot be written."""
     with _writing(path):
         write_image(path, image)
 
 
 def read_json(path: Path, advice: str = "delete it and run again") -> Any:
-    """The content of a file of results; `advice` is what to do where it is no JSON.
-
-    Raises:
-        InputError: where it cannot be read.
-    """
+    """`json_file.read_json` of a file of results."""
     return json_file.read_json(path, advice)
 
 

@@ -74,11 +74,7 @@ def tasks_of(
 
 
 def check_frames(protocol: EvaluationProtocol, split: Split, clip: PosedPhotographs) -> None:
-    """Refuse frames that the clip does not have.
-
-    Raises:
-        InputError: where there is one.
-    """
+    """Raise an InputError for a frame that the clip does not have."""
     for frame in (*split.context, *split.targets):
         if frame >= len(clip):
             raise InputError(

@@ -9,13 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from gscompleter.config import AnchorConfig
-from gscompleter.generators import (
-    Generator,
-    ImageFunction,
-    Request,
-    Synthesis,
-    as_generator,
-)
+from gscompleter.generators import Generator, ImageFunction, Request, Synthesis, as_generator
 from gscompleter.geometry import baseline_between, inside, project, rotation_between
 from gscompleter.reconstructors import Reconstructor, reconstructed
 from gscompleter.types import Camera, Lift, SceneContext, View
@@ -33,13 +27,12 @@ class AnchorChoice:
 
 def nearest_view(target: Camera, views: Sequence[View]) -> int:
     """Index of the view taken closest to `target`; of equals, the one turned least."""
-    return min(
-        range(len(views)),
-        key=lambda i: (
-            baseline_between(target, views[i].camera),
-            rotation_between(target, views[i].camera),
-        ),
-    )
+
+    def remoteness(index: int) -> tuple[float, float]:
+        camera = views[index].camera
+        return baseline_between(target, camera), rotation_between(target, camera)
+
+    return min(range(len(views)), key=remoteness)
 
 
 def select_anchor(

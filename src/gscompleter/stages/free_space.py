@@ -36,18 +36,16 @@ def respect_free_space(
     footprint: Literal["constant", "fixed"],
     config: FreeSpaceConfig = FreeSpaceConfig(),
 ) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-    """`gaussians` moved back along the rays of `target` to where no camera saw through them.
+    """`gaussians` moved back along the rays of `target` to where no camera saw through them, and
+    which of them found a place [n].
 
     Args:
         gaussians: Candidates.
         target: Camera whose rays they slide along.
         cameras: The context cameras.
         renders: The scene as these see it.
-        footprint: Whether sizes follow the distance, as in the registration.
+        footprint: Whether sizes follow the distance, as in `slide`.
         config: How often they may slide.
-
-    Returns:
-        The Gaussians, and which of them found a place [n].
     """
     ratio = torch.ones_like(gaussians.opacities)
     offsets = gaussians.means - target.center
@@ -64,9 +62,7 @@ def respect_free_space(
 
 
 def seen_through(
-    points: Float[Tensor, "n 3"],
-    cameras: Sequence[Camera],
-    renders: Sequence[Render],
+    points: Float[Tensor, "n 3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> Bool[Tensor, "n"]:
     """Which points stand before what some camera sees of the scene."""
     contradicted = torch.zeros(len(points), dtype=torch.bool, device=points.device)

@@ -65,10 +65,8 @@ def refine_opacities(
     if config.iterations == 0 or len(added) == 0:
         return added, ()
     plans = [(frozen_target.plan(added), reference.image, config.target_weight)]
-    plans += [
-        (frozen.plan(added), view.image, 1.0)
-        for frozen, view in zip(frozen_views, views, strict=True)
-    ]
+    seen = zip(frozen_views, views, strict=True)
+    plans += [(frozen.plan(added), view.image, 1.0) for frozen, view in seen]
 
     logit = config.parametrization == "logit"
     start = added.opacities.logit(eps=1e-4) if logit else added.opacities
@@ -81,9 +79,7 @@ def refine_opacities(
     losses = []
     for _ in track(range(config.iterations), "Refining"):
         current = opacities()
-        terms = [
-            weight * (plan(current).image - image).abs().mean() for plan, image, weight in plans
-        ]
+        terms = [w * (plan(current).image - image).abs().mean() for plan, image, w in plans]
         loss = torch.stack(terms).sum()
         optimizer.zero_grad()
         loss.backward()
@@ -108,7 +104,7 @@ def do_no_harm(
 
     Args:
         added: Generated Gaussians.
-        frozen_views: The scene frozen at each context camera.
+        frozen_views: The scene frozen at the camera of each of `views`.
         views: The photographs.
         allowed_errors: Largest mean squared error allowed in each view.
         config: How it is checked.

@@ -5,23 +5,15 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from gscompleter.weights.fetching import WeightsNotAvailable, cached, fetch, place_of
+from gscompleter.weights.published import PUBLISHED, PublishedWeights
+
 if TYPE_CHECKING:
-    from gscompleter.weights.fetching import WeightsNotAvailable, cached, fetch, place_of
     from gscompleter.weights.fitting import load_strictly
-    from gscompleter.weights.published import PUBLISHED, PublishedWeights
     from gscompleter.weights.reading import read_state_dict
 
 # Imported on first use, so that `gscompleter models` does not wait for torch.
-_HOMES = {
-    "PUBLISHED": "published",
-    "PublishedWeights": "published",
-    "WeightsNotAvailable": "fetching",
-    "cached": "fetching",
-    "fetch": "fetching",
-    "load_strictly": "fitting",
-    "place_of": "fetching",
-    "read_state_dict": "reading",
-}
+_HOMES = {"load_strictly": "fitting", "read_state_dict": "reading"}
 
 __all__ = [
     "PUBLISHED",

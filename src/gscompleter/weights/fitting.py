@@ -68,13 +68,11 @@ def differences(needed: Shapes, given: Shapes) -> str:
     other = [name for name in needed if name in given and needed[name] != given[name]]
     parts = []
     if missing:
-        parts.append(
-            f"it lacks {len(missing)} of {len(needed)} tensors (such as {quoted(missing[0])})"
-        )
+        example = quoted(missing[0])
+        parts.append(f"it lacks {len(missing)} of {len(needed)} tensors (such as {example})")
     if extra:
-        parts.append(
-            f"it has {len(extra)} that the network does not know (such as {quoted(extra[0])})"
-        )
+        example = quoted(extra[0])
+        parts.append(f"it has {len(extra)} that the network does not know (such as {example})")
     if other:
         name = other[0]
         shapes = f"{quoted(list(given[name]))} instead of {list(needed[name])}"

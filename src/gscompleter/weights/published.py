@@ -11,6 +11,9 @@ import re
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+UNSTATED = "not stated"
+UNLICENSED = "no licence is stated for the file"
+
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedWeights:
@@ -25,29 +28,29 @@ class PublishedWeights:
     """The configuration that its tensors fit; None where the authors do not say."""
     repository: str | None
     """Repository on the Hugging Face hub; None where the file lies elsewhere."""
-    revision: str | None
+    revision: str | None = "main"
     """Commit of the repository, or `main` where none is known, which pins nothing."""
     file: str
     """The published name of the file."""
-    sha256: str | None
+    sha256: str | None = None
     """Its SHA-256, or as many leading hex digits as are published; None where none are."""
-    megabytes: int | None
+    megabytes: int | None = None
     """Size of the file in MB, where it is known."""
     parameters: int | None
     """Learned numbers; rounded to millions where only the authors' figure is known."""
     views: tuple[int, int]
     """Fewest and most views it was trained with."""
-    image_size: tuple[int, int]
+    image_size: tuple[int, int] = (256, 256)
     """Height and width of the images it was trained on, in pixels."""
     near_far: tuple[float, float] | None
     """Smallest and largest depth of its authors' evaluation, in scene units, where known."""
     code: str
     """Page of the authors' code."""
-    code_licence: str
+    code_licence: str = "MIT"
     """Licence of that code. Ours is written anew and does not depend on it."""
-    weights_licence: str
+    weights_licence: str = UNSTATED
     """Licence that is stated for the file, or `not stated`."""
-    caution: str
+    caution: str = UNLICENSED
     """Why commercial use is unclear; empty where a licence allows it plainly."""
     source: str
     """Page from which the authors give out the file."""
@@ -86,10 +89,10 @@ class PublishedWeights:
         return "?" if self.parameters is None else f">= {self.parameters * 4 // 10**6} MB"
 
 
-UNSTATED = "not stated"
-UNLICENSED = "no licence is stated for the file"
 FROM_DEPTH_ANYTHING = "training started from Depth Anything V2 {}, which is CC BY-NC 4.0"
+FROM_BASE, FROM_LARGE = FROM_DEPTH_ANYTHING.format("Base"), FROM_DEPTH_ANYTHING.format("Large")
 ON_DL3DV = "trained on DL3DV-10K, whose terms allow non-commercial research only"
+ON_DEPTH_DATA = f"{ON_DL3DV}, and on ScanNet, TartanAir and VKITTI2, which have their own terms"
 
 MVSPLAT = PublishedWeights(
     name="mvsplat-re10k",
@@ -98,16 +101,11 @@ MVSPLAT = PublishedWeights(
     repository=None,
     revision=None,
     file="re10k.ckpt",
-    sha256=None,
     megabytes=48,
     parameters=11_955_734,
     views=(2, 2),
-    image_size=(256, 256),
     near_far=(1.0, 100.0),
     code="https://github.com/donydchen/mvsplat",
-    code_licence="MIT",
-    weights_licence=UNSTATED,
-    caution=UNLICENSED,
     source="https://drive.google.com/drive/folders/14_E_5R6ojOWnLSrSVLVEMHnTiKsfddjU",
 )
 
@@ -116,164 +114,126 @@ VOLSPLAT = PublishedWeights(
     model="VolSplat",
     network="volsplat",
     repository="lhmd/VolSplat",
-    revision="main",
     file="volsplat-re10k-256x256.ckpt",
-    sha256=None,
-    megabytes=None,
     parameters=137_998_741,
     views=(6, 6),
-    image_size=(256, 256),
     near_far=(0.5, 100.0),
     code="https://github.com/ziplab/VolSplat",
-    code_licence="MIT",
-    weights_licence=UNSTATED,
-    caution=f"{UNLICENSED}; {FROM_DEPTH_ANYTHING.format('Base')}",
+    caution=f"{UNLICENSED}; {FROM_BASE}",
     source="https://huggingface.co/lhmd/VolSplat",
-)
-
-DEPTHSPLAT = PublishedWeights(
-    name="depthsplat-small-re10k",
-    model="DepthSplat",
-    network="depthsplat-small-s1-u4-l4",
-    repository="haofeixu/depthsplat",
-    revision="main",
-    file="depthsplat-gs-small-re10k-256x256-view2-cfeab6b1.pth",
-    sha256="cfeab6b1",
-    megabytes=None,
-    parameters=38_346_416,
-    views=(2, 2),
-    image_size=(256, 256),
-    near_far=(0.5, 100.0),
-    code="https://github.com/cvg/depthsplat",
-    code_licence="MIT",
-    weights_licence="MIT",
-    caution="",
-    source="https://huggingface.co/haofeixu/depthsplat",
 )
 
 # Learned numbers of each configuration: the size of its ViT, scales of its cost volume, factor of
 # its upsampler, and the fraction (one in ...) of the image's size at which matching begins.
 PARAMETERS = {
-    "depthsplat-small-s1-u8-l8": 38_404_880,
-    "depthsplat-base-s2-u2-l4": 120_747_896,
-    "depthsplat-base-s2-u4-l8": 120_877_016,
-    "depthsplat-large-s2-u2-l4": 354_337_760,
-    "depthsplat-depth-base-s2-u4-l8": 111_229_753,
+    "small-s1-u4-l4": 38_346_416,
+    "small-s1-u8-l8": 38_404_880,
+    "base-s2-u2-l4": 120_747_896,
+    "base-s2-u4-l8": 120_877_016,
+    "large-s2-u2-l4": 354_337_760,
+    "depth-base-s2-u4-l8": 111_229_753,
 }
 
 
-def _depthsplat(name: str, file: str, network: str | None, **others: Any) -> PublishedWeights:
-    """Another file of DepthSplat: its name carries image size and leading digits of its SHA-256."""
-    parts = re.search(r"-(\d+)x(\d+)-.*-([0-9a-f]{8})\.pth$", file)
+def _depthsplat(
+    file: str, configuration: str, caution: str = "", far: float = 100.0
+) -> PublishedWeights:
+    """A file of DepthSplat's authors, who name it for what it is.
+
+    Its name carries the model, the size of its images, fewest and most views, and the leading
+    digits of its SHA-256.
+    """
+    parts = re.fullmatch(r"(.+-(\d+)x(\d+))-\w*view(\d+)(?:-(\d+))?-([0-9a-f]{8})\.pth", file)
     assert parts is not None, file
-    known: dict[str, Any] = {
-        "name": name,
-        "file": file,
-        "network": network,
-        "parameters": PARAMETERS.get(network or ""),
-        "image_size": (int(parts[1]), int(parts[2])),
-        "sha256": parts[3],
-    }
-    return replace(DEPTHSPLAT, **(known | others))
+    stem, height, width, fewest, most, digits = parts.groups()
+    return PublishedWeights(
+        name=stem.replace("-gs-", "-").removesuffix("-256x256"),
+        model="DepthSplat",
+        network=f"depthsplat-{configuration}",
+        repository="haofeixu/depthsplat",
+        file=file,
+        sha256=digits,
+        parameters=PARAMETERS.get(configuration),
+        views=(int(fewest), int(most or fewest)),
+        image_size=(int(height), int(width)),
+        near_far=(0.5, far),
+        code="https://github.com/cvg/depthsplat",
+        weights_licence="MIT",
+        caution=caution,
+        source="https://huggingface.co/haofeixu/depthsplat",
+    )
 
 
-FROM_BASE, FROM_LARGE = FROM_DEPTH_ANYTHING.format("Base"), FROM_DEPTH_ANYTHING.format("Large")
-ON_DEPTH_DATA = f"{ON_DL3DV}, and on ScanNet, TartanAir and VKITTI2, which have their own terms"
-BASELINE: dict[str, Any] = {
-    "repository": VOLSPLAT.repository,
-    "revision": VOLSPLAT.revision,
-    "megabytes": None,
-    "views": VOLSPLAT.views,
-    "near_far": None,
-    "source": VOLSPLAT.source,
-}
-DEPTH_ALONE: dict[str, Any] = {
-    "views": (2, 8),
-    "near_far": None,
-    "entry": "model",
-    "prefix": "",
-    "gives": "depth",
-}
+def _retrained(weights: PublishedWeights, **others: Any) -> PublishedWeights:
+    """A baseline that VolSplat's authors trained and put beside their own network."""
+    return replace(
+        weights,
+        repository=VOLSPLAT.repository,
+        revision=VOLSPLAT.revision,
+        sha256=None,
+        megabytes=None,
+        views=VOLSPLAT.views,
+        near_far=None,
+        weights_licence=UNSTATED,
+        caution=UNLICENSED,
+        source=VOLSPLAT.source,
+        **others,
+    )
+
+
+DEPTHSPLAT = _depthsplat("depthsplat-gs-small-re10k-256x256-view2-cfeab6b1.pth", "small-s1-u4-l4")
+DEPTH_ALONE: dict[str, Any] = {"near_far": None, "entry": "model", "prefix": "", "gives": "depth"}
 
 _FILES = (
     MVSPLAT,
     replace(MVSPLAT, name="mvsplat-acid", file="acid.ckpt"),
-    # Retrained by VolSplat's authors. Whether their tensors are named as those above is not known.
-    replace(
-        MVSPLAT,
-        name="mvsplat-re10k-6view",
-        file="mvsplat-re10k-baseline-256x256.ckpt",
-        **BASELINE,
-    ),
+    # Whether its tensors are named as those above is not known.
+    _retrained(MVSPLAT, name="mvsplat-re10k-6view", file="mvsplat-re10k-baseline-256x256.ckpt"),
     DEPTHSPLAT,
+    _depthsplat("depthsplat-gs-base-re10k-256x256-view2-ca7b6795.pth", "base-s2-u2-l4", FROM_BASE),
     _depthsplat(
-        "depthsplat-base-re10k",
-        "depthsplat-gs-base-re10k-256x256-view2-ca7b6795.pth",
-        "depthsplat-base-s2-u2-l4",
-        caution=FROM_BASE,
+        "depthsplat-gs-large-re10k-256x256-view2-e0f0f27a.pth", "large-s2-u2-l4", FROM_LARGE
     ),
+    _depthsplat("depthsplat-gs-base-re10k-256x448-view2-fea94f65.pth", "base-s2-u4-l8", FROM_BASE),
     _depthsplat(
-        "depthsplat-large-re10k",
-        "depthsplat-gs-large-re10k-256x256-view2-e0f0f27a.pth",
-        "depthsplat-large-s2-u2-l4",
-        caution=FROM_LARGE,
-    ),
-    _depthsplat(
-        "depthsplat-base-re10k-256x448",
-        "depthsplat-gs-base-re10k-256x448-view2-fea94f65.pth",
-        "depthsplat-base-s2-u4-l8",
-        caution=FROM_BASE,
-    ),
-    _depthsplat(
-        "depthsplat-base-dl3dv-256x448",
         "depthsplat-gs-base-dl3dv-256x448-randview2-6-02c7b19d.pth",
-        "depthsplat-base-s2-u4-l8",
-        views=(2, 6),
-        near_far=(0.5, 200.0),
-        caution=f"{ON_DL3DV}; {FROM_BASE}",
+        "base-s2-u4-l8",
+        f"{ON_DL3DV}; {FROM_BASE}",
+        far=200.0,
     ),
     _depthsplat(
-        "depthsplat-small-re10kdl3dv-448x768",
         "depthsplat-gs-small-re10kdl3dv-448x768-randview4-10-c08188db.pth",
-        "depthsplat-small-s1-u8-l8",
-        views=(4, 10),
-        near_far=(0.5, 200.0),
-        caution=ON_DL3DV,
+        "small-s1-u8-l8",
+        ON_DL3DV,
+        far=200.0,
     ),
     _depthsplat(
-        "depthsplat-base-re10kdl3dv-448x768",
         "depthsplat-gs-base-re10kdl3dv-448x768-randview2-6-f8ddd845.pth",
-        "depthsplat-base-s2-u4-l8",
-        views=(2, 6),
-        near_far=(0.5, 200.0),
-        caution=f"{ON_DL3DV}; {FROM_BASE}",
+        "base-s2-u4-l8",
+        f"{ON_DL3DV}; {FROM_BASE}",
+        far=200.0,
     ),
-    # Also retrained by VolSplat's authors, who do not say how large it is.
-    replace(
+    # How large it is is not said.
+    _retrained(
         DEPTHSPLAT,
         name="depthsplat-re10k-6view",
         network=None,
         file="depthsplat-re10k-baseline-256x256.ckpt",
-        sha256=None,
         parameters=None,
-        weights_licence=UNSTATED,
-        caution=UNLICENSED,
-        **BASELINE,
     ),
     # The authors do not say which upsampling it has.
-    _depthsplat(
-        "depthsplat-depth-small-352x640",
-        "depthsplat-depth-small-352x640-randview2-8-e807bd82.pth",
+    replace(
+        _depthsplat("depthsplat-depth-small-352x640-randview2-8-e807bd82.pth", "", ON_DEPTH_DATA),
         network=None,
         parameters=36_000_000,
-        caution=ON_DEPTH_DATA,
         **DEPTH_ALONE,
     ),
-    _depthsplat(
-        "depthsplat-depth-base-352x640",
-        "depthsplat-depth-base-352x640-randview2-8-65a892c5.pth",
-        "depthsplat-depth-base-s2-u4-l8",
-        caution=f"{ON_DEPTH_DATA}; {FROM_BASE}",
+    replace(
+        _depthsplat(
+            "depthsplat-depth-base-352x640-randview2-8-65a892c5.pth",
+            "depth-base-s2-u4-l8",
+            f"{ON_DEPTH_DATA}; {FROM_BASE}",
+        ),
         **DEPTH_ALONE,
     ),
     VOLSPLAT,

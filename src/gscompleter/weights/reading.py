@@ -43,11 +43,7 @@ def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
 
 
 def check_kind(path: Path, name: str) -> None:
-    """Find by its first and last bytes that a file is no file of weights at all.
-
-    Raises:
-        InputError: where it is missing, empty, a pointer, a web page, or cut off.
-    """
+    """Raise an InputError where a file is missing, empty, a pointer, a web page, or cut off."""
     if not os.path.isfile(path):
         raise InputError(f"There is no file {path}; {name} is needed there.")
     try:
@@ -67,7 +63,7 @@ def check_kind(path: Path, name: str) -> None:
     elif head.startswith(b"PK\x03\x04") and not is_archive(path):
         wrong = "ends too early, as after an interrupted download"
     if wrong:
-        raise InputError(f"{path} {wrong}; {_replace_it(path, name)}.")
+        raise _broken(path, wrong, name)
 
 
 def check_sha256(path: Path, expected: str, name: str) -> None:
@@ -85,10 +81,8 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
                 f"{path} is not the published file {name} but that of {other.name}; choose that "
                 f"model, or fetch {name}."
             )
-    raise InputError(
-        f"{path} is not the published file {name}: its SHA-256 begins with {digest[:8]} instead "
-        f"of {expected[:8]}; {_replace_it(path, name)}."
-    )
+    begins = f"its SHA-256 begins with {digest[:8]} instead of {expected[:8]}"
+    raise _broken(path, f"is not the published file {name}: {begins}", name)
 
 
 def sha256_of(path: Path) -> str:
@@ -109,11 +103,7 @@ def is_archive(path: Path) -> bool:
 
 
 def check_archive(path: Path, name: str) -> None:
-    """Compare the parts of a zip archive, as which torch saves, with their checksums.
-
-    Raises:
-        InputError: where one differs.
-    """
+    """Raise an InputError where a part of a zip archive differs from its checksum."""
     if not is_archive(path):
         return
     try:
@@ -122,7 +112,7 @@ def check_archive(path: Path, name: str) -> None:
     except Exception as error:  # an archive can be damaged in any way
         damaged = str(error)
     if damaged is not None:
-        raise InputError(f"{path} is damaged ({quoted(damaged)}); {_replace_it(path, name)}.")
+        raise _broken(path, f"is damaged ({quoted(damaged)})", name)
 
 
 def read_tensors(path: Path, name: str) -> Any:
@@ -138,15 +128,11 @@ def read_tensors(path: Path, name: str) -> Any:
     except pickle.UnpicklingError as error:
         found = re.search(r"GLOBAL (\S+)", str(error))
         if found is None:
-            raise InputError(
-                f"{path} holds no plain weights; {_replace_it(path, name)}."
-            ) from error
-        raise InputError(
-            f"{path} holds no plain weights but Python objects too ({quoted(found[1])}), and to "
-            f"load those may run any code; {_replace_it(path, name)}."
-        ) from error
+            raise _broken(path, "holds no plain weights", name) from error
+        objects = f"Python objects too ({quoted(found[1])}), and to load those may run any code"
+        raise _broken(path, f"holds no plain weights but {objects}", name) from error
     except Exception as error:  # a damaged pickle can fail in any way
-        raise InputError(f"{path} cannot be read by torch; {_replace_it(path, name)}.") from error
+        raise _broken(path, "cannot be read by torch", name) from error
 
 
 def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
@@ -175,16 +161,17 @@ def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> d
     Raises:
         InputError: where there are none, or others than are known to lie beside them.
     """
+
+    def other(held: str) -> InputError:
+        return InputError(f"{path} holds {held}; give {weights.file}.")
+
     inner = content.get(weights.entry, content) if isinstance(content, Mapping) else None
     if not isinstance(inner, Mapping) or not all(isinstance(key, str) for key in inner):
-        raise InputError(f"{path} holds no named tensors; give {weights.file}.")
+        raise other("no named tensors")
     prefix = weights.prefix
     found = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
     if not found:
-        raise InputError(
-            f"{path} holds no tensors named {prefix}…, but {_some(list(inner))}; give "
-            f"{weights.file}."
-        )
+        raise other(f"no tensors named {prefix}…, but {_some(list(inner))}")
     unknown = [
         key
         for key, value in inner.items()
@@ -192,16 +179,11 @@ def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> d
         and not key.startswith(NOT_THE_ENCODERS)
     ]
     if unknown:
-        raise InputError(
-            f"{path} holds more than the network {weights.name}: {_some(unknown)}; give "
-            f"{weights.file}."
-        )
+        raise other(f"more than the network {weights.name}: {_some(unknown)}")
     odd = [key for key, value in found.items() if not is_plain(value)]
     if odd:
-        raise InputError(
-            f"{path} holds tensors without plain numbers ({_some(odd)}): empty shells, sparse or "
-            f"quantized ones; give {weights.file}."
-        )
+        kinds = "empty shells, sparse or quantized ones"
+        raise other(f"tensors without plain numbers ({_some(odd)}): {kinds}")
     return found
 
 
@@ -211,9 +193,9 @@ def is_plain(tensor: Tensor) -> bool:
     return strided and not (tensor.is_meta or tensor.is_quantized or tensor.is_complex())
 
 
-def _replace_it(path: Path, name: str) -> str:
+def _broken(path: Path, wrong: str, name: str) -> InputError:
     # In the hub's cache the path is a link; without the file behind it, it is fetched anew.
-    return f"delete {path.resolve()} and fetch {name} again"
+    return InputError(f"{path} {wrong}; delete {path.resolve()} and fetch {name} again.")
 
 
 def _some(keys: list[str]) -> str:

@@ -11,11 +11,7 @@ from gscompleter.generators.diffusion.published import IncompleteWeightsError, S
 
 
 def language_models(source: Source, dtype: torch.dtype) -> dict[str, Any]:
-    """The parts of a pipeline that are models of transformers (encoders, checkers), by name.
-
-    Raises:
-        IncompleteWeightsError: where one lacks a tensor.
-    """
+    """The parts of a pipeline that are models of transformers, by name, each as by `loaded`."""
     import transformers
     from diffusers import DiffusionPipeline, pipelines
 
@@ -55,11 +51,7 @@ def loaded(kind: Any, source: Source, part: str, unused: str = "^$", **arguments
 
 
 def check_complete(model: torch.nn.Module, part: str) -> None:
-    """See that a model of diffusers lacks no tensor.
-
-    Raises:
-        IncompleteWeightsError: where it does.
-    """
+    """Raise an IncompleteWeightsError where a model of diffusers lacks a tensor."""
     # diffusers gives no memory to what it did not find
     missing = sorted(name for name, value in model.named_parameters() if value.is_meta)
     if missing:
@@ -67,11 +59,7 @@ def check_complete(model: torch.nn.Module, part: str) -> None:
 
 
 def check_parts(pipeline: Any) -> None:
-    """See that no model among the parts of a pipeline lacks a tensor.
-
-    Raises:
-        IncompleteWeightsError: where one does.
-    """
+    """`check_complete` for each model among the parts of a pipeline."""
     for part, model in pipeline.components.items():
         if isinstance(model, torch.nn.Module):
             check_complete(model, part)

@@ -124,15 +124,10 @@ def completed_warp(nearest: View, target: Camera, context: SceneContext) -> Warp
     """What the photographs show of the target, over a smooth continuation of its colours."""
     warped = warp_photographs(nearest, target, context)
     if not warped.known.any():
-        mean = nearest.image.mean(dim=(0, 1)).expand_as(warped.image)
-        return replace(warped, image=mean)
-    _, log_depth = background_first(warped)
-    guess = log_depth.exp().to(warped.depth.device)
-    warped = with_unexplained(warped, guess, target, context)
+        return replace(warped, image=nearest.image.mean(dim=(0, 1)).expand_as(warped.image))
+    warped = with_unexplained(warped, target, context)
     tone, _ = background_first(warped)
-    tone = tone.to(warped.image.device)
-    image = torch.where(warped.known[..., None], warped.image, tone)
-    return replace(warped, image=image.clamp(0, 1))
+    return replace(warped, image=tone.clamp(0, 1).to(warped.image.device))
 
 
 def load_diffusers_inpaint(
@@ -140,18 +135,9 @@ def load_diffusers_inpaint(
     device: str = "cpu",
     settings: DiffusersInpaintSettings = DiffusersInpaintSettings(),
 ) -> DiffusersInpaint:
-    """An inpainting pipeline as the settings want it.
-
-    Raises:
-        InputError: where packages or weights are missing, or no path was given.
-    """
-    return DiffusersInpaint(
-        load_painter(settings.path, device, settings.offload),
-        seed,
-        settings.prompt,
-        settings.steps,
-        settings.retries,
-    )
+    """Φ as the settings want it; errors as those of `load_painter`."""
+    painter = load_painter(settings.path, device, settings.offload)
+    return DiffusersInpaint(painter, seed, settings.prompt, settings.steps, settings.retries)
 
 
 @lru_cache(maxsize=1)

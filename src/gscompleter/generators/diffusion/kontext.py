@@ -14,25 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-SIZES = (
-    (1568, 672),
-    (1504, 688),
-    (1456, 720),
-    (1392, 752),
-    (1328, 800),
-    (1248, 832),
-    (1184, 880),
-    (1104, 944),
-    (1024, 1024),
-    (944, 1104),
-    (880, 1184),
-    (832, 1248),
-    (800, 1328),
-    (752, 1392),
-    (720, 1456),
-    (688, 1504),
-    (672, 1568),
-)
+_LONG = (1568, 1504, 1456, 1392, 1328, 1248, 1184, 1104)
+_SHORT = (672, 688, 720, 752, 800, 832, 880, 944)
+SIZES = ((1024, 1024), *zip(_LONG, _SHORT, strict=True), *zip(_SHORT, _LONG, strict=True))
 """Heights and widths that the model was trained with: about a million pixels each."""
 
 

@@ -95,11 +95,7 @@ class PEField:
         return [answer(i) for i in range(len(requests))]
 
     def condition(self, nearest: View, target: Camera, context: SceneContext) -> Condition:
-        """What the model is told of a target.
-
-        Raises:
-            InputError: where the scene has no depth at the nearest photograph.
-        """
+        """What the model is told of a target; errors as those of `synthesize`."""
         size = self.model.size_for(target.height, target.width)
         source_size = self.model.size_for(nearest.camera.height, nearest.camera.width)
         grids = self.model.grid(source_size), self.model.grid(size)
@@ -164,11 +160,7 @@ def render_at(view: View, context: SceneContext) -> Render:
 def load_pe_field(
     seed: int = 0, device: str = "cpu", settings: PEFieldSettings = PEFieldSettings()
 ) -> PEField:
-    """PE-Field as the settings want it.
-
-    Raises:
-        InputError: where packages or weights are missing.
-    """
+    """PE-Field as the settings want it; an InputError where packages or weights are missing."""
     return PEField(
         load_kontext(settings.path, device, settings.offload),
         seed,

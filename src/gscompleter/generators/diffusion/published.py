@@ -128,26 +128,17 @@ def source_of(path: str, library: str = "diffusers") -> Source:
 
 def announce(sources: list[Source]) -> None:
     """Say on stderr, before anything is downloaded, what is fetched and under which terms."""
-    seen = set()
-    for source in sources:
-        if source.is_local or (source.place, source.revision) in seen:
-            continue
-        seen.add((source.place, source.revision))
+    once = {(source.place, source.revision): source for source in sources if not source.is_local}
+    for source in once.values():
         page = f"https://huggingface.co/{source.place}"
-        pinned = (
-            f"at commit {source.revision}"
-            if source.is_pinned
-            else (f"at {source.revision!r}, which pins nothing: what is fetched may change")
-        )
+        pinned = f"at {source.revision!r}, which pins nothing: what is fetched may change"
+        if source.is_pinned:
+            pinned = f"at commit {source.revision}"
         print(f"Weights of {page} {pinned}. Terms: {source.terms}.", file=sys.stderr)
 
 
 def needs_diffusers(name: str) -> None:
-    """See that the extra packages are there.
-
-    Raises:
-        InputError: where one is missing; the sentence says what to install.
-    """
+    """Raise an InputError that says what to install where one of `PACKAGES` is missing."""
     missing = [package for package in PACKAGES if find_spec(package) is None]
     if missing:
         raise InputError(

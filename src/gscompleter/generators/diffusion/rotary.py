@@ -15,13 +15,13 @@ from torch import Tensor, nn
 
 from gscompleter.generators.diffusion.position_ids import IDS
 
-GROUPS = 4
-"""Groups of heads, one for each quarter of a token."""
+THETA = 10_000.0
+"""Base of the frequencies, as in FLUX."""
 HEADS = 24
 """Heads that the scheme is made for: six in a group, on levels 0, 1, 2, 2, 2 and 2."""
 TRIPLE_OF_HEAD = tuple(
     triple
-    for quarter in range(GROUPS)
+    for quarter in range(4)
     for triple in (0, 1 + quarter, *(5 + 4 * quarter + inner for inner in range(4)))
 )
 """Which of the 21 triples of a token each head turns by."""
@@ -30,11 +30,10 @@ TRIPLE_OF_HEAD = tuple(
 class PerHeadRotary(nn.Module):
     """Position ids of tokens -> cosines and sines for each of their heads."""
 
-    def __init__(self, axes: tuple[int, int, int], theta: float = 10_000.0) -> None:
+    def __init__(self, axes: tuple[int, int, int]) -> None:
         """`axes` are the channels of a head that z, row and column turn; their sum is its size."""
         super().__init__()
         self.axes = axes
-        self.theta = theta
 
     def forward(
         self, ids: Float[Tensor, "tokens numbers"]
@@ -57,7 +56,7 @@ class PerHeadRotary(nn.Module):
     def frequencies(self, axis: int, ids: Tensor) -> Float[Tensor, "pairs"]:
         """Radians per token for each pair of the axis's channels."""
         channels = torch.arange(0, self.axes[axis], 2, dtype=torch.float64, device=ids.device)
-        return 1.0 / self.theta ** (channels / self.axes[axis])
+        return 1.0 / THETA ** (channels / self.axes[axis])
 
 
 class PerHeadAttention:
@@ -73,9 +72,12 @@ class PerHeadAttention:
         image_rotary_emb: tuple[Tensor, Tensor] | None = None,
     ) -> Float[Tensor, "b tokens c"] | tuple[Tensor, Tensor]:
         """Attention of text and image tokens; in single blocks they come as one sequence."""
-        query, key, value = projected(attn, hidden_states)
+        layers = (attn.to_q, attn.to_k, attn.to_v)
+        query, key, value = projected(hidden_states, layers, (attn.norm_q, attn.norm_k))
         if encoder_hidden_states is not None:
-            of_text = projected_text(attn, encoder_hidden_states)
+            layers = (attn.add_q_proj, attn.add_k_proj, attn.add_v_proj)
+            norms = (attn.norm_added_q, attn.norm_added_k)
+            of_text = projected(encoder_hidden_states, layers, norms)
             query, key, value = (
                 torch.cat([text, image], dim=1)
                 for text, image in zip(of_text, (query, key, value), strict=True)
@@ -92,22 +94,12 @@ class PerHeadAttention:
         return image, attn.to_add_out(text)
 
 
-def projected(attn: Any, tokens: Float[Tensor, "b n c"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Query, key and value [b, n, heads, d] of image tokens, the first two normalised."""
-    query, key, value = (
-        layer(tokens).unflatten(-1, (-1, attn.head_dim))
-        for layer in (attn.to_q, attn.to_k, attn.to_v)
-    )
-    return attn.norm_q(query), attn.norm_k(key), value
-
-
-def projected_text(attn: Any, tokens: Float[Tensor, "b n c"]) -> tuple[Tensor, Tensor, Tensor]:
-    """The same of text tokens, by layers of their own."""
-    query, key, value = (
-        layer(tokens).unflatten(-1, (-1, attn.head_dim))
-        for layer in (attn.add_q_proj, attn.add_k_proj, attn.add_v_proj)
-    )
-    return attn.norm_added_q(query), attn.norm_added_k(key), value
+def projected(
+    tokens: Float[Tensor, "b n c"], layers: tuple[nn.Module, ...], norms: tuple[nn.Module, ...]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Query, key and value [b, n, heads, d], by a layer each; the first two are normalised."""
+    query, key, value = (layer(tokens).unflatten(-1, (HEADS, -1)) for layer in layers)
+    return norms[0](query), norms[1](key), value
 
 
 def turned(

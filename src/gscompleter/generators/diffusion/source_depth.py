@@ -57,11 +57,7 @@ def context_depth(photograph: View, render: Render) -> Float[Tensor, "h w"]:
 
 
 def seen(render: Render) -> Bool[Tensor, "h w"]:
-    """Where the scene has a depth.
-
-    Raises:
-        InputError: where that is nowhere.
-    """
+    """Where the scene has a depth; an InputError where that is nowhere."""
     valid = render.depth_map().valid & (render.depth > 0)
     if not valid.any():
         raise InputError(
@@ -83,11 +79,7 @@ class MonocularDepth:
     """Where it runs."""
 
     def __call__(self, photograph: View, render: Render) -> Float[Tensor, "h w"]:
-        """Its depth, fitted to that of the scene where the scene has one.
-
-        Raises:
-            InputError: where the photograph's camera sees nothing of the scene.
-        """
+        """Its depth, fitted to that of the scene where it has one; errors as `context_depth`."""
         size = (photograph.camera.height, photograph.camera.width)
         pixels = (255 * photograph.image.clamp(0, 1)).round().byte().cpu().numpy()
         inputs = self.processor(images=pixels, return_tensors="pt").to(self.device)
@@ -128,11 +120,7 @@ def deviation(values: Float[Tensor, "n"]) -> Float[Tensor, ""]:
 
 
 def source_depth_named(name: str, device: str = "cpu") -> SourceDepth:
-    """`context`, `monocular` (the published model), or a model by its folder or hub id.
-
-    Raises:
-        InputError: where packages are missing or the model cannot be had.
-    """
+    """`context`, `monocular` (the published model), or what `load_monocular` makes of a path."""
     if name == "context":
         return context_depth
     return load_monocular(MONOCULAR if name == "monocular" else name, device)
@@ -140,11 +128,7 @@ def source_depth_named(name: str, device: str = "cpu") -> SourceDepth:
 
 @lru_cache(maxsize=1)
 def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth:
-    """A depth estimation model of transformers, for `PEField(depth=...)`.
-
-    Args:
-        path: A folder, USER/NAME or USER/NAME@COMMIT.
-        device: cpu or cuda.
+    """A depth estimation model of transformers from a folder, USER/NAME or USER/NAME@COMMIT.
 
     Raises:
         InputError: where packages are missing or the model cannot be had.

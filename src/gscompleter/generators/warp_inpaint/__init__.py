@@ -48,17 +48,13 @@ class WarpInpaint:
         self, nearest: View, target: Camera, context: SceneContext
     ) -> Float[Tensor, "h w 3"]:
         """The image `target` would take, completely filled, in [0, 1]."""
-        device = nearest.image.device
         warped = warp_photographs(nearest, target, context)
         if not warped.known.any():
             # Nothing of the scene is in sight: there is no border to continue.
             return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
-        _, log_depth = background_first(warped)
-        guess = log_depth.exp().to(device)
-        warped = with_unexplained(warped, guess, target, context).to("cpu")
-        tone, log_depth = background_first(warped)
-        image = self.with_structure(tone, log_depth, warped, context)
-        return image.clamp(0, 1).to(device)
+        warped = with_unexplained(warped, target, context).to("cpu")
+        image = self.with_structure(*background_first(warped), warped, context)
+        return image.clamp(0, 1).to(nearest.image.device)
 
     def with_structure(
         self,

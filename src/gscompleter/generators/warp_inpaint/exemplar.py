@@ -13,7 +13,9 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
+from gscompleter.generators.smooth import distance_to_known
 from gscompleter.kernels import patchmatch
+from gscompleter.masks import dilate
 
 RADIUS = 3
 """Patches are squares of 2 * radius + 1 pixels."""
@@ -121,15 +123,15 @@ def solve(
     """
     h, w = level.known.shape
     known = level.known.numpy()
-    usable = usable_centres(level.sources.valid, RADIUS)
-    near_hole = dilated(~known, RADIUS)
+    usable = usable_centres(level.sources.valid)
+    near_hole = dilate(~level.known, RADIUS).numpy()
     if not usable.any() or known.all():
         return level.image, None
 
     queries, hole = np.argwhere(near_hole), np.argwhere(~known)
     query_at = np.full((h, w), -1, np.int64)
     query_at[near_hole] = np.arange(len(queries))
-    weight = trust(known, CONFIDENCE)
+    weight = trust(level.known)
     votes, shift = weight[near_hole], np.zeros((len(queries), 3), np.float32)
     matches = initial_matches(queries, coarse_field, usable, seed)
     images = np.ascontiguousarray(level.sources.images.numpy())
@@ -171,25 +173,17 @@ def solve(
     return torch.from_numpy(current), field
 
 
-def trust(known: Bool[ndarray, "h w"], confidence: float) -> Float32[ndarray, "h w"]:
+def trust(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]:
     """How much a pixel counts when patches are compared: less, the deeper it lies in the hole."""
-    away = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.where(known, 1.0, np.maximum(confidence**away, 0.05)).astype(np.float32)
+    away = distance_to_known(known).numpy()
+    return np.where(known, 1.0, np.maximum(CONFIDENCE**away, 0.05)).astype(np.float32)
 
 
-def dilated(mask: Bool[ndarray, "h w"], radius: int) -> Bool[ndarray, "h w"]:
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
-
-
-def usable_centres(valid: Bool[Tensor, "s h w"], radius: int) -> Bool[ndarray, "s h w"]:
-    """Pixels around which a whole patch is valid."""
-    kernel = np.ones((2 * radius + 1,) * 2, np.uint8)
-    return np.stack(
-        [
-            cv2.erode(v, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-            for v in valid.numpy().astype(np.uint8)
-        ]
-    )
+def usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
+    """Pixels around which a whole patch is valid; beyond the border nothing is."""
+    lacking = pad(~valid, (RADIUS,) * 4, value=True)
+    inner = slice(RADIUS, -RADIUS)
+    return np.stack([~dilate(v, RADIUS)[inner, inner].numpy() for v in lacking])
 
 
 def initial_matches(

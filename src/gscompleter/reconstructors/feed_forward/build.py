@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import torch
 
 from gscompleter.reconstructors.feed_forward.depthsplat import VARIANTS, DepthSplat
-from gscompleter.reconstructors.feed_forward.mvsplat import MVSplat, MVSplatConfig
+from gscompleter.reconstructors.feed_forward.mvsplat import MVSplat
 from gscompleter.reconstructors.feed_forward.reconstructor import FeedForward
-from gscompleter.reconstructors.feed_forward.volsplat import VolSplat, VolSplatConfig
-from gscompleter.weights import (
-    PUBLISHED,
-    PublishedWeights,
-    fetch,
-    load_strictly,
-    read_state_dict,
-)
+from gscompleter.reconstructors.feed_forward.volsplat import VolSplat
+from gscompleter.weights import PUBLISHED, PublishedWeights, fetch, load_strictly, read_state_dict
 from gscompleter.weights.fitting import shapes_of
 
 Network = MVSplat | DepthSplat | VolSplat
@@ -46,15 +39,9 @@ def build(name: str, weights: Path | None = None, device: str = "cpu") -> FeedFo
 
 def network_of(published: PublishedWeights) -> Network:
     """The network that a file fits, with random weights, set up for what it was trained on."""
-    near, far = published.near_far or (None, None)
     if published.model == "DepthSplat":
-        depthsplat = VARIANTS[variant_of(published)]
-        return DepthSplat(replace(depthsplat, near=near, far=far) if near and far else depthsplat)
-    if published.model == "MVSplat":
-        mvsplat = MVSplatConfig()
-        return MVSplat(replace(mvsplat, near=near, far=far) if near and far else mvsplat)
-    volsplat = VolSplatConfig()
-    return VolSplat(replace(volsplat, near=near, far=far) if near and far else volsplat)
+        return DepthSplat(VARIANTS[variant_of(published)])
+    return MVSplat() if published.model == "MVSplat" else VolSplat()
 
 
 def variant_of(published: PublishedWeights) -> str:
@@ -65,9 +52,9 @@ def variant_of(published: PublishedWeights) -> str:
 
 def shapes_of_all() -> dict[str, dict[str, tuple[int, ...]]]:
     """The tensors of every network there is, by the names of the weights that fit it."""
-    found: dict[str, dict[str, tuple[int, ...]]] = {}
     with torch.device("meta"):
-        for published in PUBLISHED.values():
-            if published.is_reconstructor:
-                found[published.name] = shapes_of(network_of(published).state_dict())
-    return found
+        return {
+            name: shapes_of(network_of(published).state_dict())
+            for name, published in PUBLISHED.items()
+            if published.is_reconstructor
+        }

@@ -17,10 +17,16 @@ from gscompleter.reconstructors.feed_forward.cameras import Cameras, nearest_vie
 from gscompleter.reconstructors.feed_forward.cnn import ImageEncoder, normalised
 from gscompleter.reconstructors.feed_forward.cost_volume import cost_volume, evenly_spaced
 from gscompleter.reconstructors.feed_forward.dino import PATCH, DinoV2
-from gscompleter.reconstructors.feed_forward.dpt import DptHead, Layout, padded_conv3x3
+from gscompleter.reconstructors.feed_forward.dpt import (
+    CHANNELS,
+    DptHead,
+    Layout,
+    padded_conv3x3,
+    two_padded_convolutions,
+)
 from gscompleter.reconstructors.feed_forward.resampling import enlarged, resized
 from gscompleter.reconstructors.feed_forward.transformer import MultiViewTransformer
-from gscompleter.reconstructors.feed_forward.unet import Steps, UNet, conv3x3
+from gscompleter.reconstructors.feed_forward.unet import UNet, conv3x3, refiner
 
 MAX_SOURCES = 2
 """Of more than three views each is matched with the two nearest, else with all others."""
@@ -49,9 +55,6 @@ VITS = {
     "vitl": Vit(1024, 24, 16, (4, 11, 17, 23), (128, 256, 512, 1024), 64, 128),
 }
 
-CHANNELS = {"cnn0": 64, "cnn1": 96, "cnn2": 128, "matching0": 128, "matching1": 64, "disparity": 1}
-"""Of the maps that DPT heads join: of the encoder (finest first), of the transformer (coarsest
-first), and the inverse depth."""
 LAYOUTS: Mapping[tuple[int, int], Layout] = {
     (4, 1): (("cnn0", "cnn1", "vit"), ("cnn2", "vit", "matching0", "disparity"), ("vit",)),
     (2, 2): (
@@ -105,15 +108,15 @@ class DepthPrediction:
 
 
 class Pyramid(nn.Module):
-    """A map, and another of twice the resolution with half the channels."""
+    """A map and, of two scales, another of twice the resolution with half the channels."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, num_scales: int) -> None:
         super().__init__()
-        half = channels // 2
-        finer = nn.Sequential(
-            nn.ConvTranspose2d(channels, half, 2, 2), nn.GELU(), conv3x3(half, half)
-        )
-        self.stages = nn.ModuleList([nn.Identity(), finer])
+        self.stages = nn.ModuleList([nn.Identity()])
+        if num_scales == 2:
+            half = channels // 2
+            upsampling = nn.ConvTranspose2d(channels, half, 2, 2)
+            self.stages.append(nn.Sequential(upsampling, nn.GELU(), conv3x3(half, half)))
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> list[Float[Tensor, "n _ _ _"]]:
         return [stage(x) for stage in self.stages]
@@ -129,9 +132,8 @@ class DepthPredictor(nn.Module):
         self.backbone = ImageEncoder(1 if config.lowest_feature_resolution == 4 else 2, 2)
         self.transformer = MultiViewTransformer()
         self.pretrained = DinoV2(self.vit.channels, self.vit.num_blocks, self.vit.heads)
-        if config.num_scales == 2:
-            self.mv_pyramid = Pyramid(128)
-            self.mono_pyramid = Pyramid(self.vit.channels)
+        self.mv_pyramid = Pyramid(128, config.num_scales)
+        self.mono_pyramid = Pyramid(self.vit.channels, config.num_scales)
         self.regressor = nn.ModuleList()
         self.regressor_residual = nn.ModuleList()
         self.depth_head = nn.ModuleList()
@@ -146,44 +148,21 @@ class DepthPredictor(nn.Module):
         of_image, of_vit = CHANNELS[f"cnn{2 - scale}"], self.vit.channels // 2**scale
         channels = candidates + of_image + width + of_vit
         unet = UNet(width, levels=3 + scale, attention_level=2 + scale, pre_norm=True)
-        self.regressor.append(
-            Steps(
-                [
-                    conv3x3(channels, width),
-                    nn.GroupNorm(8, width),
-                    nn.GELU(),
-                    unet,
-                    conv3x3(width, width),
-                ]
-            )
-        )
+        self.regressor.append(refiner(channels, width, unet))
         self.regressor_residual.append(nn.Conv2d(channels, width, 1))
-        self.depth_head.append(
-            nn.Sequential(
-                padded_conv3x3(width, 2 * width),
-                nn.GELU(),
-                padded_conv3x3(2 * width, candidates),
-            )
-        )
+        self.depth_head.append(two_padded_convolutions(width, 2 * width, candidates))
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> DepthPrediction:
         """Depth and features of at least two views in [0, 1], their sides multiples of `patch`."""
         b, v = images.shape[:2]
-        sources = (
-            nearest_views(cameras, MAX_SOURCES)
-            if v > MAX_SOURCES + 1
-            else other_views(b, v, images.device)
-        )
+        few = v <= MAX_SOURCES + 1
+        sources = other_views(b, v, images.device) if few else nearest_views(cameras, MAX_SOURCES)
         flat = normalised(images.flatten(0, 1))
         encoded = self.backbone(flat)
-        matching = self.matching_features(encoded[-1], sources)
+        matching = self.mv_pyramid(self.transformer(encoded[-1], sources))
         vit_maps = self.vit_features(flat)
-        monocular = self.monocular_features(vit_maps[-1])
-
-        contexts = [
-            [encoded[2 - scale], matching[scale], monocular[scale]]
-            for scale in range(self.config.num_scales)
-        ]
+        deepest = resized(vit_maps[-1], encoded[-1].shape[2:])
+        contexts = list(zip(encoded[::-1], matching, self.mono_pyramid(deepest), strict=False))
 
         low, high = cameras.inverse_range()
         candidates = evenly_spaced(low, high, self.config.num_candidates)
@@ -203,31 +182,16 @@ class DepthPredictor(nn.Module):
         certainty = probability.amax(1, keepdim=True)
         return DepthPrediction(1 / full.clamp(low, high), certainty, maps, vit_maps)
 
-    def matching_features(
-        self, encoded: Float[Tensor, "n 128 h w"], sources: Int[Tensor, "b v s"]
-    ) -> list[Float[Tensor, "n _ _ _"]]:
-        """Features to match views by, at each scale."""
-        informed = self.transformer(encoded, sources)
-        return self.mv_pyramid(informed) if self.config.num_scales == 2 else [informed]
-
     def vit_features(self, images: Float[Tensor, "n 3 h w"]) -> list[Float[Tensor, "n c p q"]]:
         """Features of four depths of the vision transformer, at 1/8 of full resolution."""
         h, w = images.shape[2:]
         patches = resized(images, (h // PATCH * PATCH, w // PATCH * PATCH))
         return [resized(x, (h // 8, w // 8)) for x in self.pretrained(patches, self.vit.tapped)]
 
-    def monocular_features(
-        self, vit_map: Float[Tensor, "n c p q"]
-    ) -> list[Float[Tensor, "n _ _ _"]]:
-        """The deepest features of the vision transformer, at each scale."""
-        if self.config.lowest_feature_resolution == 4:
-            vit_map = enlarged(vit_map, 2)
-        return self.mono_pyramid(vit_map) if self.config.num_scales == 2 else [vit_map]
-
     def match(
         self,
         scale: int,
-        context: list[Float[Tensor, "n _ h w"]],
+        context: tuple[Float[Tensor, "n _ h w"], ...],
         cameras: Cameras,
         sources: Int[Tensor, "b v s"],
         candidates: Float[Tensor, "n d _ _"],
@@ -252,7 +216,7 @@ def dpt_head(
     vit = VITS[config.vit]
     levels = LAYOUTS[config.upsample_factor, config.num_scales]
     layout = [[name for name in names if with_disparity or name != "disparity"] for names in levels]
-    return DptHead(vit.channels, vit.widths, features, layout, CHANNELS, out)
+    return DptHead(vit.channels, vit.widths, features, layout, out)
 
 
 def to_residual(features: int) -> nn.Sequential:

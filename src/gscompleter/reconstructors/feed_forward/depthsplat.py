@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from gscompleter.reconstructors.feed_forward.cameras import Cameras
 from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
-from gscompleter.reconstructors.feed_forward.dpt import padded_conv3x3
+from gscompleter.reconstructors.feed_forward.dpt import two_padded_convolutions
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import (
     DEPTHSPLAT_CHANNELS,
     PixelGaussians,
@@ -65,20 +65,12 @@ class DepthSplat(PixelFeatures):
     def __init__(self, config: DepthSplatConfig = DepthSplatConfig()) -> None:
         super().__init__(config.depth)
         self.config = config
-        self.gaussian_head = nn.Sequential(
-            padded_conv3x3(self.channels, DEPTHSPLAT_CHANNELS),
-            nn.GELU(),
-            padded_conv3x3(DEPTHSPLAT_CHANNELS, DEPTHSPLAT_CHANNELS),
+        self.gaussian_head = two_padded_convolutions(
+            self.channels, DEPTHSPLAT_CHANNELS, DEPTHSPLAT_CHANNELS
         )
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
-        """The Gaussians of all pixels.
-
-        Args:
-            images: In [0, 1], at least two views, with sides that are multiples of
-                `config.patch`.
-            cameras: Of the views.
-        """
+        """The Gaussians of all pixels; see `DepthPredictor` for the images."""
         depth, features = self.describe(images, cameras)
         raw = self.gaussian_head(features)
         flat = images.flatten(0, 1)

@@ -13,6 +13,9 @@ from gscompleter.reconstructors.feed_forward.resampling import resized
 
 VIT = "vit"
 """Stands, among the names of maps that are joined, for the transformer's own."""
+CHANNELS = {"cnn0": 64, "cnn1": 96, "cnn2": 128, "matching0": 128, "matching1": 64, "disparity": 1}
+"""Of the maps they are joined with: of the encoder (finest first), of the multi-view transformer
+(coarsest first), and the inverse depth."""
 Layout = Sequence[Sequence[str]]
 """Names of the maps that are joined at 1/2, 1/4 and 1/8 of full resolution, in this order."""
 
@@ -20,6 +23,10 @@ Layout = Sequence[Sequence[str]]
 def padded_conv3x3(channels: int, out: int) -> nn.Conv2d:
     """A convolution that continues the border."""
     return nn.Conv2d(channels, out, 3, 1, 1, padding_mode="replicate")
+
+
+def two_padded_convolutions(channels: int, width: int, out: int) -> nn.Sequential:
+    return nn.Sequential(padded_conv3x3(channels, width), nn.GELU(), padded_conv3x3(width, out))
 
 
 class ResidualUnit(nn.Module):
@@ -80,10 +87,8 @@ class Scratch(nn.Module):
         self.output_conv = nn.Identity() if out is None else out
 
     def forward(self, pyramid: Sequence[Float[Tensor, "n _ _ _"]]) -> Float[Tensor, "n c h w"]:
-        a = self.layer1_rn(pyramid[0])
-        b = self.layer2_rn(pyramid[1])
-        c = self.layer3_rn(pyramid[2])
-        d = self.layer4_rn(pyramid[3])
+        layers = (self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn)
+        a, b, c, d = (layer(x) for layer, x in zip(layers, pyramid, strict=True))
         x = self.refinenet4(d, c.shape[2:])
         x = self.refinenet3.fused(x, c, b.shape[2:])
         x = self.refinenet2.fused(x, b, a.shape[2:])
@@ -100,7 +105,6 @@ class DptHead(nn.Module):
         widths: Sequence[int],
         features: int,
         layout: Layout,
-        channels: Mapping[str, int],
         out: nn.Module | None = None,
     ) -> None:
         """
@@ -109,7 +113,6 @@ class DptHead(nn.Module):
             widths: Channels of the four levels, finest first.
             features: Channels of the fused map.
             layout: Which maps are joined at the three finest levels.
-            channels: Of the maps that `layout` names.
             out: What follows the fusion, if anything does.
         """
         super().__init__()
@@ -124,7 +127,7 @@ class DptHead(nn.Module):
             ]
         )
         self.concat_projects = nn.ModuleList(
-            nn.Conv2d(sum(width if name == VIT else channels[name] for name in names), width, 1)
+            nn.Conv2d(sum(width if name == VIT else CHANNELS[name] for name in names), width, 1)
             for names, width in zip(layout, widths[:3], strict=True)
         )
         self.scratch = Scratch(widths, features, out)

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.reconstructors.feed_forward.cameras import Cameras
-from gscompleter.types import Camera, View
+from gscompleter.types import Camera, DepthMap, View
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,14 @@ class Crop:
         return slice(self.left, self.left + self.width)
 
     def padded(
-        self, values: Float[Tensor, "{self.height} {self.width}"], height: int, width: int
-    ) -> tuple[Float[Tensor, "{height} {width}"], Bool[Tensor, "{height} {width}"]]:
-        """`values` of the window in the whole image, and where that is; 0 outside."""
-        whole = values.new_zeros(height, width)
-        within = torch.zeros(height, width, dtype=torch.bool, device=values.device)
-        whole[self.rows, self.columns] = values
+        self, depth: Float[Tensor, "{self.height} {self.width}"], camera: Camera
+    ) -> DepthMap:
+        """z-depth of the window in the whole image of `camera`, and where that is; 0 outside."""
+        whole = depth.new_zeros(camera.height, camera.width)
+        within = torch.zeros_like(whole, dtype=torch.bool)
+        whole[self.rows, self.columns] = depth
         within[self.rows, self.columns] = True
-        return whole, within
+        return DepthMap(whole, within)
 
     def pixel_index(self, width: int) -> Int[Tensor, "n"]:
         """Row-major numbers that the pixels of the window have in an image of `width` columns."""

@@ -22,7 +22,13 @@ from gscompleter.reconstructors.feed_forward.gaussian_adapter import (
 )
 from gscompleter.reconstructors.feed_forward.resampling import enlarged
 from gscompleter.reconstructors.feed_forward.transformer import MultiViewTransformer
-from gscompleter.reconstructors.feed_forward.unet import Steps, UNet, conv3x3
+from gscompleter.reconstructors.feed_forward.unet import (
+    Steps,
+    UNet,
+    conv3x3,
+    refiner,
+    two_convolutions,
+)
 
 NUM_CANDIDATES = 128
 """Inverse depths that are compared."""
@@ -72,9 +78,7 @@ class DepthPredictor(nn.Module):
         super().__init__()
         self.depth_chunk = depth_chunk
         coarse = UNet(128, levels=3, attention_level=2, pre_norm=False)
-        self.corr_refine_net = Steps(
-            [conv3x3(256, 128), nn.GroupNorm(8, 128), nn.GELU(), coarse, conv3x3(128, 128)]
-        )
+        self.corr_refine_net = refiner(256, 128, coarse)
         self.regressor_residual = nn.Conv2d(256, 128, 1)
         self.depth_head_lowres = two_convolutions(128, 256, NUM_CANDIDATES)
         self.upsampler = nn.Sequential(
@@ -108,10 +112,7 @@ class DepthPredictor(nn.Module):
         return 1 / disparity, density.sigmoid(), raw
 
     def coarse_disparity(
-        self,
-        features: Float[Tensor, "n 128 p q"],
-        cameras: Cameras,
-        sources: Int[Tensor, "b v s"],
+        self, features: Float[Tensor, "n 128 p q"], cameras: Cameras, sources: Int[Tensor, "b v s"]
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n 1 h w"]]:
         """Expected inverse depth, and the probability of the best, at full resolution."""
         candidates = evenly_spaced(*cameras.inverse_range(), NUM_CANDIDATES)
@@ -134,19 +135,10 @@ class MVSplat(nn.Module):
         self.depth_predictor = DepthPredictor(config.depth_chunk)
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
-        """The Gaussians of all pixels.
-
-        Args:
-            images: In [0, 1], at least two views, with sides that are multiples of 16.
-            cameras: Of the views.
-        """
+        """The Gaussians of all pixels of at least two views, whose sides are multiples of 16."""
         b, v = images.shape[:2]
         sources = other_views(b, v, images.device)
         flat = images.flatten(0, 1)
         informed, alone = self.backbone(flat, sources)
         distance, opacity, raw = self.depth_predictor(flat, informed, alone, cameras, sources)
         return mvsplat_gaussians(raw, distance, opacity, cameras)
-
-
-def two_convolutions(channels: int, width: int, out: int) -> nn.Sequential:
-    return nn.Sequential(conv3x3(channels, width), nn.GELU(), conv3x3(width, out))

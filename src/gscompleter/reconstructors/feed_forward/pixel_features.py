@@ -14,7 +14,7 @@ from gscompleter.reconstructors.feed_forward.depth_predictor import (
     DepthPredictor,
     dpt_head,
 )
-from gscompleter.reconstructors.feed_forward.unet import conv3x3
+from gscompleter.reconstructors.feed_forward.unet import two_convolutions
 
 REGRESSED = 64
 """Channels that are made of all others; they come first."""
@@ -34,9 +34,7 @@ class PixelFeatures(nn.Module):
         self.channels = REGRESSED + 3 + features + 1
         self.depth_predictor = DepthPredictor(config)
         self.feature_upsampler = dpt_head(config, features, with_disparity=False)
-        self.gaussian_regressor = nn.Sequential(
-            conv3x3(features + 5, REGRESSED), nn.GELU(), conv3x3(REGRESSED, REGRESSED)
-        )
+        self.gaussian_regressor = two_convolutions(features + 5, REGRESSED, REGRESSED)
 
     def describe(
         self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras

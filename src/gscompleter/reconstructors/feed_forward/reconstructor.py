@@ -83,16 +83,10 @@ def reconstruction_of(
     device = views[0].image.device
     gaussians = gaussians_of(predicted).to(device)
     per_view = crops[0].height * crops[0].width
-    means = gaussians.means.split(per_view)
-    pairs = list(zip(views, crops, strict=True))
-    depths = [depth_map_of(own, view, crop) for own, (view, crop) in zip(means, pairs, strict=True)]
-    pixels = [crop.pixel_index(view.camera.width) for view, crop in pairs]
-    return Reconstruction(
-        gaussians,
-        tuple(depths),
-        torch.arange(len(views), device=device).repeat_interleave(per_view),
-        torch.cat(pixels).to(device),
-    )
+    depths = map(depth_map_of, gaussians.means.split(per_view), views, crops)
+    pixels = [crop.pixel_index(v.camera.width) for v, crop in zip(views, crops, strict=True)]
+    numbers = torch.arange(len(views), device=device).repeat_interleave(per_view)
+    return Reconstruction(gaussians, tuple(depths), numbers, torch.cat(pixels).to(device))
 
 
 def reconstruction_of_voxels(
@@ -100,18 +94,15 @@ def reconstruction_of_voxels(
 ) -> Reconstruction:
     """The scene on the device of its views; its Gaussians belong to no particular pixel."""
     device = views[0].image.device
-    gaussians = observed(
-        predicted.means, predicted.quats, predicted.scales, predicted.opacities, predicted.sh
-    )
     depths = [
-        DepthMap(*crop.padded(depth, view.camera.height, view.camera.width))
+        crop.padded(depth, view.camera)
         for depth, view, crop in zip(predicted.depth.to(device), views, crops, strict=True)
     ]
-    return Reconstruction(gaussians.to(device), tuple(depths))
+    return Reconstruction(gaussians_of(predicted).to(device), tuple(depths))
 
 
-def gaussians_of(predicted: PixelGaussians) -> Gaussians:
-    """View by view, row by row, without the harmonics that nothing shows."""
+def gaussians_of(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
+    """Those of pixels view by view and row by row; without the harmonics that nothing shows."""
     return observed(
         predicted.means.flatten(0, -2),
         predicted.quats.flatten(0, -2),
@@ -124,7 +115,4 @@ def gaussians_of(predicted: PixelGaussians) -> Gaussians:
 def depth_map_of(means: Float[Tensor, "n 3"], view: View, crop: Crop) -> DepthMap:
     """z-depth of the Gaussians of the crop, in the whole image."""
     z = (means - view.camera.center) @ view.camera.forward
-    depth, within = crop.padded(
-        z.view(crop.height, crop.width), view.camera.height, view.camera.width
-    )
-    return DepthMap(depth, within)
+    return crop.padded(z.view(crop.height, crop.width), view.camera)

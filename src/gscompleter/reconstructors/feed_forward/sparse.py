@@ -234,21 +234,14 @@ class PointwiseConv(nn.Module):
         return features @ self.kernel
 
 
-@dataclass(frozen=True)
-class Hierarchy:
-    """The tables of a U-Net over one grid."""
+def hierarchy_over(grid: Grid, num_levels: int) -> tuple[list[Neighbours], Neighbours]:
+    """The tables of a U-Net of `num_levels` halvings of `grid`, and that within the coarsest grid.
 
-    downward: tuple[Neighbours, ...]
-    """From each grid to the one of twice the stride; transposed, they lead up again."""
-    coarsest: Neighbours
-    """Within the coarsest grid."""
-
-
-def hierarchy_over(grid: Grid, num_levels: int) -> Hierarchy:
-    """The tables of `num_levels` halvings of `grid`."""
+    Each leads from a grid to the one of twice the stride; transposed, it leads up again.
+    """
     downward = []
     for _ in range(num_levels):
         coarse = grid.coarser()
         downward.append(neighbours_between(grid, coarse))
         grid = coarse
-    return Hierarchy(tuple(downward), neighbours_within(grid))
+    return downward, neighbours_within(grid)

@@ -27,8 +27,7 @@ class RowNorm(nn.Module):
         self.bn = nn.BatchNorm1d(channels)
 
     def forward(self, features: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
-        normalised: Tensor = self.bn(features)
-        return normalised
+        return self.bn(features)
 
 
 class ConvBlock(nn.Module):
@@ -72,8 +71,7 @@ class DecoderBlock(nn.ModuleList):
         encoded: Float[Tensor, "n width"],
     ) -> Float[Tensor, "n width"]:
         up, join = self
-        joined: Tensor = join(torch.cat([up(features, downward), encoded], dim=1))
-        return joined
+        return join(torch.cat([up(features, downward), encoded], dim=1))
 
 
 class SparseUNet(nn.Module):
@@ -92,15 +90,13 @@ class SparseUNet(nn.Module):
 
     def forward(self, features: Float[Tensor, "n c"], grid: Grid) -> Float[Tensor, "n c"]:
         """Refined features of the cells of `grid`."""
-        tables = hierarchy_over(grid, len(CHANNELS))
-        outermost, *inner = tables.downward
+        tables, coarsest = hierarchy_over(grid, len(CHANNELS))
         x, encoded = features, []
-        for encoder, downward in zip(self.encoders, tables.downward[:-1], strict=True):
+        for encoder, downward in zip(self.encoders, tables[:-1], strict=True):
             x = encoder(x, downward)
             encoded.append(x)
-        x = self.bottleneck[0](x, tables.downward[-1])
-        x = self.bottleneck[1](x, tables.coarsest)
-        for decoder, downward in zip(self.decoder_blocks, reversed(inner), strict=True):
+        x = self.bottleneck[0](x, tables[-1])
+        x = self.bottleneck[1](x, coarsest)
+        for decoder, downward in zip(self.decoder_blocks, tables[:0:-1], strict=True):
             x = decoder(x, downward, encoded.pop())
-        refined: Tensor = self.final_upsample(x, outermost)
-        return refined
+        return self.final_upsample(x, tables[0])

@@ -10,7 +10,7 @@ file is the only place that knows; all else takes the result for harmonics of 3D
 from __future__ import annotations
 
 from functools import cache
-from math import factorial, pi, sqrt
+from math import factorial, isqrt, pi, prod, sqrt
 
 import torch
 from jaxtyping import Float, Float64
@@ -26,14 +26,13 @@ def rotate_sh(
     sh: Float[Tensor, "b v h w k 3"], rotations: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w k 3"]:
     """Harmonics of k = (degree + 1)² coefficients, rotated in the basis of e3nn."""
-    degrees = [sh[..., :1, :]]
+    turned = [sh[..., :1, :]]
     with full_precision(sh):
-        while (k := sum(part.shape[-2] for part in degrees)) < sh.shape[-2]:
-            degree = len(degrees)
+        for degree in range(1, isqrt(sh.shape[-2])):
+            part = sh[..., degree**2 : (degree + 1) ** 2, :]
             matrices = rotation_of_degree(degree, rotations)
-            part = sh[..., k : k + 2 * degree + 1, :]
-            degrees.append(torch.einsum("bvij,bvhwjc->bvhwic", matrices, part))
-    return torch.cat(degrees, dim=-2)
+            turned.append(torch.einsum("bvij,bvhwjc->bvhwic", matrices, part))
+    return torch.cat(turned, dim=-2)
 
 
 def rotation_of_degree(degree: int, rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n m m"]:
@@ -45,9 +44,7 @@ def rotation_of_degree(degree: int, rotations: Float[Tensor, "*n 3 3"]) -> Float
 
 
 @cache
-def sampled_harmonics(
-    degree: int,
-) -> tuple[Float64[Tensor, "d 3"], Float64[Tensor, "m d"]]:
+def sampled_harmonics(degree: int) -> tuple[Float64[Tensor, "d 3"], Float64[Tensor, "m d"]]:
     """Directions all over the sphere, and the pseudo-inverse of the harmonics at them."""
     number = torch.arange(NUM_DIRECTIONS, dtype=torch.float64)
     y = 1 - (2 * number + 1) / NUM_DIRECTIONS
@@ -73,16 +70,8 @@ def harmonics(degree: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "
 
 def associated_legendre(degree: int, order: int, t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """`P(t) / (1 - t²)^(order / 2)`, without the Condon-Shortley sign."""
-    before, value = torch.zeros_like(t), torch.full_like(t, odd_factorial(order))
+    before, value = torch.zeros_like(t), torch.full_like(t, prod(range(1, 2 * order, 2)))
     for n in range(order + 1, degree + 1):
         following = ((2 * n - 1) * t * value - (n + order - 1) * before) / (n - order)
         before, value = value, following
     return value
-
-
-def odd_factorial(order: int) -> float:
-    """1 · 3 · … · (2 order - 1)."""
-    product = 1.0
-    for i in range(1, order + 1):
-        product *= 2 * i - 1
-    return product

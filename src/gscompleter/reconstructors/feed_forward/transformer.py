@@ -32,16 +32,7 @@ class WindowAttention(nn.Module):
         sources: Float[Tensor, "n s h w c"],
         mask: Float[Tensor, "windows p p"] | None,
     ) -> Float[Tensor, "n h w c"]:
-        """`x` and what it learns from `sources`; with a `mask`, in windows shifted by half."""
-        return x + self.message(x, sources, mask)
-
-    def message(
-        self,
-        x: Float[Tensor, "n h w c"],
-        sources: Float[Tensor, "n s h w c"],
-        mask: Float[Tensor, "windows p p"] | None,
-    ) -> Float[Tensor, "n h w c"]:
-        """What each pixel of `x` learns from `sources`."""
+        """What each pixel of `x` learns from `sources`; with a `mask`, windows are shifted."""
         _, h, w, _ = x.shape
         shift = (0, 0) if mask is None else (h // SPLITS // 2, w // SPLITS // 2)
         back = (-shift[0], -shift[1])
@@ -69,13 +60,13 @@ class WindowAttentionAndMlp(WindowAttention):
         )
         self.norm2 = nn.LayerNorm(channels)
 
-    def message(
+    def forward(
         self,
         x: Float[Tensor, "n h w c"],
         sources: Float[Tensor, "n s h w c"],
         mask: Float[Tensor, "windows p p"] | None,
     ) -> Float[Tensor, "n h w c"]:
-        message = super().message(x, sources, mask)
+        message = super().forward(x, sources, mask)
         return self.norm2(self.mlp(torch.cat([x, message], -1)))
 
 
@@ -95,8 +86,8 @@ class TransformerLayer(nn.Module):
     ) -> Float[Tensor, "b v h w c"]:
         seen = select(x, sources).flatten(0, 1)
         own = x.flatten(0, 1)
-        own = self.self_attn(own, own[:, None], mask)
-        return self.cross_attn_ffn(own, seen, mask).view_as(x)
+        own = own + self.self_attn(own, own[:, None], mask)
+        return (own + self.cross_attn_ffn(own, seen, mask)).view_as(x)
 
 
 class MultiViewTransformer(nn.Module):

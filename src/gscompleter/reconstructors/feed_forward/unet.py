@@ -98,6 +98,16 @@ class Steps(nn.ModuleList):
         return x
 
 
+def refiner(channels: int, width: int, unet: UNet) -> Steps:
+    """A U-Net of `width` on maps of `channels`, with a convolution before and after it."""
+    before = [conv3x3(channels, width), group_norm(width), nn.GELU()]
+    return Steps([*before, unet, conv3x3(width, width)])
+
+
+def two_convolutions(channels: int, width: int, out: int) -> nn.Sequential:
+    return nn.Sequential(conv3x3(channels, width), nn.GELU(), conv3x3(width, out))
+
+
 class UNet(nn.Module):
     """A U-Net of constant width, with attention at the level `attention_level` (0 is finest)."""
 

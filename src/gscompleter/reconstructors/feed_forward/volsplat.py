@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from gscompleter.reconstructors.feed_forward.cameras import Cameras, full_precision
 from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
+from gscompleter.reconstructors.feed_forward.depthsplat import BASE, DepthSplatConfig
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import (
     MIN_SCALE,
     damped,
@@ -36,24 +37,13 @@ REACH = 1.5
 
 
 @dataclass(frozen=True)
-class VolSplatConfig:
-    depth: DepthConfig = DepthConfig("vitb", 2, 2, 4)
+class VolSplatConfig(DepthSplatConfig):
+    """What DepthSplat base has, and voxels."""
+
+    depth: DepthConfig = BASE
     """The depth predictor, that of DepthSplat base."""
-    image_size: tuple[int, int] = (256, 256)
-    """Height and width it was trained at, in pixels; others work too."""
-    near: float = 0.5
-    """Smallest z-depth, in scene units, where the camera knows none."""
-    far: float = 100.0
-    """Largest z-depth, in scene units, where the camera knows none."""
     voxel_resolution: float = 0.001
     """Side of a voxel, in scene units."""
-    gaussian_scale_max: float = 3.0
-    """Largest standard deviation of a Gaussian, in scene units."""
-
-    @property
-    def patch(self) -> int:
-        """Sides of the images must be multiples of it, in pixels."""
-        return self.depth.patch
 
 
 @dataclass(frozen=True)
@@ -86,8 +76,7 @@ class GaussianHead(nn.Module):
         self, features: Float[Tensor, "n channels_in"], grid: Grid
     ) -> Float[Tensor, "n channels_out"]:
         neighbours = neighbours_within(grid)
-        raw: Tensor = self.conv2(F.gelu(self.conv1(features, neighbours)), neighbours)
-        return raw
+        return self.conv2(F.gelu(self.conv1(features, neighbours)), neighbours)
 
 
 class VolSplat(PixelFeatures):
@@ -100,12 +89,7 @@ class VolSplat(PixelFeatures):
         self.gaussian_head = GaussianHead(self.channels, sum(PARTS))
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> VoxelGaussians:
-        """The Gaussians of all voxels of one scene.
-
-        Args:
-            images: In [0, 1], at least two views, with sides that are multiples of
-                `config.patch`.
-            cameras: Of the views.
+        """The Gaussians of all voxels of one scene; see `DepthPredictor` for the images.
 
         Raises:
             InputError: depths that are not finite, or voxels spread too widely to be counted.

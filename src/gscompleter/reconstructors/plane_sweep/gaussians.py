@@ -18,10 +18,7 @@ OPACITY = 0.98
 
 
 def discs(
-    view: View,
-    depth: Float[Tensor, "h w"],
-    normals: Float[Tensor, "h w 3"],
-    sigma: float,
+    view: View, depth: Float[Tensor, "h w"], normals: Float[Tensor, "h w 3"], sigma: float
 ) -> Gaussians:
     """A Gaussian for every pixel of `view`, row by row, at its z-depth.
 

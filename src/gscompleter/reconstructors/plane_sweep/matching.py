@@ -66,16 +66,9 @@ def cost_volume(
     reference: StereoImage, sources: Sequence[Source], inverse_depths: Float[np.ndarray, "d"]
 ) -> UInt8[np.ndarray, "h w d"]:
     """Costs of the planes in 0 to 254; of several sources the best ones count."""
+    settings = (RADIUS, np.float32(NOISE), np.float32(DETAIL))
     costs = [
-        stereo.matching_costs(
-            reference.image,
-            source.image,
-            transform,
-            inverse_depths,
-            RADIUS,
-            np.float32(NOISE),
-            np.float32(DETAIL),
-        )
+        stereo.matching_costs(reference.image, source.image, transform, inverse_depths, *settings)
         for source, transform in sources
     ]
     return stereo.best_mean(np.stack(costs), BEST_SHARE, np.uint8(UNSEEN_COST))

@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from gscompleter.kernels import stereo
-from gscompleter.reconstructors.plane_sweep.confidence import MAX_RETURN_ERROR
-
-Map = Float32[np.ndarray, "h w"]
-Mask = Bool[np.ndarray, "h w"]
+from gscompleter.reconstructors.plane_sweep.confidence import MAX_RETURN_ERROR, Map, Mask
 
 
 @dataclass(frozen=True)

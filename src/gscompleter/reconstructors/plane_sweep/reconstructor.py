@@ -13,11 +13,7 @@ from jaxtyping import Float32
 from gscompleter.kernels import stereo
 from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.matching.features import features_of, matches
-from gscompleter.matching.stereo_image import (
-    StereoImage,
-    source_from_reference,
-    stereo_images,
-)
+from gscompleter.matching.stereo_image import StereoImage, source_from_reference, stereo_images
 from gscompleter.reconstructors.plane_sweep.aggregation import aggregate
 from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance
 from gscompleter.reconstructors.plane_sweep.confidence import confidence_of, consistent
@@ -100,17 +96,12 @@ class PlaneSweep:
             for sweep, confidence in zip(sweeps, confidences, strict=True)
         ]
         depths = []
-        for number, (view, image, sweep) in enumerate(zip(views, images, sweeps, strict=True)):
-            measured, weight = self.with_background(
-                number, sweep, confidences[number], sure, transforms
-            )
-            heights = fit_surfaces(measured, weight, image.image)
+        for i, (view, sweep) in enumerate(zip(views, sweeps, strict=True)):
+            measured, weight = self.with_background(i, sweep, confidences[i], sure, transforms)
+            heights = fit_surfaces(measured, weight, images[i].image)
             depth = torch.from_numpy(np.float32(unit) / sweep.inverse(heights))
-            confidence = torch.from_numpy(confidences[number])
-            device = view.image.device
-            depths.append(
-                DepthMap(depth.to(device), (confidence > 0).to(device), confidence.to(device))
-            )
+            confidence = torch.from_numpy(confidences[i]).to(view.image.device)
+            depths.append(DepthMap(depth.to(confidence.device), confidence > 0, confidence))
         return depths
 
     def sweep(
@@ -123,8 +114,7 @@ class PlaneSweep:
     ) -> Sweep:
         """The planes that match best in view `number`."""
         image = images[number]
-        others = [i for i in range(len(images)) if i != number]
-        sources = [(images[i], transforms[number, i]) for i in others]
+        sources = [(other, transforms[number, i]) for i, other in enumerate(images) if i != number]
         planes = inverse_depth_planes(image, sources, near, far)
         costs = cost_volume(image, sources, planes)
         index, margin = stereo.winners(aggregate(costs, image))

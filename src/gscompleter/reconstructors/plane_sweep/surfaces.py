@@ -60,18 +60,9 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
             slopes = np.stack([doubled(slope, start.shape) / 2 for slope in slopes])
         # A coarse pixel holds 4 ** number fine ones; its steps are 2 ** number times as high.
         scale = 2.0**number
-        across, down = step_costs(colours)
-        variation.fit(
-            heights,
-            slopes,
-            data,
-            weight,
-            across / np.float32(scale),
-            down / np.float32(scale),
-            np.float32(BEND_PENALTY / scale**2),
-            np.float32(TOLERANCE),
-            ITERATIONS,
-        )
+        across, down = (cost / np.float32(scale) for cost in step_costs(colours))
+        bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
+        variation.fit(heights, slopes, data, weight, across, down, bend, tolerance, ITERATIONS)
     return heights
 
 
