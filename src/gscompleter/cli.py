@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from gscompleter import __version__
+from gscompleter.commands.convert import ConvertOptions
 from gscompleter.commands.options import (
     CompleteOptions,
     DemoOptions,
@@ -18,6 +19,7 @@ from gscompleter.commands.options import (
     ModelsOptions,
     TablesOptions,
 )
+from gscompleter.commands.strip import StripOptions
 from gscompleter.errors import InputError
 
 Command = (
@@ -27,6 +29,8 @@ Command = (
     | Annotated[TablesOptions, tyro.conf.subcommand("tables")]
     | Annotated[IndexOptions, tyro.conf.subcommand("index")]
     | Annotated[ModelsOptions, tyro.conf.subcommand("models")]
+    | Annotated[ConvertOptions, tyro.conf.subcommand("convert")]
+    | Annotated[StripOptions, tyro.conf.subcommand("strip")]
 )
 
 # Where each command lives. Its module is imported once the arguments are known to be right, so
@@ -38,6 +42,8 @@ COMMANDS = {
     TablesOptions: ("gscompleter.commands.evaluate", "run_tables"),
     IndexOptions: ("gscompleter.commands.evaluate", "run_index"),
     ModelsOptions: ("gscompleter.commands.models", "run_models"),
+    ConvertOptions: ("gscompleter.commands.convert", "run_convert"),
+    StripOptions: ("gscompleter.commands.strip", "run_strip"),
 }
 
 
