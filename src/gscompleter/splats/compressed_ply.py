@@ -8,7 +8,6 @@ opacity, and a rotation in 2 + 3 x 10 bits. Harmonics lie in an element of their
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy import ndarray
 
 from gscompleter.io.files import replacing
 from gscompleter.io.ply import Element, encode, read_header
-from gscompleter.splats.decoding import check_size, content, damaged, gaussians_of, harmonics
+from gscompleter.splats.decoding import check_size, damaged, gaussians_of, harmonics
 from gscompleter.splats.packing import fraction, quantized, with_largest, without_largest
 from gscompleter.types import SH_C0, Gaussians
 
@@ -46,27 +45,29 @@ def read_compressed_ply(path: Path) -> Gaussians:
     if not {"chunk", "vertex"} <= tables.keys():
         raise damaged(path, "it has no chunks or no vertices")
     chunk, vertex = tables["chunk"], tables["vertex"]
+    bounds = chunk.dtype.names or ()
     missing = [name for name in PACKED if name not in (vertex.dtype.names or ())]
-    missing += [name for name in BOUNDS[:12] if name not in (chunk.dtype.names or ())]
+    missing += [name for name in BOUNDS[:12] if name not in bounds]
     if missing or len(chunk) * CHUNK < len(vertex):
         raise damaged(path, f"it lacks {', '.join(missing) or 'chunks for some of its vertices'}")
     position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in PACKED)
     means = _within(chunk, "", AXES, _fractions_of_three(position))
     scales = np.exp(_within(chunk, "scale_", AXES, _fractions_of_three(scale)))
     rgba = np.stack([fraction(color, shift, 8) for shift in (24, 16, 8, 0)], axis=1)
-    rgb = _within(chunk, "", CHANNELS, rgba[:, :3]) if "min_r" in chunk.dtype.names else rgba[:, :3]
+    has_colours = set(BOUNDS) <= set(bounds)
+    rgb = _within(chunk, "", CHANNELS, rgba[:, :3]) if has_colours else rgba[:, :3]
     rest = _rest(path, tables.get("sh"), len(vertex))
     return gaussians_of(means, _quats(rotation), scales, rgba[:, 3], harmonics(rgb, rest))
 
 
 def _tables(path: Path) -> dict[str, ndarray]:
     """The elements of a binary little-endian .ply of plain properties, by name."""
-    data = content(path)
-    file = io.BytesIO(data)
-    header = read_header(file, path)
+    with path.open("rb") as file:
+        header = read_header(file, path)
+        data = file.read()
     if header.format != "binary_little_endian":
         raise damaged(path, f"a compressed .ply is binary_little_endian, not {header.format}")
-    tables, start = {}, file.tell()
+    tables, start = {}, 0
     for element in header.elements:
         row = _row(path, element)
         check_size(path, len(data), start + element.count * row.itemsize)

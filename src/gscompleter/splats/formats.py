@@ -137,10 +137,10 @@ def format_of(path: Path) -> str:
     for name, format_ in FORMATS.items():
         if format_.begins is not None and format_.begins(head):
             return name
-    name = _by_name(path)
-    if name is None or FORMATS[name].begins is not None:
+    named = _by_name(path)
+    if named is None or FORMATS[named].begins is not None:
         raise InputError(f"{path} holds no Gaussians in a format that is known: {_known()}.")
-    return name
+    return named
 
 
 def writable_format(path: Path) -> Format:

@@ -75,7 +75,8 @@ def read_glb(path: Path) -> Gaussians:
 
 
 def _document(path: Path, data: bytes) -> Document:
-    chunks, start = {}, 12
+    chunks: dict[int, bytes] = {}
+    start = 12
     while start + CHUNK.size <= len(data):
         size, kind = CHUNK.unpack_from(data, start)
         start += CHUNK.size

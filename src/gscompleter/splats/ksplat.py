@@ -143,21 +143,27 @@ def _row(level: int, degree: int) -> np.dtype:
 def _decoded(path: Path, data: bytes, header: Header, section: Section, row: np.dtype) -> Gaussians:
     start = section.partial * 4 + section.buckets * section.bucket_bytes
     rows = np.frombuffer(data, row, section.count, start)
-    means = rows["mean"].astype(np.float32)
-    if header.level > 0:
-        step = section.block / 2 / section.steps
-        means = (means - section.steps) * step + _centres(path, data, section)
-    rest = rows["rest"].astype(np.float32)
+    rest = rows["rest"].astype(np.float64)
     if header.level == 2:
         rest = header.lowest + rest / 255 * (header.highest - header.lowest)
     rgba = rows["rgba"].astype(np.float32) / 255
     return gaussians_of(
-        means,
+        _means(path, data, header, section, rows),
         rows["quat"].astype(np.float32),
         rows["scale"].astype(np.float32),
         rgba[:, 3],
         harmonics(rgba[:, :3], _by_coefficient(rest, section.degree)),
     )
+
+
+def _means(
+    path: Path, data: bytes, header: Header, section: Section, rows: ndarray
+) -> Float[ndarray, "n 3"]:
+    positions = rows["mean"].astype(np.float64)
+    if header.level == 0:
+        return positions
+    step = section.block / 2 / section.steps
+    return (positions - section.steps) * step + _centres(path, data, section)
 
 
 def _centres(path: Path, data: bytes, section: Section) -> Float[ndarray, "n 3"]:
@@ -180,7 +186,7 @@ def _centres(path: Path, data: bytes, section: Section) -> Float[ndarray, "n 3"]
 
 def _by_coefficient(rest: Float[ndarray, "n m"], degree: int) -> Float[ndarray, "n k 3"]:
     """Harmonics degree by degree and in each channel by channel, as [n, k, 3]."""
-    bands, start = [np.empty((len(rest), 0, 3), np.float32)], 0
+    bands, start = [np.empty((len(rest), 0, 3))], 0
     for band in range(1, degree + 1):
         width = 3 * (2 * band + 1)
         part = rest[:, start : start + width].reshape(len(rest), 3, -1)

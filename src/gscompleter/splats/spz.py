@@ -113,9 +113,11 @@ def _from_gzip(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
         size = sum(header.sizes)
         check_growth(path, size, len(data), MOST_GROWTH)
         body = unpacker.decompress(unpacker.unconsumed_tail, size) if size else b""
-        unpacker.decompress(unpacker.unconsumed_tail, 1)  # which compares the checksum
+        more = unpacker.decompress(unpacker.unconsumed_tail, 1)  # which compares the checksum
     except zlib.error as error:
         raise damaged(path, "it cannot be unpacked") from error
+    if not (more or unpacker.eof):
+        raise damaged(path, "it ends too early")
     return header, _split(path, header, body)
 
 
