@@ -98,6 +98,8 @@ def made(folder: Path, name: str, gaussians: Gaussians) -> Path:
         write_ksplat(path, gaussians, level=1)
     elif path.suffix == ".glb":
         write_glb(path, *glb_table(half_turned(gaussians, ABOUT_Z)))
+    elif name == "plain.spz":
+        path.write_bytes(gzip.decompress(made(folder, "scene.spz", gaussians).read_bytes()))
     elif path.suffix == ".spz":
         write_spz_4(path, made(folder, "scene.spz", gaussians))
     else:
@@ -387,11 +389,14 @@ def test_what_cannot_be_written_is_refused(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("name", FORMATS_BUT_PLY)
+@pytest.mark.parametrize("name", [*FORMATS_BUT_PLY, "plain.spz", "folder"])
 def test_mutated_files_are_read_or_refused(tmp_path, name):
     from mutate_splats import refusals
 
-    assert refusals(made(tmp_path, name, plausible(40, 1)), count=40, seed=0) >= 0
+    path = made(tmp_path, name, plausible(40, 1))
+    if path.is_dir():
+        path = path / "meta.json"
+    assert 0 < refusals(path, count=40, seed=0) <= 40
 
 
 # ---------------------------------------------------------------------------------- commands

@@ -12,6 +12,7 @@ from gscompleter.commands.convert import check_free
 from gscompleter.errors import InputError
 
 if TYPE_CHECKING:
+    from gscompleter.splats.layout import Layout
     from gscompleter.types import Gaussians
 
 
@@ -36,16 +37,41 @@ def run_strip(options: StripOptions) -> None:
         InputError: where nothing of it was given, or a file cannot be read or written.
     """
     # Here, so that `--help` does not wait for torch.
+    from gscompleter.io.ply import save_ply
     from gscompleter.splats.formats import load_splat, save_splat, writable_format
+    from gscompleter.splats.layout import write_layout
 
     writable_format(options.out)
     check_free(options.out, options.overwrite)
     completed = load_splat(options.completed)
     given = as_given(completed, options.completed)
-    save_splat(options.out, given)
+    file = file_as_given(options.completed, given)
+    if file is not None and writable_format(options.out).write is save_ply:
+        write_layout(options.out, file)
+    else:
+        save_splat(options.out, given)
     if not options.quiet:
         generated = int((completed.generated > 0).sum())
         print(f"{len(given):,} Gaussians, {generated:,} generated ones taken out: {options.out}")
+
+
+def file_as_given(path: Path, given: Gaussians) -> Layout | None:
+    """The completed .ply at `path` without the rows and the column that completing it added.
+
+    None where it is no .ply whose rows can be kept, or they were widened for more harmonics.
+    """
+    from gscompleter.splats.formats import format_of
+    from gscompleter.splats.layout import read_layout, unlabelled, with_rows
+    from gscompleter.splats.removed import NAME, load_removed
+
+    layout = read_layout(path) if format_of(path) == "ply" else None
+    if layout is None or layout.num_rest != 3 * (given.sh.shape[1] - 1):
+        return None
+    layout, place = unlabelled(layout), path.parent / NAME
+    if not place.is_file():
+        return layout
+    others = read_layout(place)
+    return None if others is None else with_rows(layout, others, load_removed(place)[1])
 
 
 def as_given(completed: Gaussians, path: Path) -> Gaussians:
@@ -75,9 +101,9 @@ def without_padding(completed: Gaussians) -> Gaussians:
     observed = completed[completed.generated == 0]
     generated = completed[completed.generated > 0]
     k = completed.sh.shape[1]
-    for lower in (9, 4, 1):
-        added = lower < k and (generated.sh[:, lower:k] != 0).any()
-        if not added or (observed.sh[:, lower:k] != 0).any():
+    for lower in (width for width in (9, 4, 1) if width < k):
+        padded = (generated.sh[:, lower:k] != 0).any() and not observed.sh[:, lower:k].any()
+        if not padded:
             break
         k = lower
     return replace(observed, sh=observed.sh[:, :k].contiguous())

@@ -119,7 +119,7 @@ def _rest(path: Path, table: ndarray | None, count: int) -> Float[ndarray, "n k 
     packed = np.stack([table[name] for name in wanted], axis=1) if names else np.empty((count, 0))
     values = np.clip((packed.astype(np.float32) + 0.5) / 256, 0, 1)
     values = np.where(packed == 0, 0, np.where(packed == 255, 1, values)) * 8 - 4
-    return values.reshape(count, 3, -1).transpose(0, 2, 1)
+    return values.reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
 
 
 # --------------------------------------------------------------------------------------- write

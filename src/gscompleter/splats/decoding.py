@@ -86,12 +86,12 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
         InputError: where there are none, or some hold NaN, infinity or a rotation of zeros and
             `drop_nonfinite` is off.
     """
+    if len(gaussians) == 0:
+        raise InputError(f"{path} is empty: it holds no Gaussian.")
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     good = torch.stack([torch.isfinite(f).reshape(len(f), -1).all(1) for f in fields]).all(0)
     good &= (gaussians.quats != 0).any(1)
     bad = int((~good).sum())
-    if len(gaussians) == 0:
-        raise InputError(f"{path} is empty: it holds no Gaussian.")
     if bad == 0:
         return gaussians
     if not drop_nonfinite:

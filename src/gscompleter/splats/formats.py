@@ -122,6 +122,8 @@ def format_of(path: Path) -> str:
         if (path / META).is_file():
             return "sog"
         raise InputError(f"{path} is a folder without {META}; name a file of Gaussians.")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is a device; a file of Gaussians is needed.")
     try:
         with path.open("rb") as file:
             head = file.read(HEAD)

@@ -96,6 +96,8 @@ def _header(path: Path, data: bytes) -> Header:
         raise InputError(f"{path} is no .spz: it holds something else that is compressed.")
     if version not in (2, 3, 4):
         raise InputError(f"{path} is .spz version {version}; versions 2, 3 and 4 are known.")
+    if count == 0:
+        raise InputError(f"{path} is empty: it holds no Gaussian.")
     if degree >= len(COEFFICIENTS) or bits > 24:
         raise InputError(
             f"{path} has harmonics of degree {degree} and {bits} fractional bits; a .spz of "
@@ -112,7 +114,7 @@ def _from_gzip(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
             raise damaged(path, f"version {header.version} is not packed as a whole")
         size = sum(header.sizes)
         check_growth(path, size, len(data), MOST_GROWTH)
-        body = unpacker.decompress(unpacker.unconsumed_tail, size) if size else b""
+        body = unpacker.decompress(unpacker.unconsumed_tail, size)
         more = unpacker.decompress(unpacker.unconsumed_tail, 1)  # which compares the checksum
     except zlib.error as error:
         raise damaged(path, "it cannot be unpacked") from error
@@ -163,12 +165,9 @@ def _unpacked(path: Path, data: bytes, size: int) -> bytes:
 
 def _decoded(header: Header, streams: list[bytes]) -> Gaussians:
     """The Gaussians as the file has them, in its own axes."""
-    rows = [
-        np.frombuffer(stream, np.uint8).reshape(header.count, -1) if stream else None
-        for stream in streams
-    ]
     positions, opacities, colours, scales, rotations, rest = (
-        np.zeros((header.count, 0), np.uint8) if row is None else row for row in rows
+        np.frombuffer(stream, np.uint8).reshape(header.count, len(stream) // header.count)
+        for stream in streams
     )
     colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOUR_SCALE
     higher = (rest.astype(np.float32) - 128) / 128
@@ -176,7 +175,7 @@ def _decoded(header: Header, streams: list[bytes]) -> Gaussians:
         np.ldexp(_signed(positions).astype(np.float32), -header.fractional_bits),
         _first_three(rotations) if header.version == 2 else _smallest_three(rotations),
         np.exp(scales.astype(np.float32) / 16 - 10),
-        opacities[:, 0].astype(np.float32) / 255 if header.count else np.zeros(0, np.float32),
+        opacities[:, 0].astype(np.float32) / 255,
         harmonics(colour, higher.reshape(header.count, COEFFICIENTS[header.degree], 3)),
     )
 
