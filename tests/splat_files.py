@@ -164,7 +164,11 @@ def sog_files(gaussians: Gaussians, version: int = 2) -> dict[str, bytes]:
     meta["scales"] = {"files": ["scales.webp"]}
     meta["sh0"] = {"files": ["sh0.webp"]}
     if k:
-        meta["shN"] = {"files": ["shN_centroids.webp", "shN_labels.webp"]}
+        meta["shN"] = {
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+            "bands": gaussians.sh_degree,
+            "count": n,
+        }
         palette = np.full((-(-n // 64), 64 * k, 4), 255, np.uint8)
         flat = np.rint((gaussians.sh[:, 1:].numpy() + 4) / 8 * 255).clip(0, 255)
         palette.reshape(-1, k, 4)[:n, :, :3] = flat

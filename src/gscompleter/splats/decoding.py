@@ -68,7 +68,9 @@ def gaussians_of(
 ) -> Gaussians:
     """Observed Gaussians from arrays in our conventions, as float32."""
     arrays = (means, quats, scales, opacities, sh)
-    return observed(*(torch.from_numpy(np.array(array, np.float32)) for array in arrays))
+    return observed(
+        *(torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays)
+    )
 
 
 def harmonics(

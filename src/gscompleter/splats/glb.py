@@ -68,7 +68,7 @@ def read_glb(path: Path) -> Gaussians:
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise damaged(path, f"its description cannot be understood ({error!r})") from error
+        raise damaged(path, f"its description means nothing ({str(error)[:80]!r})") from error
     if not parts:
         raise InputError(f"{path} holds no Gaussians: nothing in it uses {EXTENSION}.")
     return half_turned(merge(parts), ABOUT_Z)
@@ -159,10 +159,15 @@ def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
             f"{extension.get('kernel', 'ellipse')}, {colours}); export it as .ply."
         )
 
-    def named(name: str) -> Float[ndarray, "n k"]:
+    count = document.table["accessors"][attributes["POSITION"]]["count"]
+
+    def named(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
         if name not in attributes:
             raise InputError(f"{document.path} lacks the attribute {name} of its Gaussians.")
-        return _accessor(document, document.table["accessors"][attributes[name]])
+        accessor = document.table["accessors"][attributes[name]]
+        if (accessor["type"], accessor["count"]) != (kind, count):
+            raise damaged(document.path, f"its attribute {name} has another size than it must have")
+        return _accessor(document, accessor)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
     sh = [
@@ -172,9 +177,9 @@ def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
     ]
     return gaussians_of(
         named("POSITION"),
-        np.roll(named(f"{EXTENSION}:ROTATION"), 1, axis=1),
+        np.roll(named(f"{EXTENSION}:ROTATION", "VEC4"), 1, axis=1),
         named(f"{EXTENSION}:SCALE"),
-        named(f"{EXTENSION}:OPACITY")[:, 0],
+        named(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0],
         np.stack(sh, axis=1),
     )
 
@@ -192,6 +197,8 @@ def _accessor(document: Document, accessor: dict[str, Any]) -> Float[ndarray, "n
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     stride = int(view.get("byteStride", 0)) or width * kind.itemsize
     shape = (int(accessor["count"]), width)
+    if stride < width * kind.itemsize:
+        raise damaged(document.path, "its attributes overlap")
     # numpy refuses what lies outside of the buffer.
     values = np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
     if kind.kind == "f":

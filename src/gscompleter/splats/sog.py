@@ -147,7 +147,7 @@ def _read(parts: Parts, meta: str = META) -> Gaussians:
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise damaged(parts.path, f"its {meta} cannot be understood ({error!r})") from error
+        raise damaged(parts.path, f"its {meta} means nothing ({str(error)[:80]!r})") from error
 
 
 def _decoded(parts: Parts, table: dict[str, Any], version: int) -> Gaussians:

@@ -170,7 +170,9 @@ def _decoded(header: Header, streams: list[bytes]) -> Gaussians:
         for stream in streams
     )
     colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOUR_SCALE
-    higher = (rest.astype(np.float32) - 128) / 128
+    higher = rest.astype(np.float32)
+    higher -= 128
+    higher /= 128
     return gaussians_of(
         np.ldexp(_signed(positions).astype(np.float32), -header.fractional_bits),
         _first_three(rotations) if header.version == 2 else _smallest_three(rotations),
@@ -228,7 +230,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
         )
     )
     with replacing(path) as file:
-        file.write(gzip.compress(body, mtime=0))
+        file.write(gzip.compress(body, compresslevel=6, mtime=0))
 
 
 def _fractional_bits(path: Path, gaussians: Gaussians) -> int:
