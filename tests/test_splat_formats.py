@@ -38,8 +38,6 @@ from splat_files import (
     write_spz_4,
 )
 
-pytest.importorskip("zstandard", reason="needs zstandard, for .spz version 4")
-
 CPU = load_renderer("cpu")
 WRITTEN = ("scene.ply", "scene.compressed.ply", "scene.spz", "scene.splat")
 FORMATS_BUT_PLY = (
@@ -323,6 +321,7 @@ def test_what_is_no_splat_is_refused(tmp_path):
         ("e.spz", b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0), "version 9"),
         ("f.glb", b"glTF" + bytes(8), "no description"),
         ("g.json", b'{"frames": []}', "no .sog"),
+        ("g.gltf", b'{"asset": {}}', "no .sog"),
         ("h.ksplat", b"\x00\x07" + bytes(4094), "is empty"),
         ("i.ksplat", b"\x09" + bytes(4095), "no .ksplat that is known"),
     ]:

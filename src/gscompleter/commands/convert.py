@@ -29,7 +29,7 @@ class ConvertOptions:
 
 
 def run_convert(options: ConvertOptions) -> None:
-    """Read A, write B, and say what was lost on the way.
+    """Read A, write B, and say how much that is.
 
     Raises:
         InputError: where A cannot be read, or B cannot be written or is there already.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -79,12 +79,8 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         return load_ply(path, drop_nonfinite)
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
         gaussians = format_.read(path)
-    return whole(_labelled(gaussians, path), path, drop_nonfinite)
-
-
-def _labelled(gaussians: Gaussians, path: Path) -> Gaussians:
-    gaussians.generated.copy_(load_labels(path, len(gaussians)))
-    return gaussians
+    labelled = replace(gaussians, generated=load_labels(path, len(gaussians)))
+    return whole(labelled, path, drop_nonfinite)
 
 
 def save_splat(path: Path | str, gaussians: Gaussians) -> None:

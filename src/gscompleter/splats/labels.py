@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Int64, UInt8
+from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.errors import InputError
@@ -69,8 +70,8 @@ def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
     return torch.from_numpy(np.repeat(runs[:, 0].astype(np.uint8), runs[:, 1]))
 
 
-def _covers(runs: np.ndarray, count: int) -> bool:
-    """Whether the runs [m, 2] are labels of exactly `count` Gaussians."""
+def _covers(runs: Int64[ndarray, "m 2"], count: int) -> bool:
+    """Whether the runs are the labels of exactly `count` Gaussians."""
     in_range = ((runs >= 0) & (runs <= [255, count])).all()
     return bool(in_range) and sum(runs[:, 1].tolist()) == count
 

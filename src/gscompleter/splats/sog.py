@@ -93,10 +93,11 @@ def read_sog(path: Path) -> Gaussians:
     """
     if path.is_dir():
         return _read(Parts(path, lambda name: content(path / name)))
-    if path.suffix == ".json":
+    data = content(path)
+    if not data.startswith(ZIP):
         return _read(Parts(path, lambda name: content(path.parent / name)), path.name)
     try:
-        with zipfile.ZipFile(io.BytesIO(content(path))) as bundle:
+        with zipfile.ZipFile(io.BytesIO(data)) as bundle:
             return _read(Parts(path, lambda name: _entry(path, bundle, name)))
     except InputError:
         raise

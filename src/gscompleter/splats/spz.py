@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from gscompleter.errors import InputError
@@ -182,19 +182,19 @@ def _decoded(header: Header, streams: list[bytes]) -> Gaussians:
     )
 
 
-def _signed(positions: ndarray) -> Int[ndarray, "n 3"]:
+def _signed(positions: UInt8[ndarray, "n 9"]) -> Int[ndarray, "n 3"]:
     """Three signed numbers of 24 bits in each row of 9 bytes."""
     a, b, c = np.moveaxis(positions.reshape(-1, 3, 3).astype(np.int32), 2, 0)
     return ((a | (b << 8) | (c << 16)) ^ (1 << 23)) - (1 << 23)
 
 
-def _first_three(rotations: ndarray) -> Float[ndarray, "n 4"]:
+def _first_three(rotations: UInt8[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
     xyz = rotations.astype(np.float32) / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(1, keepdims=True)))
     return np.concatenate([w, xyz], axis=1)
 
 
-def _smallest_three(rotations: ndarray) -> Float[ndarray, "n 4"]:
+def _smallest_three(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     """Sign and 9 bits for each of three components of xyzw, the number of the fourth on top."""
     packed = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     fields = np.stack([packed >> np.uint32(shift) for shift in (20, 10, 0)], axis=1)
