@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gscompleter.io.ply import load_ply, save_ply
     from gscompleter.reconstructors import load_reconstructor
     from gscompleter.render import load_renderer
+    from gscompleter.splats import load_splat, save_splat
     from gscompleter.types import Camera, Completion, Gaussians, Render, View, merge
 
 # Where each public name lives. They are imported on first use, so that `import gscompleter` and
@@ -33,6 +34,8 @@ _HOMES = {
     "load_views": "data.scene",
     "load_reconstructor": "reconstructors",
     "load_renderer": "render",
+    "load_splat": "splats",
+    "save_splat": "splats",
     "Camera": "types",
     "Completion": "types",
     "Gaussians": "types",
@@ -57,9 +60,11 @@ __all__ = [
     "load_ply",
     "load_reconstructor",
     "load_renderer",
+    "load_splat",
     "load_views",
     "merge",
     "save_ply",
+    "save_splat",
 ]
 
 

@@ -16,6 +16,7 @@ import tyro
 from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
 from gscompleter import __version__
+from gscompleter.commands.convert import ConvertOptions
 from gscompleter.commands.generator_options import generator_flags
 from gscompleter.commands.options import (
     CompleteOptions,
@@ -25,6 +26,7 @@ from gscompleter.commands.options import (
     ModelsOptions,
     TablesOptions,
 )
+from gscompleter.commands.strip import StripOptions
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError, quoted
@@ -39,6 +41,8 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "tables": (TablesOptions, "gscompleter.commands.evaluate", "run_tables"),
     "index": (IndexOptions, "gscompleter.commands.evaluate", "run_index"),
     "models": (ModelsOptions, "gscompleter.commands.models", "run_models"),
+    "convert": (ConvertOptions, "gscompleter.commands.convert", "run_convert"),
+    "strip": (StripOptions, "gscompleter.commands.strip", "run_strip"),
 }
 
 Command: Any = Union[  # noqa: UP007  (of as many as there are)

@@ -1,0 +1,57 @@
+"""The command `convert`: the same Gaussians in another format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from gscompleter.config.settings import Settings
+from gscompleter.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions(Settings):
+    """Write a scene of Gaussians in another format: by its name .ply, .compressed.ply, .spz or
+    .splat. Read are these, .ksplat, .sog (a bundle or its folder) and .glb."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
+    """The file to read, or the folder of a .sog."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
+    """The file to write."""
+    drop_nonfinite: bool = False
+    """Leave out Gaussians that hold NaN or infinity."""
+    overwrite: bool = False
+    """Replace the file where there is one."""
+    quiet: bool = False
+    """Say nothing but errors."""
+
+
+def run_convert(options: ConvertOptions) -> None:
+    """Read A, write B, and say how much that is.
+
+    Raises:
+        InputError: where A cannot be read, or B cannot be written or is there already.
+    """
+    # Here, so that `--help` does not wait for torch.
+    from gscompleter.splats.formats import load_splat, save_splat, writable_format
+
+    writable_format(options.out)
+    check_free(options.out, options.overwrite)
+    gaussians = load_splat(options.source, options.drop_nonfinite)
+    save_splat(options.out, gaussians)
+    if not options.quiet:
+        generated = int((gaussians.generated > 0).sum())
+        print(f"{len(gaussians):,} Gaussians, {generated:,} of them generated: {options.out}")
+
+
+def check_free(path: Path, overwrite: bool) -> None:
+    """Refuse to replace a file unasked.
+
+    Raises:
+        InputError: where `path` is there and `overwrite` is off.
+    """
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} is there already; name another file, or use --overwrite.")

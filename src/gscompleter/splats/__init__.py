@@ -1,0 +1,7 @@
+"""Scenes of Gaussians in the formats that people hold, one file for each of them."""
+
+from __future__ import annotations
+
+from gscompleter.splats.formats import FORMATS as FORMATS
+from gscompleter.splats.formats import load_splat as load_splat
+from gscompleter.splats.formats import save_splat as save_splat

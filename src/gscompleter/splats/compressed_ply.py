@@ -1,0 +1,221 @@
+"""The compressed .ply of SuperSplat: 16 bytes for each Gaussian, and one for each harmonic.
+
+256 Gaussians are a chunk, which holds the bounds of its positions, log-scales and colours; within
+them a Gaussian has 11, 10 and 11 bits of position and of scale, 8 bits for each channel and its
+opacity, and a rotation in 2 + 3 x 10 bits. Harmonics lie in an element of their own, as bytes over
+[-4, 4].
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8, UInt32
+from numpy import ndarray
+
+from gscompleter.io.files import replacing
+from gscompleter.io.ply import Element, encode, read_header
+from gscompleter.splats.decoding import check_size, damaged, gaussians_of, harmonics
+from gscompleter.splats.packing import fraction, quantized, with_largest, without_largest
+from gscompleter.types import SH_C0, Gaussians
+
+CHUNK = 256
+AXES, CHANNELS = ("x", "y", "z"), ("r", "g", "b")
+BOUNDS = (
+    *(f"{end}_{axis}" for end in ("min", "max") for axis in AXES),
+    *(f"{end}_scale_{axis}" for end in ("min", "max") for axis in AXES),
+    *(f"{end}_{channel}" for end in ("min", "max") for channel in CHANNELS),
+)
+"""What a chunk holds. Early files have no bounds of colours, which then are those of [0, 1]."""
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+NUM_REST = (0, 9, 24, 45)
+WIDEST_LOG_SCALE = 20.0
+"""Log-scales beyond it are written as this one, as other writers do."""
+
+
+def read_compressed_ply(path: Path) -> Gaussians:
+    """The Gaussians of a compressed .ply, of SH degree 0 to 3.
+
+    Raises:
+        InputError: where it cannot be read, is truncated, or contradicts itself.
+    """
+    tables = _tables(path)
+    if not {"chunk", "vertex"} <= tables.keys():
+        raise damaged(path, "it has no chunks or no vertices")
+    chunk, vertex = tables["chunk"], tables["vertex"]
+    bounds = chunk.dtype.names or ()
+    missing = [name for name in PACKED if name not in (vertex.dtype.names or ())]
+    missing += [name for name in BOUNDS[:12] if name not in bounds]
+    if missing or len(chunk) * CHUNK < len(vertex):
+        raise damaged(path, f"it lacks {', '.join(missing) or 'chunks for some of its vertices'}")
+    position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in PACKED)
+    means = _within(chunk, "", AXES, _fractions_of_three(position))
+    scales = np.exp(_within(chunk, "scale_", AXES, _fractions_of_three(scale)))
+    rgba = np.stack([fraction(color, shift, 8) for shift in (24, 16, 8, 0)], axis=1)
+    has_colours = set(BOUNDS) <= set(bounds)
+    rgb = _within(chunk, "", CHANNELS, rgba[:, :3]) if has_colours else rgba[:, :3]
+    rest = _rest(path, tables.get("sh"), len(vertex))
+    return gaussians_of(means, _quats(rotation), scales, rgba[:, 3], harmonics(rgb, rest))
+
+
+def _tables(path: Path) -> dict[str, ndarray]:
+    """The elements of a binary little-endian .ply of plain properties, by name."""
+    with path.open("rb") as file:
+        file_format, elements = read_header(file, path)
+        data = file.read()
+    if file_format != "binary_little_endian":
+        raise damaged(path, f"a compressed .ply is binary_little_endian, not {file_format}")
+    tables, start = {}, 0
+    for element in elements:
+        row = _row(path, element)
+        check_size(path, len(data), start + element.count * row.itemsize)
+        # An element without properties takes no bytes, whatever it says it counts.
+        count = element.count if row.itemsize else 0
+        tables[element.name] = np.frombuffer(data, row, count, start) if count else np.empty(0, row)
+        start += count * row.itemsize
+    return tables
+
+
+def _row(path: Path, element: Element) -> np.dtype:
+    names = [p.name for p in element.properties]
+    if element.has_lists or len(set(names)) < len(names):
+        raise damaged(path, f"its element {element.name!r} holds lists or a name twice")
+    return element.dtype("<")
+
+
+def _fractions_of_three(packed: UInt32[ndarray, "n"]) -> Float[ndarray, "n 3"]:
+    return np.stack(
+        [fraction(packed, 21, 11), fraction(packed, 11, 10), fraction(packed, 0, 11)], axis=1
+    )
+
+
+def _within(
+    chunk: ndarray, kind: str, axes: tuple[str, ...], fractions: Float[ndarray, "n 3"]
+) -> Float[ndarray, "n 3"]:
+    """Fractions of the bounds that the chunk of each Gaussian has, `kind` "" or "scale_"."""
+    of_chunk = np.arange(len(fractions)) // CHUNK
+    low = np.stack([chunk[f"min_{kind}{axis}"] for axis in axes], axis=1)[of_chunk]
+    high = np.stack([chunk[f"max_{kind}{axis}"] for axis in axes], axis=1)[of_chunk]
+    return low * (1 - fractions) + high * fractions
+
+
+def _quats(packed: UInt32[ndarray, "n"]) -> Float[ndarray, "n 4"]:
+    smaller = np.stack([fraction(packed, shift, 10) for shift in (20, 10, 0)], axis=1)
+    return with_largest(packed >> np.uint32(30), (smaller - 0.5) * np.float32(np.sqrt(2)))
+
+
+def _rest(path: Path, table: ndarray | None, count: int) -> Float[ndarray, "n k 3"] | None:
+    """Harmonics of degree 1 and above, from the middle of what each byte stands for."""
+    if table is None:
+        return None
+    names = table.dtype.names or ()
+    wanted = tuple(f"f_rest_{i}" for i in range(len(names)))
+    if len(table) != count or len(names) not in NUM_REST or set(names) != set(wanted):
+        raise damaged(path, "its harmonics are not those of degree 0 to 3")
+    if any(table.dtype[name] != np.uint8 for name in names):
+        raise damaged(path, "its harmonics are no bytes")
+    packed = np.stack([table[name] for name in wanted], axis=1) if names else np.empty((count, 0))
+    values = np.clip((packed.astype(np.float32) + 0.5) / 256, 0, 1)
+    values = np.where(packed == 0, 0, np.where(packed == 255, 1, values)) * 8 - 4
+    return values.reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
+
+
+# --------------------------------------------------------------------------------------- write
+
+
+def near_together(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians along a Morton curve, so that those of a chunk lie close to each other."""
+    means = gaussians.means.double().numpy()
+    low, high = means.min(0), means.max(0)
+    extent = np.maximum(high - low, np.finfo(np.float64).tiny)
+    cells = ((means - low) / extent * (2**21 - 1)).astype(np.uint64)
+    code = np.zeros(len(cells), np.uint64)
+    for bit in range(21):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return gaussians[torch.from_numpy(code.argsort(kind="stable"))]
+
+
+def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write a compressed .ply of the Gaussians in their order (see `near_together`).
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    encoded = encode(gaussians).numpy()
+    log_scales = np.clip(encoded[:, :3], -WIDEST_LOG_SCALE, WIDEST_LOG_SCALE)
+    rgb = 0.5 + SH_C0 * gaussians.sh[:, 0].numpy()
+    columns, fractions = [], []
+    for values in (gaussians.means.numpy(), log_scales, rgb):
+        low, high = _bounds(values)
+        columns += [low, high]
+        fractions.append(_fractions_within(values, low, high))
+    position, scale, color = fractions
+    packed = np.stack(
+        [
+            _packed_three(position),
+            _packed_quats(gaussians.quats.numpy()),
+            _packed_three(scale),
+            _packed_rgba(np.concatenate([color, gaussians.opacities.numpy()[:, None]], axis=1)),
+        ],
+        axis=1,
+    )
+    rest = _packed_rest(gaussians)
+    with replacing(path) as file:
+        file.write(_header(len(gaussians), len(columns[0]), rest.shape[1]))
+        file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
+        file.write(packed.astype("<u4").tobytes())
+        file.write(rest.tobytes())
+
+
+def _bounds(values: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, "c 3"], Float[ndarray, "c 3"]]:
+    starts = np.arange(0, len(values), CHUNK)
+    return np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+
+
+def _fractions_within(
+    values: Float[ndarray, "n 3"], low: Float[ndarray, "c 3"], high: Float[ndarray, "c 3"]
+) -> Float[ndarray, "n 3"]:
+    of_chunk = np.arange(len(values)) // CHUNK
+    extent = np.where(high > low, high - low, 1)
+    return (values - low[of_chunk]) / extent[of_chunk]
+
+
+def _packed_three(fractions: Float[ndarray, "n 3"]) -> UInt32[ndarray, "n"]:
+    a, b, c = (quantized(fractions[:, i], bits) for i, bits in enumerate((11, 10, 11)))
+    return (a << np.uint32(21)) | (b << np.uint32(11)) | c
+
+
+def _packed_quats(quats: Float[ndarray, "n 4"]) -> UInt32[ndarray, "n"]:
+    largest, smaller = without_largest(quats)
+    a, b, c = quantized(smaller / np.sqrt(2) + 0.5, 10).T
+    head = largest.astype(np.uint32) << np.uint32(30)
+    return head | (a << np.uint32(20)) | (b << np.uint32(10)) | c
+
+
+def _packed_rgba(fractions: Float[ndarray, "n 4"]) -> UInt32[ndarray, "n"]:
+    r, g, b, a = quantized(fractions, 8).T
+    return (r << np.uint32(24)) | (g << np.uint32(16)) | (b << np.uint32(8)) | a
+
+
+def _packed_rest(gaussians: Gaussians) -> UInt8[ndarray, "n m"]:
+    """Harmonics of degree 1 and above in bytes, all of red, then green, then blue."""
+    rest = gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), -1).numpy()
+    return np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
+
+
+def _header(count: int, chunks: int, num_rest: int) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
+    lines += [f"property float {name}" for name in BOUNDS]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
+    if num_rest:
+        lines += [f"element sh {count}"]
+        lines += [f"property uchar f_rest_{i}" for i in range(num_rest)]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def is_compressed(head: bytes) -> bool:
+    """Whether a file that begins with `head` is a compressed .ply."""
+    return head.startswith(b"ply") and b"packed_position" in head

@@ -1,0 +1,167 @@
+"""The table of formats: a file is known by how it begins, and written by how its name ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gscompleter.errors import InputError
+from gscompleter.io.ply import load_ply, save_ply
+from gscompleter.splats.compressed_ply import (
+    is_compressed,
+    near_together,
+    read_compressed_ply,
+    write_compressed_ply,
+)
+from gscompleter.splats.decoding import whole
+from gscompleter.splats.glb import is_glb, read_glb
+from gscompleter.splats.ksplat import read_ksplat
+from gscompleter.splats.labels import load_labels, save_labels
+from gscompleter.splats.sog import META, is_sog, read_sog
+from gscompleter.splats.splat import read_splat, write_splat
+from gscompleter.splats.spz import is_spz, read_spz, write_spz
+from gscompleter.types import Gaussians
+
+HEAD = 8192
+"""Bytes that tell what a file is: the header of a compressed .ply fits."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """How one kind of file is known, read and written."""
+
+    extensions: tuple[str, ...]
+    begins: Callable[[bytes], bool] | None
+    """Whether a file with these first bytes is one; None where nothing but the name tells."""
+    read: Callable[[Path], Gaussians]
+    write: Callable[[Path, Gaussians], None] | None = None
+    arrange: Callable[[Gaussians], Gaussians] | None = None
+    """The order that files of this kind hold their Gaussians in; None keeps the given one."""
+
+
+FORMATS = {
+    "compressed-ply": Format(
+        (".compressed.ply",),
+        is_compressed,
+        read_compressed_ply,
+        write_compressed_ply,
+        near_together,
+    ),
+    "ply": Format((".ply",), lambda head: head.startswith(b"ply"), load_ply, save_ply),
+    "spz": Format((".spz",), is_spz, read_spz, write_spz),
+    "sog": Format((".sog", META), is_sog, read_sog),
+    "glb": Format((".glb",), is_glb, read_glb),
+    "splat": Format((".splat",), None, read_splat, write_splat),
+    "ksplat": Format((".ksplat",), None, read_ksplat),
+}
+"""By name, in the order in which a file is tried."""
+
+
+def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
+    """The Gaussians of a file of any format of `FORMATS`, in the axes of a 3DGS .ply.
+
+    What was generated is known from a .ply itself, of other formats from the labels beside them.
+
+    Args:
+        path: The file, or the folder of a .sog.
+        drop_nonfinite: Leave out Gaussians that hold NaN or infinity, or a rotation of zeros,
+            instead of refusing the file.
+
+    Raises:
+        InputError: no such file, of no format that is known, truncated, damaged or empty.
+    """
+    path = Path(path)
+    format_ = FORMATS[format_of(path)]
+    if format_.read is load_ply:
+        return load_ply(path, drop_nonfinite)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
+        gaussians = format_.read(path)
+    labelled = replace(gaussians, generated=load_labels(path, len(gaussians)))
+    return whole(labelled, path, drop_nonfinite)
+
+
+def save_splat(path: Path | str, gaussians: Gaussians) -> None:
+    """Write Gaussians in the format that the end of the name asks for.
+
+    A .ply holds everything. The others round, and what was generated goes into a file beside
+    them, `NAME.generated.json`.
+
+    Raises:
+        InputError: where the format is unknown or only read, there is nothing to write, or the
+            file cannot be written.
+    """
+    path = Path(path)
+    format_ = writable_format(path)
+    if len(gaussians) == 0:
+        raise InputError(f"There is no Gaussian to write to {path}.")
+    if format_.write is save_ply:
+        save_ply(path, gaussians)
+        return
+    assert format_.write is not None
+    gaussians = whole(gaussians.to("cpu"), path, drop_nonfinite=False)
+    if format_.arrange is not None:
+        gaussians = format_.arrange(gaussians)
+    format_.write(path, gaussians)
+    save_labels(path, gaussians.generated)
+
+
+def format_of(path: Path) -> str:
+    """The name of the format of what lies at `path`.
+
+    Raises:
+        InputError: where nothing lies there, or it is of no format that is known.
+    """
+    if path.is_dir():
+        if (path / META).is_file():
+            return "sog"
+        raise InputError(f"{path} is a folder without {META}; name a file of Gaussians.")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is a device; a file of Gaussians is needed.")
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD)
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror}.") from error
+    if head.startswith(b"version https://git-lfs"):
+        raise InputError(
+            f"{path} is a git-lfs pointer, not the scene itself; run `git lfs pull` in its "
+            "repository to fetch it."
+        )
+    if not head:
+        raise InputError(f"{path} is empty; a file of Gaussians is needed.")
+    for name, format_ in FORMATS.items():
+        if format_.begins is not None and format_.begins(head):
+            return name
+    named = _by_name(path)
+    if named is None or FORMATS[named].begins is not None:
+        raise InputError(f"{path} holds no Gaussians in a format that is known: {_known()}.")
+    return named
+
+
+def writable_format(path: Path) -> Format:
+    """The format that `path` would be written in.
+
+    Raises:
+        InputError: where there is none, or it is only read.
+    """
+    name = _by_name(path)
+    if name is None or FORMATS[name].write is None:
+        raise InputError(
+            f"{path} cannot be written in the format its name asks for; name it "
+            f"{', '.join(f.extensions[0] for f in FORMATS.values() if f.write)}."
+        )
+    return FORMATS[name]
+
+
+def _by_name(path: Path) -> str | None:
+    for name, format_ in FORMATS.items():
+        if path.name.lower().endswith(format_.extensions):
+            return name
+    return None
+
+
+def _known() -> str:
+    return ", ".join(f"*{extension}" for f in FORMATS.values() for extension in f.extensions)

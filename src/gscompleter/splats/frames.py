@@ -1,0 +1,91 @@
+"""The same Gaussians in another frame, view-dependent colours included.
+
+A 3DGS .ply, and all formats but two, are read in the frame they were written in. SPZ is x right,
+y up, z back where a .ply is x right, y down, z forward: a half turn about x. glTF is x left, y up,
+z forward: a half turn about z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.render.spherical_harmonics import sh_basis
+from gscompleter.types import Gaussians
+
+ABOUT_X = (1.0, -1.0, -1.0)
+"""Signs of the axes after half a turn about x."""
+ABOUT_Z = (-1.0, -1.0, 1.0)
+"""Signs of the axes after half a turn about z."""
+
+
+def half_turned(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
+    """The Gaussians after half a turn about an axis. Exact: only signs change."""
+    flip = torch.tensor(signs)
+    return replace(
+        gaussians,
+        means=gaussians.means * flip,
+        quats=gaussians.quats * torch.tensor((1.0, *signs)),
+        sh=gaussians.sh * _signs_of_harmonics(signs, gaussians.sh.shape[1])[:, None],
+    )
+
+
+def _signs_of_harmonics(signs: tuple[float, float, float], k: int) -> Float[Tensor, "k"]:
+    """Every basis function is even or odd under half a turn about an axis."""
+    direction = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.7]]), dim=1)
+    return (sh_basis(direction * torch.tensor(signs), k) / sh_basis(direction, k))[0].round()
+
+
+def moved(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:
+    """The Gaussians after a rotation, a uniform scale and a shift: `x' = s R x + t`."""
+    scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
+    rotation = similarity[:3, :3] / scale
+    return replace(
+        gaussians,
+        means=gaussians.means @ similarity[:3, :3].T + similarity[:3, 3],
+        quats=_product(_quaternion(rotation), gaussians.quats),
+        scales=gaussians.scales * scale,
+        sh=_turned_harmonics(gaussians.sh, rotation),
+        encoded=None,
+    )
+
+
+def _turned_harmonics(
+    sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n k 3"]:
+    """Harmonics that show along `R d` what `sh` shows along d, by least squares."""
+    k = sh.shape[1]
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(
+        torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1
+    )
+    before = sh_basis(directions, k)
+    after = sh_basis(directions @ rotation.double().T, k)
+    return torch.einsum("ij,njc->nic", torch.linalg.lstsq(after, before).solution.to(sh), sh)
+
+
+def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
+    """wxyz of a rotation: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.double().tolist()
+    matrix = torch.tensor(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ],
+        dtype=torch.float64,
+    )
+    return torch.linalg.eigh(matrix).eigenvectors[:, -1].to(rotation.dtype)
+
+
+def _product(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+    """Hamilton product of wxyz quaternions: first the turns `b`, then the turn `a`."""
+    vector = (
+        a[0] * b[:, 1:] + b[:, :1] * a[1:] + torch.linalg.cross(a[1:].expand(len(b), 3), b[:, 1:])
+    )
+    scalar = a[0] * b[:, :1] - b[:, 1:] @ a[1:, None]
+    return torch.cat([scalar, vector], dim=1)

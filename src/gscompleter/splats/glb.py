@@ -1,0 +1,209 @@
+"""Gaussians in binary glTF (.glb) with the extension KHR_gaussian_splatting, read only.
+
+A primitive of points has an attribute for each property: linear scales, opacities in [0, 1],
+rotations as xyzw, and a harmonic of three channels in each `SH_DEGREE_d_COEF_i`. Nodes place it in
+the scene. Axes are x left, y up, z forward.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.splats.decoding import check_size, content, damaged, gaussians_of
+from gscompleter.splats.frames import ABOUT_Z, half_turned, moved
+from gscompleter.types import Gaussians, merge
+
+MAGIC = b"glTF"
+CHUNK = struct.Struct("<II")
+JSON, BINARY = 0x4E4F534A, 0x004E4942
+EXTENSION = "KHR_gaussian_splatting"
+COLOURS = "srgb_rec709_display"
+"""The space of colours that all trainers of splats work in."""
+KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+"""numpy's names of the component types."""
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+FEWEST_BYTES = 8
+"""Every Gaussian takes more than so many; fewer would mean that a scene repeats itself."""
+DEEPEST = 100
+"""Nodes below one another. A tree has an end, a circle has not."""
+
+
+@dataclass(frozen=True)
+class Document:
+    """The two parts of a .glb."""
+
+    path: Path
+    table: dict[str, Any]
+    binary: bytes
+
+
+def is_glb(head: bytes) -> bool:
+    """Whether a file that begins with `head` is binary glTF."""
+    return head.startswith(MAGIC)
+
+
+def read_glb(path: Path) -> Gaussians:
+    """All Gaussians of the scene in a .glb, in the axes of a .ply.
+
+    Raises:
+        InputError: where it cannot be read, holds no Gaussians, or holds them in another way.
+    """
+    document = _document(path, content(path))
+    try:
+        placed = list(_placed_primitives(document))
+        _check_repeats(document, [primitive for primitive, _ in placed])
+        parts = [moved(_decoded(document, primitive), place) for primitive, place in placed]
+    except InputError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise damaged(path, f"its description means nothing ({str(error)[:80]!r})") from error
+    if not parts:
+        raise InputError(f"{path} holds no Gaussians: nothing in it uses {EXTENSION}.")
+    return half_turned(merge(parts), ABOUT_Z)
+
+
+def _document(path: Path, data: bytes) -> Document:
+    chunks: dict[int, bytes] = {}
+    start = 12
+    while start + CHUNK.size <= len(data):
+        size, kind = CHUNK.unpack_from(data, start)
+        start += CHUNK.size
+        check_size(path, len(data), start + size)
+        chunks.setdefault(kind, data[start : start + size])
+        start += size
+    try:
+        table = json.loads(chunks[JSON])
+    except (KeyError, ValueError, RecursionError) as error:
+        raise damaged(path, "it has no description") from error
+    if not isinstance(table, dict):
+        raise damaged(path, "its description is no table")
+    return Document(path, table, chunks.get(BINARY, b""))
+
+
+def _placed_primitives(
+    document: Document,
+) -> Iterator[tuple[dict[str, Any], Float[Tensor, "4 4"]]]:
+    """The primitives of Gaussians in the scene, each with its transform into the scene."""
+    table = document.table
+    scenes = table.get("scenes")
+    roots = scenes[table.get("scene", 0)]["nodes"] if scenes else range(len(table["nodes"]))
+    waiting = [(index, torch.eye(4, dtype=torch.float64), 0) for index in roots]
+    while waiting:
+        index, above, depth = waiting.pop(0)
+        if depth > DEEPEST or len(waiting) > len(table["nodes"]):
+            raise damaged(document.path, "its nodes contain each other")
+        node = table["nodes"][index]
+        place = above @ _place(document, node)
+        waiting += [(child, place, depth + 1) for child in node.get("children", ())]
+        if "mesh" in node:
+            for primitive in table["meshes"][node["mesh"]]["primitives"]:
+                if EXTENSION in primitive.get("extensions", {}):
+                    yield primitive, place.float()
+
+
+def _place(document: Document, node: dict[str, Any]) -> Float[Tensor, "4 4"]:
+    """The transform of a node: a rotation, a uniform scale and a shift."""
+    if "matrix" in node:
+        place = torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
+    else:
+        x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
+        place = torch.eye(4, dtype=torch.float64)
+        place[:3, :3] = torch.tensor(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
+        place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
+    linear = place[:3, :3]
+    volume = float(torch.linalg.det(linear))
+    shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
+    if not volume > 0 or not torch.allclose(shape, torch.eye(3).double(), atol=1e-3):
+        raise InputError(
+            f"{document.path} mirrors or stretches its Gaussians unevenly by a node; apply the "
+            "transform in the program that wrote it."
+        )
+    return place
+
+
+def _check_repeats(document: Document, primitives: list[dict[str, Any]]) -> None:
+    accessors = [
+        document.table["accessors"][primitive["attributes"]["POSITION"]] for primitive in primitives
+    ]
+    if sum(int(a["count"]) for a in accessors) * FEWEST_BYTES > len(document.binary):
+        raise damaged(document.path, "it says that it holds more Gaussians than have room in it")
+
+
+def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
+    """The Gaussians of a primitive, where its node finds them."""
+    extension, attributes = primitive["extensions"][EXTENSION], primitive["attributes"]
+    packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
+    colours = extension.get("colorSpace", COLOURS)
+    if packed != EXTENSION or extension.get("kernel", "ellipse") != "ellipse" or colours != COLOURS:
+        raise InputError(
+            f"{document.path} holds Gaussians in a way that is not known ({packed}, "
+            f"{extension.get('kernel', 'ellipse')}, {colours}); export it as .ply."
+        )
+
+    count = document.table["accessors"][attributes["POSITION"]]["count"]
+
+    def named(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
+        if name not in attributes:
+            raise InputError(f"{document.path} lacks the attribute {name} of its Gaussians.")
+        accessor = document.table["accessors"][attributes[name]]
+        if (accessor["type"], accessor["count"]) != (kind, count):
+            raise damaged(document.path, f"its attribute {name} has another size than it must have")
+        return _accessor(document, accessor)
+
+    degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
+    sh = [
+        named(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}")
+        for d in range(degree + 1)
+        for i in range(2 * d + 1)
+    ]
+    return gaussians_of(
+        named("POSITION"),
+        np.roll(named(f"{EXTENSION}:ROTATION", "VEC4"), 1, axis=1),
+        named(f"{EXTENSION}:SCALE"),
+        named(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0],
+        np.stack(sh, axis=1),
+    )
+
+
+def _accessor(document: Document, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
+    """The numbers that an accessor finds in the binary part; whole ones stand for fractions."""
+    if "sparse" in accessor or "bufferView" not in accessor:
+        raise InputError(f"{document.path} holds sparse attributes; export it as .ply.")
+    view = document.table["bufferViews"][accessor["bufferView"]]
+    if view.get("buffer") != 0 or view.get("extensions"):
+        raise InputError(
+            f"{document.path} holds its Gaussians compressed or in another file; export it as .ply."
+        )
+    kind, width = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]]
+    start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
+    stride = int(view.get("byteStride", 0)) or width * kind.itemsize
+    shape = (int(accessor["count"]), width)
+    if stride < width * kind.itemsize:
+        raise damaged(document.path, "its attributes overlap")
+    # numpy refuses what lies outside of the buffer.
+    values = np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
+    if kind.kind == "f":
+        return values.astype(np.float32)
+    if not accessor.get("normalized") and width != 3:
+        raise damaged(document.path, "its rotations or opacities are no fractions")
+    largest = np.iinfo(kind).max if accessor.get("normalized") else 1
+    return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)

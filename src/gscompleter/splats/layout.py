@@ -1,0 +1,172 @@
+"""A .ply as its program wrote it: header, columns of its own and order of properties kept.
+
+A scene that was given is completed in its own file: its rows stay byte for byte, `uchar generated`
+stands behind them, rows are appended. Taking these out again leaves the file that was given.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from numpy import ndarray
+from torch import Tensor
+
+from gscompleter.io.files import replacing
+from gscompleter.io.ply import Element, load_ply, read_header, save_ply
+from gscompleter.types import Gaussians
+
+LABEL = "generated"
+_COUNT = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
+_LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A binary .ply whose first element are Gaussians."""
+
+    header: bytes
+    """As far as and with `end_header`."""
+    byte_order: str
+    """"<" or ">"."""
+    vertex: Element
+    rows: ndarray
+    """One structured row for each Gaussian, [n]."""
+    behind: bytes
+    """Everything after the last row."""
+
+    @property
+    def is_labelled(self) -> bool:
+        return LABEL in (self.rows.dtype.names or ())
+
+    @property
+    def num_rest(self) -> int:
+        """Properties for harmonics of degree 1 and above."""
+        return sum(name.startswith("f_rest_") for name in self.rows.dtype.names or ())
+
+
+def read_layout(path: Path) -> Layout | None:
+    """A file that `load_ply` reads, as it is; None where it is ASCII or begins with another table.
+
+    Raises:
+        InputError: where its header is broken.
+    """
+    with path.open("rb") as file:
+        file_format, (vertex, *_) = read_header(file, path)
+        if file_format == "ascii" or vertex.name != "vertex":
+            return None
+        size = file.tell()
+        file.seek(0)
+        header = file.read(size)
+        byte_order = "<" if file_format == "binary_little_endian" else ">"
+        rows = np.fromfile(file, vertex.dtype(byte_order), vertex.count)
+        return Layout(header, byte_order, vertex, rows, file.read())
+
+
+def write_layout(path: Path, layout: Layout) -> None:
+    """Write the file, its header with the count of the rows that are there.
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    count = str(len(layout.rows)).encode()
+    with replacing(path) as file:
+        file.write(_COUNT.sub(rb"\g<1>" + count, layout.header, count=1))
+        file.write(layout.rows.tobytes())
+        file.write(layout.behind)
+
+
+def unlabelled(layout: Layout) -> Layout:
+    """What was not generated, without the column that says so."""
+    if not layout.is_labelled:
+        return layout
+    kept = [p for p in layout.vertex.properties if p.name != LABEL]
+    vertex = Element("vertex", 0, kept)
+    rows = _filled(layout.rows[layout.rows[LABEL] == 0], vertex.dtype(layout.byte_order))
+    return replace(layout, header=_LABEL_LINE.sub(b"", layout.header), vertex=vertex, rows=rows)
+
+
+def with_rows(layout: Layout, others: Layout, places: Int[Tensor, "m"]) -> Layout | None:
+    """The rows of `others` put in, so that they get the numbers `places`.
+
+    None where theirs have other columns.
+    """
+    if others.rows.dtype != layout.rows.dtype:
+        return None
+    total = len(layout.rows) + len(others.rows)
+    taken = np.zeros(total, bool)
+    taken[places.numpy()] = True
+    rows = np.empty(total, layout.rows.dtype)
+    rows[taken], rows[~taken] = others.rows, layout.rows
+    return replace(layout, rows=rows)
+
+
+def save_like(path: Path, scene: Gaussians, given: Path) -> None:
+    """Write a completed scene as the file of its context, labelled and longer.
+
+    Where that file has no rows to keep (it is ASCII, has labels itself, fewer harmonics than the
+    scene, or is not what the scene begins with) the scene is written in our layout.
+
+    Args:
+        path: The file.
+        scene: The Gaussians of `given` in their order, and others behind them.
+        given: The file that the context was read from.
+
+    Raises:
+        InputError: where `given` cannot be read or the file cannot be written.
+    """
+    scene = scene.to("cpu")
+    layout = read_layout(given) if given.name.lower().endswith(".ply") else None
+    if layout is None or layout.is_labelled or not _begins_with(scene, given):
+        save_ply(path, scene, provenance=True)
+        return
+    rows = np.zeros(len(scene), [*layout.rows.dtype.descr, (LABEL, "u1")])
+    count = len(layout.rows)
+    rows[:count] = _filled(layout.rows, rows.dtype)
+    rows[count:] = _filled(_plain_rows(scene[count:]), rows.dtype)
+    rows[LABEL] = scene.generated.numpy()
+    write_layout(path, replace(layout, header=_labelled_header(layout), rows=rows))
+
+
+def _begins_with(scene: Gaussians, given: Path) -> bool:
+    context = load_ply(given, drop_nonfinite=True)
+    count = len(context)
+    same = context.sh.shape[1] == scene.sh.shape[1] and count <= len(scene)
+    return same and torch.equal(context.means, scene.means[:count])
+
+
+def _plain_rows(gaussians: Gaussians) -> ndarray:
+    """Gaussians as rows of our own layout."""
+    if len(gaussians) == 0:
+        return np.empty(0, [("x", "<f4")])
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "rows.ply"
+        save_ply(place, gaussians, provenance=False)
+        layout = read_layout(place)
+    assert layout is not None
+    return layout.rows
+
+
+def _filled(rows: ndarray, dtype: np.dtype) -> ndarray:
+    """The columns that `rows` and `dtype` share, zeros in the others."""
+    out = np.zeros(len(rows), dtype)
+    for name in set(rows.dtype.names or ()) & set(dtype.names or ()):
+        out[name] = rows[name]
+    return out
+
+
+def _labelled_header(layout: Layout) -> bytes:
+    """The header with a line for the label behind the last property of the vertices."""
+    lines = layout.header.splitlines(keepends=True)
+    start = next(i for i, line in enumerate(lines) if _COUNT.match(line))
+    after = [i for i, line in enumerate(lines) if i > start and line.startswith(b"element")]
+    end = after[0] if after else len(lines) - 1
+    last = max(i for i in range(start, end) if lines[i].startswith(b"property"))
+    ending = b"\r\n" if lines[last].endswith(b"\r\n") else b"\n"
+    lines.insert(last + 1, b"property uchar generated" + ending)
+    return b"".join(lines)

@@ -1,0 +1,86 @@
+"""Gaussians that were set aside from a scene, and where they belong in it.
+
+`removed.ply` is a 3DGS .ply whose vertices are followed by an element `place` with a property
+`uint row`: the rows that they had in the scene as it was given.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.io.files import replacing
+from gscompleter.io.ply import load_ply, read_header, save_ply
+from gscompleter.types import Gaussians, merge
+
+NAME = "removed.ply"
+"""How the file is called, beside the completed scene."""
+
+
+def save_removed(path: Path, removed: Gaussians, rows: Int[Tensor, "n"]) -> None:
+    """Write Gaussians that were set aside.
+
+    Args:
+        path: The file.
+        removed: The Gaussians.
+        rows: Their numbers in the scene as it was given, from 0, ascending.
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / NAME
+        save_ply(plain, removed)
+        head, end, vertices = plain.read_bytes().partition(b"end_header\n")
+    place = f"element place {len(rows)}\nproperty uint row\n".encode()
+    with replacing(path) as file:
+        file.write(head + place + end + vertices)
+        file.write(rows.numpy().astype("<u4").tobytes())
+
+
+def load_removed(path: Path) -> tuple[Gaussians, Int[Tensor, "n"]]:
+    """Gaussians that were set aside, and their rows in the scene as it was given.
+
+    Raises:
+        InputError: where it cannot be read, or does not say where they belong.
+    """
+    removed = load_ply(path)
+    with path.open("rb") as file:
+        _, (vertex, *others) = read_header(file, path)
+        layout = [(e.name, e.count, [(p.name, p.kind) for p in e.properties]) for e in others]
+        if layout != [("place", len(removed), [("row", "u4")])]:
+            raise InputError(
+                f"{path} does not say where its Gaussians belong in the scene; without it they "
+                "cannot be put back in order."
+            )
+        file.seek(vertex.count * vertex.dtype("<").itemsize, 1)
+        rows = np.frombuffer(file.read(), "<u4")
+    if len(rows) != len(removed) or (np.diff(rows.astype(np.int64)) <= 0).any():
+        raise InputError(f"{path} is damaged: its rows do not ascend; fetch the file again.")
+    return removed, torch.from_numpy(rows.astype(np.int64))
+
+
+def put_back(kept: Gaussians, removed: Gaussians, rows: Int[Tensor, "n"], path: Path) -> Gaussians:
+    """The scene as it was before `removed` were taken out of it.
+
+    Raises:
+        InputError: where the rows lie beyond the scene, so that `path` belongs to another one.
+    """
+    total = len(kept) + len(removed)
+    if len(rows) and int(rows.max()) >= total:
+        raise InputError(
+            f"{path} belongs to another scene: it names row {int(rows.max()):,} of one that has "
+            f"{total:,} Gaussians."
+        )
+    taken: Bool[Tensor, "n"] = torch.zeros(total, dtype=torch.bool)
+    taken[rows] = True
+    order = torch.empty(total, dtype=torch.int64)
+    order[~taken] = torch.arange(len(kept))
+    order[taken] = torch.arange(len(kept), total)
+    return merge([kept, removed])[order]

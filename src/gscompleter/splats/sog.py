@@ -1,0 +1,226 @@
+"""The .sog format of PlayCanvas, a folder or a bundle (a zip of the same files), read only.
+
+`meta.json` names lossless WebP images that hold a Gaussian in each pixel: two images for 16 bits
+of position in a logarithmic scale, one for the rotation (2 + 3 x 8 bits), one of scales, one of
+colour and opacity; harmonics are rows of a palette. Bytes stand for entries of a codebook
+(version 2) or for steps between a lowest and a highest value (version 1).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from PIL import Image
+
+from gscompleter.errors import InputError
+from gscompleter.splats.decoding import (
+    check_growth,
+    content,
+    damaged,
+    gaussians_of,
+    harmonics,
+)
+from gscompleter.splats.packing import with_largest
+from gscompleter.types import SH_C0, Gaussians
+
+META = "meta.json"
+ZIP = b"PK\x03\x04"
+COEFFICIENTS = (0, 3, 8, 15)
+PALETTE_WIDTH = 64
+"""Entries of the palette of harmonics in each row of its image."""
+MOST_GROWTH = 256
+"""How many times its size an image may unpack to. Real ones reach ten."""
+MOST_DEFLATED = 8
+"""How many times its size an entry of a bundle may unpack to; images do not shrink at all."""
+ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    OSError,
+    RuntimeError,
+    ValueError,
+)
+"""What a damaged or encrypted bundle makes Python's reader raise."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The files of a scene, wherever they lie."""
+
+    path: Path
+    """What the user named."""
+    read: Callable[[str], bytes]
+
+    def pixels(self, name: object, needed: int) -> UInt8[ndarray, "h w 4"]:
+        """An image of at least `needed` pixels.
+
+        Raises:
+            InputError: where it is absent, no lossless WebP, too small, or absurdly large.
+        """
+        data = self.read(_plain(self.path, name))
+        width, height = _webp_size(self.path, data)
+        check_growth(self.path, 4 * width * height, len(data), MOST_GROWTH)
+        if width * height < needed:
+            raise damaged(self.path, f"{name} has fewer pixels than there are Gaussians")
+        try:
+            return np.array(Image.open(io.BytesIO(data), formats=["WEBP"]).convert("RGBA"))
+        except (OSError, ValueError, SyntaxError, MemoryError) as error:
+            raise damaged(self.path, f"{name} is no image") from error
+
+
+def is_sog(head: bytes) -> bool:
+    """Whether a file that begins with `head` is a bundle or the `meta.json` of a folder."""
+    return head.startswith(ZIP) or head.lstrip()[:1] == b"{"
+
+
+def read_sog(path: Path) -> Gaussians:
+    """The Gaussians of a bundle, of a folder, or of the folder that a `meta.json` lies in.
+
+    Raises:
+        InputError: where something is absent, damaged, or of a version that is not known.
+    """
+    if path.is_dir():
+        return _read(Parts(path, lambda name: content(path / name)))
+    data = content(path)
+    if not data.startswith(ZIP):
+        return _read(Parts(path, lambda name: content(path.parent / name)), path.name)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as bundle:
+            return _read(Parts(path, lambda name: _entry(path, bundle, name)))
+    except InputError:
+        raise
+    except ZIP_ERRORS as error:
+        raise damaged(path, "its bundle cannot be opened") from error
+
+
+def _entry(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
+    try:
+        entry = bundle.getinfo(name)
+    except KeyError as error:
+        raise damaged(path, f"it has no {name}") from error
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise damaged(path, f"its {name} is packed in a way that bundles are not")
+    check_growth(path, entry.file_size, entry.compress_size, MOST_DEFLATED)
+    with bundle.open(entry) as file:
+        return file.read(entry.file_size)
+
+
+def _plain(path: Path, name: object) -> str:
+    """The name of a file right beside `meta.json`; nothing else is opened."""
+    if not isinstance(name, str) or not name or Path(name).name != name or "\0" in name:
+        raise damaged(path, f"it names a file {name!r}, which is none of its own")
+    return name
+
+
+def _webp_size(path: Path, data: bytes) -> tuple[int, int]:
+    """Width and height of a lossless WebP, before anything is unpacked."""
+    if data[:4] == b"RIFF" and data[8:15] == b"WEBPVP8" and len(data) >= 30:
+        if data[15:16] == b"L":
+            (bits,) = struct.unpack_from("<I", data, 21)
+            return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        if data[15:16] == b"X":
+            width, height = (int.from_bytes(data[at : at + 3], "little") for at in (24, 27))
+            return width + 1, height + 1
+    raise damaged(path, "one of its images is no lossless WebP")
+
+
+def _read(parts: Parts, meta: str = META) -> Gaussians:
+    try:
+        table = json.loads(parts.read(meta))
+        if not isinstance(table, dict) or "means" not in table:
+            raise InputError(f"{parts.path} is no .sog: its {meta} describes something else.")
+        version = table.get("version", 1)
+        if version not in (1, 2):
+            raise InputError(f"{parts.path} is .sog version {version}; 1 and 2 are known.")
+        return _decoded(parts, table, version)
+    except InputError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise damaged(parts.path, f"its {meta} means nothing ({str(error)[:80]!r})") from error
+
+
+def _decoded(parts: Parts, table: dict[str, Any], version: int) -> Gaussians:
+    count = int(table["count"] if version == 2 else table["means"]["shape"][0])
+    if count < 0:
+        raise damaged(parts.path, f"it counts {count} Gaussians")
+    means = _means(parts, table["means"], count)
+    (name,) = table["quats"]["files"]
+    packed = parts.pixels(name, count).reshape(-1, 4)[:count]
+    logs = _values(parts, table["scales"], count, version, 3)
+    rgba = _values(parts, table["sh0"], count, version, 4)
+    opacities = rgba[:, 3] if version == 2 else 1 / (1 + np.exp(-rgba[:, 3]))
+    rest = _rest(parts, table["shN"], count, version) if table.get("shN") else None
+    sh = harmonics(0.5 + SH_C0 * rgba[:, :3], rest)
+    return gaussians_of(means, _quats(packed), np.exp(logs), opacities, sh)
+
+
+def _means(parts: Parts, table: dict[str, Any], count: int) -> Float[ndarray, "n 3"]:
+    low, high = (
+        parts.pixels(name, count).reshape(-1, 4)[:count, :3].astype(np.float32)
+        for name in table["files"]
+    )
+    steps = (low + 256 * high) / 65535
+    logs = _between(table["mins"], table["maxs"], steps, 3)
+    return np.sign(logs) * np.expm1(np.abs(logs))
+
+
+def _between(
+    low: object, high: object, fractions: Float[ndarray, "n k"], k: int
+) -> Float[ndarray, "n k"]:
+    lowest, highest = (np.asarray(bound, np.float32).reshape(k) for bound in (low, high))
+    return lowest + (highest - lowest) * fractions
+
+
+def _quats(packed: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
+    smaller = (packed[:, :3].astype(np.float32) / 255 - 0.5) * np.float32(np.sqrt(2))
+    quats = with_largest(packed[:, 3] & 3, smaller)
+    quats[packed[:, 3] < 252] = (1, 0, 0, 0)  # no rotation, as other readers have it
+    return quats
+
+
+def _values(
+    parts: Parts, table: dict[str, Any], count: int, version: int, k: int
+) -> Float[ndarray, "n k"]:
+    """The first `k` channels of an image, decoded; a fourth of version 2 is a fraction."""
+    (name,) = table["files"]
+    packed = parts.pixels(name, count).reshape(-1, 4)[:count, :k]
+    if version == 1:
+        return _between(table["mins"], table["maxs"], packed.astype(np.float32) / 255, k)
+    codes = _codebook(table)[packed[:, :3]]
+    return np.concatenate([codes, packed[:, 3:].astype(np.float32) / 255], axis=1)
+
+
+def _codebook(table: dict[str, Any]) -> Float[ndarray, "256"]:
+    return np.asarray(table["codebook"], np.float32).reshape(256)
+
+
+def _rest(
+    parts: Parts, table: dict[str, Any], count: int, version: int
+) -> Float[ndarray, "n k 3"] | None:
+    """Harmonics of degree 1 and above: each Gaussian has the number of a row of the palette."""
+    centroids, labels = table["files"]
+    palette = parts.pixels(centroids, 1)
+    k = palette.shape[1] // PALETTE_WIDTH
+    if k not in COEFFICIENTS[1:] or palette.shape[1] % PALETTE_WIDTH:
+        raise damaged(parts.path, f"{centroids} is no palette of harmonics of degree 1 to 3")
+    rows = palette[:, :, :3].reshape(-1, k, 3)
+    label = parts.pixels(labels, count).reshape(-1, 4)[:count].astype(np.int64)
+    number = label[:, 0] + 256 * label[:, 1]
+    if count and number.max() >= len(rows):
+        raise damaged(parts.path, f"{labels} names harmonics that are not in the palette")
+    if version == 2:
+        return _codebook(table)[rows][number]
+    low, high = float(table["mins"]), float(table["maxs"])
+    return (low + (high - low) * rows.astype(np.float32) / 255)[number]

@@ -1,0 +1,55 @@
+"""The .splat format: 32 bytes for each Gaussian, no header, no view-dependent colour.
+
+Position and scale are float32 (the scale linear), colour and opacity a byte each, and so are the
+components of the rotation, wxyz, from -1 at 0 to 1 at 256.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gscompleter.errors import InputError
+from gscompleter.io.files import replacing
+from gscompleter.splats.decoding import content, gaussians_of, harmonics
+from gscompleter.types import SH_C0, Gaussians
+
+ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+def read_splat(path: Path) -> Gaussians:
+    """The Gaussians of a .splat.
+
+    Raises:
+        InputError: where it cannot be read, or does not consist of whole rows.
+    """
+    data = content(path)
+    if len(data) % ROW.itemsize:
+        raise InputError(
+            f"{path} is truncated or no .splat: its {len(data):,} bytes are no multiple of "
+            f"{ROW.itemsize}; fetch the file again."
+        )
+    rows = np.frombuffer(data, ROW)
+    rgba = rows["rgba"].astype(np.float32) / 255
+    quats = (rows["quat"].astype(np.float32) - 128) / 128
+    return gaussians_of(rows["mean"], quats, rows["scale"], rgba[:, 3], harmonics(rgba[:, :3]))
+
+
+def write_splat(path: Path, gaussians: Gaussians) -> None:
+    """Write a .splat; harmonics of degree 1 and above have no room in it.
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    rows = np.empty(len(gaussians), ROW)
+    rows["mean"] = gaussians.means.numpy()
+    rows["scale"] = gaussians.scales.numpy()
+    rgb = 0.5 + SH_C0 * gaussians.sh[:, 0].numpy()
+    rgba = np.concatenate([rgb, gaussians.opacities.numpy()[:, None]], axis=1)
+    rows["rgba"] = np.rint(np.clip(rgba, 0, 1) * 255)
+    quats = gaussians.quats.numpy()
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    rows["quat"] = np.clip(np.rint(unit * 128 + 128), 0, 255)
+    with replacing(path) as file:
+        file.write(rows.view(np.uint8).data)

@@ -1,0 +1,264 @@
+"""The .spz format of Niantic, versions 2, 3 and 4 read, version 3 written.
+
+Attribute after attribute: positions of 24 bits fixed point, opacities, colours and log-scales of a
+byte, rotations (version 2: three bytes; later: 2 + 3 x 10 bits), harmonics of a byte. Versions 2
+and 3 are one gzip stream with a header of 16 bytes; version 4 is a header of 32 bytes and a zstd
+stream for each attribute. Axes are x right, y up, z back.
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+from gscompleter.errors import InputError
+from gscompleter.io.files import replacing
+from gscompleter.io.ply import encode
+from gscompleter.splats.decoding import (
+    check_growth,
+    check_size,
+    content,
+    damaged,
+    gaussians_of,
+    harmonics,
+)
+from gscompleter.splats.frames import ABOUT_X, half_turned
+from gscompleter.splats.packing import with_largest, without_largest
+from gscompleter.types import SH_C0, Gaussians
+
+MAGIC = b"NGSP"
+GZIP = b"\x1f\x8b"
+HEADER = struct.Struct("<4sIIBBBB")
+"""Magic, version, count, SH degree, fractional bits, flags, and the number of streams."""
+TABLE = struct.Struct("<I12x")
+"""Version 4 goes on with the offset of its table of sizes."""
+COEFFICIENTS = (0, 3, 8, 15)
+MOST_GROWTH = 256
+"""How many times its size a file may unpack to. Real ones reach two."""
+LARGEST_WINDOW = 1 << 27
+"""Bytes that zstd may look back, and needs to keep."""
+COLOUR_SCALE = 0.15
+"""Constant harmonics are held as `0.5 + 0.15 sh`."""
+MOST_FRACTIONAL_BITS = 16
+"""As few as positions need are before the point, but at most so many behind it."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a .spz says of itself."""
+
+    version: int
+    count: int
+    degree: int
+    fractional_bits: int
+    streams: int
+
+    @property
+    def sizes(self) -> list[int]:
+        """Bytes of positions, opacities, colours, scales, rotations and harmonics."""
+        rotation = 3 if self.version == 2 else 4
+        widths = [9, 1, 3, 3, rotation, 3 * COEFFICIENTS[self.degree]]
+        return [width * self.count for width in widths]
+
+
+def is_spz(head: bytes) -> bool:
+    """Whether a file that begins with `head` is a .spz."""
+    return head.startswith((MAGIC, GZIP))
+
+
+def read_spz(path: Path) -> Gaussians:
+    """The Gaussians of a .spz, of SH degree 0 to 3, in the axes of a .ply.
+
+    Raises:
+        InputError: where it cannot be read, is truncated, or of a version that is not known.
+    """
+    data = content(path)
+    if data.startswith(GZIP):
+        header, streams = _from_gzip(path, data)
+    else:
+        header = _header(path, data)
+        plain = header.version < 4
+        streams = _split(path, header, data[HEADER.size :]) if plain else _from_zstd(path, data)
+    return half_turned(_decoded(header, streams), ABOUT_X)
+
+
+def _header(path: Path, data: bytes) -> Header:
+    check_size(path, len(data), HEADER.size)
+    magic, version, count, degree, bits, _, streams = HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise InputError(f"{path} is no .spz: it holds something else that is compressed.")
+    if version not in (2, 3, 4):
+        raise InputError(f"{path} is .spz version {version}; versions 2, 3 and 4 are known.")
+    if count == 0:
+        raise InputError(f"{path} is empty: it holds no Gaussian.")
+    if degree >= len(COEFFICIENTS) or bits > 24:
+        raise InputError(
+            f"{path} has harmonics of degree {degree} and {bits} fractional bits; a .spz of "
+            "degree 0 to 3 and at most 24 bits is needed."
+        )
+    return Header(version, count, degree, bits, streams)
+
+
+def _from_gzip(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
+    unpacker = zlib.decompressobj(31)
+    try:
+        header = _header(path, unpacker.decompress(data, HEADER.size))
+        if header.version > 3:
+            raise damaged(path, f"version {header.version} is not packed as a whole")
+        size = sum(header.sizes)
+        check_growth(path, size, len(data), MOST_GROWTH)
+        body = unpacker.decompress(unpacker.unconsumed_tail, size)
+        more = unpacker.decompress(unpacker.unconsumed_tail, 1)  # which compares the checksum
+    except zlib.error as error:
+        raise damaged(path, "it cannot be unpacked") from error
+    if not (more or unpacker.eof):
+        raise damaged(path, "it ends too early")
+    return header, _split(path, header, body)
+
+
+def _split(path: Path, header: Header, body: bytes) -> list[bytes]:
+    check_size(path, len(body), sum(header.sizes))
+    ends = np.cumsum(header.sizes).tolist()
+    return [body[end - size : end] for end, size in zip(ends, header.sizes, strict=True)]
+
+
+def _from_zstd(path: Path, data: bytes) -> list[bytes]:
+    """The attributes of version 4, each from its own stream."""
+    header = _header(path, data)
+    check_size(path, len(data), HEADER.size + TABLE.size)
+    (place,) = TABLE.unpack_from(data, HEADER.size)
+    start = place + 16 * header.streams
+    check_size(path, len(data), start)
+    check_growth(path, sum(header.sizes), len(data), MOST_GROWTH)
+    needed = 6 if header.degree else 5
+    if header.streams < needed:
+        raise damaged(path, f"{header.streams} of {needed} attributes are there")
+    streams = []
+    for number, size in enumerate(header.sizes[:needed]):
+        packed, unpacked = struct.unpack_from("<QQ", data, place + 16 * number)
+        check_size(path, len(data), start + packed)
+        if unpacked != size:
+            raise damaged(path, "the sizes of its attributes do not fit the count of Gaussians")
+        streams.append(_unpacked(path, data[start : start + packed], size))
+        start += packed
+    return [*streams, b""][:6]
+
+
+def _unpacked(path: Path, data: bytes, size: int) -> bytes:
+    import zstandard  # here, because only this version of one format needs it
+
+    unpacker = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
+    try:
+        body = unpacker.stream_reader(data).read(size)
+    except (zstandard.ZstdError, MemoryError) as error:
+        raise damaged(path, "it cannot be unpacked") from error
+    check_size(path, len(body), size)
+    return body
+
+
+def _decoded(header: Header, streams: list[bytes]) -> Gaussians:
+    """The Gaussians as the file has them, in its own axes."""
+    positions, opacities, colours, scales, rotations, rest = (
+        np.frombuffer(stream, np.uint8).reshape(header.count, len(stream) // header.count)
+        for stream in streams
+    )
+    colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOUR_SCALE
+    higher = rest.astype(np.float32)
+    higher -= 128
+    higher /= 128
+    return gaussians_of(
+        np.ldexp(_signed(positions).astype(np.float32), -header.fractional_bits),
+        _first_three(rotations) if header.version == 2 else _smallest_three(rotations),
+        np.exp(scales.astype(np.float32) / 16 - 10),
+        opacities[:, 0].astype(np.float32) / 255,
+        harmonics(colour, higher.reshape(header.count, COEFFICIENTS[header.degree], 3)),
+    )
+
+
+def _signed(positions: UInt8[ndarray, "n 9"]) -> Int[ndarray, "n 3"]:
+    """Three signed numbers of 24 bits in each row of 9 bytes."""
+    a, b, c = np.moveaxis(positions.reshape(-1, 3, 3).astype(np.int32), 2, 0)
+    return ((a | (b << 8) | (c << 16)) ^ (1 << 23)) - (1 << 23)
+
+
+def _first_three(rotations: UInt8[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
+    xyz = rotations.astype(np.float32) / 127.5 - 1
+    w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(1, keepdims=True)))
+    return np.concatenate([w, xyz], axis=1)
+
+
+def _smallest_three(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
+    """Sign and 9 bits for each of three components of xyzw, the number of the fourth on top."""
+    packed = np.ascontiguousarray(rotations).view("<u4")[:, 0]
+    fields = np.stack([packed >> np.uint32(shift) for shift in (20, 10, 0)], axis=1)
+    sizes = (fields & np.uint32(511)).astype(np.float32) / 511 * np.float32(np.sqrt(0.5))
+    smaller = np.where(fields & np.uint32(512), -sizes, sizes)
+    return np.roll(with_largest(packed >> np.uint32(30), smaller), 1, axis=1)
+
+
+# --------------------------------------------------------------------------------------- write
+
+
+def write_spz(path: Path, gaussians: Gaussians) -> None:
+    """Write a .spz of version 3, positions as fine as their range leaves room for.
+
+    Raises:
+        InputError: where Gaussians lie too far out for it, or the file cannot be written.
+    """
+    turned = half_turned(gaussians, ABOUT_X)
+    bits = _fractional_bits(path, turned)
+    header = HEADER.pack(MAGIC, 3, len(turned), turned.sh_degree, bits, 0, 0)
+    constant = 0.5 + COLOUR_SCALE * turned.sh[:, 0].numpy()
+    rest = turned.sh[:, 1:].reshape(len(turned), -1).numpy()
+    log_scales = encode(gaussians)[:, :3].numpy()
+    body = b"".join(
+        (
+            header,
+            _packed_positions(turned.means.numpy(), bits),
+            _bytes(turned.opacities.numpy() * 255),
+            _bytes(constant * 255),
+            _bytes((log_scales + 10) * 16),
+            _packed_rotations(turned.quats.numpy()),
+            _bytes(rest * 128 + 128),
+        )
+    )
+    with replacing(path) as file:
+        file.write(gzip.compress(body, compresslevel=6, mtime=0))
+
+
+def _fractional_bits(path: Path, gaussians: Gaussians) -> int:
+    """How many of 23 bits the farthest coordinate leaves behind the point."""
+    farthest = gaussians.means.abs().max().item()
+    bits = 23 - int(np.ceil(np.log2(farthest + 1)))
+    if bits < 0:
+        raise InputError(
+            f"{path} cannot hold Gaussians {farthest:.3g} from the origin; remove the floaters or "
+            "write a .ply."
+        )
+    return min(bits, MOST_FRACTIONAL_BITS)
+
+
+def _bytes(values: Float[ndarray, "*n"]) -> bytes:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8).tobytes()
+
+
+def _packed_positions(means: Float[ndarray, "n 3"], bits: int) -> bytes:
+    fixed = np.rint(means.astype(np.float64) * 2**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
+    return fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes()
+
+
+def _packed_rotations(quats: Float[ndarray, "n 4"]) -> bytes:
+    largest, smaller = without_largest(np.roll(quats, -1, axis=1))
+    sizes = np.rint(np.abs(smaller) / np.sqrt(0.5) * 511).clip(0, 511).astype(np.uint32)
+    fields = sizes | np.where(smaller < 0, np.uint32(512), np.uint32(0)).astype(np.uint32)
+    packed = largest.astype(np.uint32) << np.uint32(30)
+    for column, shift in enumerate((20, 10, 0)):
+        packed |= fields[:, column] << np.uint32(shift)
+    return packed.astype("<u4").tobytes()

@@ -1,0 +1,247 @@
+"""Files in the formats that are only read, made of given Gaussians, to test the readers with."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from PIL import Image
+
+from gscompleter.types import SH_C0, Gaussians
+
+SH_NAME = "KHR_gaussian_splatting:SH_DEGREE_{}_COEF_{}"
+
+
+def rgb_bytes(gaussians: Gaussians) -> np.ndarray:
+    rgb = 0.5 + SH_C0 * gaussians.sh[:, 0].numpy()
+    rgba = np.concatenate([rgb, gaussians.opacities.numpy()[:, None]], axis=1)
+    return np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8)
+
+
+def write_ksplat(path: Path, gaussians: Gaussians, level: int, bucket_size: int = 7) -> Path:
+    """One section; buckets follow one another, each centred on its Gaussians."""
+    n, block, steps = len(gaussians), 64.0, 32767
+    means = gaussians.means.numpy()
+    buckets = -(-n // bucket_size)
+    full, left = divmod(n, bucket_size)
+    of_bucket = np.arange(n) // bucket_size
+    centres = np.stack([means[of_bucket == b].mean(0) for b in range(buckets)]).astype("<f4")
+    rest, start = [], 1
+    for degree in range(1, gaussians.sh_degree + 1):
+        band = gaussians.sh[:, start : start + 2 * degree + 1].numpy()
+        rest.append(band.transpose(0, 2, 1).reshape(n, -1))
+        start += 2 * degree + 1
+    rest = np.concatenate([np.empty((n, 0), np.float32), *rest], axis=1)
+    number = "<f4" if level == 0 else "<f2"
+    if level == 0:
+        positions = means.astype("<f4")
+    else:
+        offset = (means - centres[of_bucket]) / (block / 2 / steps) + steps
+        positions = np.rint(offset).clip(0, 65535).astype("<u2")
+    harmonics = rest.astype(number)
+    if level == 2:
+        harmonics = np.rint((rest + 4) / 8 * 255).clip(0, 255).astype(np.uint8)
+    columns = [
+        positions,
+        gaussians.scales.numpy().astype(number),
+        gaussians.quats.numpy().astype(number),
+        rgb_bytes(gaussians),
+        harmonics,
+    ]
+    rows = np.concatenate([np.ascontiguousarray(c).view(np.uint8) for c in columns], axis=1)
+    partial = [left] if left else []
+    header = bytearray(4096)
+    struct.pack_into("<BBxxIIII", header, 0, 0, 1, 1, 1, n, n)
+    struct.pack_into("<H", header, 20, level)
+    struct.pack_into("<ff", header, 36, -4, 4)
+    section = bytearray(1024)
+    struct.pack_into("<IIIIfH", section, 0, n, n, bucket_size, buckets, block, 12)
+    struct.pack_into("<I", section, 24, steps)
+    struct.pack_into("<IIH", section, 32, full, len(partial), gaussians.sh_degree)
+    sizes = np.array(partial, "<u4").tobytes()
+    path.write_bytes(bytes(header + section) + sizes + centres.tobytes() + rows.tobytes())
+    return path
+
+
+def write_spz_4(path: Path, version_3: Path) -> Path:
+    """The same content as a file of version 3, in a stream for each attribute."""
+    raw = gzip.decompress(version_3.read_bytes())
+    magic, _, n, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", raw)
+    widths = [9, 1, 3, 3, 4, (0, 9, 24, 45)[degree]]
+    streams, start = [], 16
+    for width in widths[: 6 if degree else 5]:
+        streams.append(raw[start : start + width * n])
+        start += width * n
+    packed = [zstandard.compress(stream) for stream in streams]
+    header = struct.pack("<4sIIBBBBI12x", magic, 4, n, degree, bits, flags, len(streams), 32)
+    table = b"".join(
+        struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True)
+    )
+    path.write_bytes(header + table + b"".join(packed))
+    return path
+
+
+def write_spz_2(path: Path, version_3: Path, gaussians: Gaussians) -> Path:
+    """A file of version 3 with the rotations of version 2: three bytes of xyz, w positive."""
+    raw = gzip.decompress(version_3.read_bytes())
+    n = len(gaussians)
+    quats = gaussians.quats.numpy() * (1, 1, -1, -1)
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    quats *= np.where(quats[:, :1] < 0, -1, 1)
+    rotations = np.rint((quats[:, 1:] + 1) * 127.5).astype(np.uint8).tobytes()
+    start = 16 + 16 * n
+    body = raw[:4] + struct.pack("<I", 2) + raw[8:start] + rotations + raw[start + 4 * n :]
+    path.write_bytes(gzip.compress(body))
+    return path
+
+
+def webp(pixels: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True)
+    return file.getvalue()
+
+
+def square(values: np.ndarray) -> np.ndarray:
+    """Bytes [n, k] as an image [h, w, 4] that is opaque where k is 3."""
+    n, k = values.shape
+    side = int(np.ceil(np.sqrt(n)))
+    image = np.full((side * side, 4), 255, np.uint8)
+    image[:n, :k] = values
+    return image.reshape(side, side, 4)
+
+
+def sog_files(gaussians: Gaussians, version: int = 2) -> dict[str, bytes]:
+    """The files of a .sog. Codebooks are even steps, so that both versions hold the same."""
+    n, k = len(gaussians), gaussians.sh.shape[1] - 1
+    means = gaussians.means.numpy()
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = logs.min(0), logs.max(0)
+    steps = np.rint((logs - low) / (high - low) * 65535).astype(np.uint16)
+    quats = gaussians.quats.numpy()
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    largest = np.abs(quats).argmax(1)
+    quats *= np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1, 1)
+    smaller = np.stack([np.delete(q, i) for q, i in zip(quats, largest, strict=True)])
+    rotation = np.concatenate(
+        [np.rint((smaller / np.sqrt(2) + 0.5) * 255), 252 + largest[:, None]], axis=1
+    )
+    logit = gaussians.opacities.logit().clamp(-8, 8).numpy()[:, None]
+    opacity = gaussians.opacities.numpy()[:, None] if version == 2 else (logit + 8) / 16
+    colour = np.concatenate([(gaussians.sh[:, 0].numpy() + 4) / 8, opacity], axis=1)
+    files = {
+        "means_l.webp": webp(square((steps & 255).astype(np.uint8))),
+        "means_u.webp": webp(square((steps >> 8).astype(np.uint8))),
+        "quats.webp": webp(square(rotation.astype(np.uint8))),
+        "scales.webp": webp(
+            square(np.rint((gaussians.scales.log().numpy() + 10) / 20 * 255).astype(np.uint8))
+        ),
+        "sh0.webp": webp(square(np.rint(colour.clip(0, 1) * 255).astype(np.uint8))),
+    }
+    book = {
+        "scales": np.linspace(-10, 10, 256),
+        "sh0": np.linspace(-4, 4, 256),
+        "shN": np.linspace(-4, 4, 256),
+    }
+    bounds = {
+        "scales": {"mins": [-10] * 3, "maxs": [10] * 3},
+        "sh0": {"mins": [-4, -4, -4, -8], "maxs": [4, 4, 4, 8]},
+        "shN": {"mins": -4, "maxs": 4},
+    }
+    meta = {"version": 2, "count": n} if version == 2 else {}
+    meta["means"] = {
+        "mins": low.tolist(),
+        "maxs": high.tolist(),
+        "files": ["means_l.webp", "means_u.webp"],
+        "shape": [n, 3],
+    }
+    meta["quats"] = {"files": ["quats.webp"]}
+    meta["scales"] = {"files": ["scales.webp"]}
+    meta["sh0"] = {"files": ["sh0.webp"]}
+    if k:
+        meta["shN"] = {
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+            "bands": gaussians.sh_degree,
+            "count": n,
+        }
+        palette = np.full((-(-n // 64), 64 * k, 4), 255, np.uint8)
+        flat = np.rint((gaussians.sh[:, 1:].numpy() + 4) / 8 * 255).clip(0, 255)
+        palette.reshape(-1, k, 4)[:n, :, :3] = flat
+        number = np.arange(n)
+        label = np.stack([number & 255, number >> 8, 0 * number], axis=1)
+        files["shN_centroids.webp"] = webp(palette)
+        files["shN_labels.webp"] = webp(square(label.astype(np.uint8)))
+    for name in [name for name in book if name in meta]:
+        meta[name] |= {"codebook": book[name].tolist()} if version == 2 else bounds[name]
+    return {"meta.json": json.dumps(meta).encode(), **files}
+
+
+def write_sog(path: Path, files: dict[str, bytes]) -> Path:
+    """A bundle where the name ends in .sog, else a folder."""
+    if path.suffix == ".sog":
+        with zipfile.ZipFile(path, "w") as bundle:
+            for name, data in files.items():
+                bundle.writestr(name, data)
+        return path
+    path.mkdir()
+    for name, data in files.items():
+        (path / name).write_bytes(data)
+    return path
+
+
+def glb_table(gaussians: Gaussians) -> tuple[dict, bytes]:
+    """Description and binary part of a .glb that holds the Gaussians in its own axes."""
+    prefix = "KHR_gaussian_splatting:"
+    columns = {
+        "POSITION": gaussians.means,
+        f"{prefix}ROTATION": gaussians.quats.roll(-1, 1),
+        f"{prefix}SCALE": gaussians.scales,
+        f"{prefix}OPACITY": gaussians.opacities[:, None],
+    }
+    for degree in range(gaussians.sh_degree + 1):
+        for i in range(2 * degree + 1):
+            columns[SH_NAME.format(degree, i)] = gaussians.sh[:, degree**2 + i]
+    binary, views, accessors = b"", [], []
+    for values in columns.values():
+        data = values.contiguous().numpy().astype("<f4").tobytes()
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
+        accessors.append(
+            {
+                "bufferView": len(accessors),
+                "componentType": 5126,
+                "count": len(gaussians),
+                "type": kind,
+            }
+        )
+        binary += data
+    primitive = {
+        "attributes": {name: i for i, name in enumerate(columns)},
+        "mode": 0,
+        "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse"}},
+    }
+    table = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": len(binary)}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    return table, binary
+
+
+def write_glb(path: Path, table: dict, binary: bytes) -> Path:
+    text = json.dumps(table).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return path

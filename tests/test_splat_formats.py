@@ -1,0 +1,511 @@
+"""Formats of splats: the same picture from each of them, and a sentence for what is no splat."""
+
+import gzip
+import json
+import os
+import shutil
+import struct
+import subprocess
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from command import run
+from gscompleter import (
+    Gaussians,
+    InputError,
+    Render,
+    load_renderer,
+    load_splat,
+    merge,
+    save_ply,
+    save_splat,
+)
+from gscompleter.splats.compressed_ply import near_together
+from gscompleter.splats.frames import ABOUT_X, ABOUT_Z, half_turned, moved
+from gscompleter.splats.labels import place_of_labels
+from scenes import camera_at, random_gaussians, scaled
+from splat_files import (
+    glb_table,
+    sog_files,
+    write_glb,
+    write_ksplat,
+    write_sog,
+    write_spz_2,
+    write_spz_4,
+)
+
+CPU = load_renderer("cpu")
+WRITTEN = ("scene.ply", "scene.compressed.ply", "scene.spz", "scene.splat")
+FORMATS_BUT_PLY = (
+    "scene.compressed.ply",
+    "scene.spz",
+    "four.spz",
+    "scene.splat",
+    "scene.ksplat",
+    "scene.sog",
+    "scene.glb",
+)
+
+
+def plausible(n: int = 200, degree: int = 3) -> Gaussians:
+    """Gaussians whose colours and harmonics every format has room for."""
+    gaussians = random_gaussians(n, seed=3, sh_degree=degree)
+    sh = gaussians.sh * 0.5
+    sh[:, 0] = sh[:, 0].clamp(-1.7, 1.7)
+    return replace(gaussians, sh=sh.clamp(-0.98, 0.98))
+
+
+def psnr(a: Gaussians, b: Gaussians) -> float:
+    """How alike two scenes look, in dB, the worst of three cameras."""
+    cameras = [
+        camera_at(size=64),
+        camera_at(0.5, -0.3, yaw=20, size=64),
+        camera_at(yaw=-30, size=64),
+    ]
+
+    def error(camera) -> float:
+        drawn: list[Render] = [CPU.render(scene, camera) for scene in (a, b)]
+        return (drawn[0].image - drawn[1].image).square().mean().item()
+
+    return -10 * torch.tensor(max(error(camera) for camera in cameras) + 1e-12).log10().item()
+
+
+def covariances(gaussians: Gaussians) -> torch.Tensor:
+    """[n, 3, 3], which unlike quaternions are the same however axes are called and signed."""
+    w, x, y, z = torch.nn.functional.normalize(gaussians.quats.double(), dim=1).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    rotation = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    axes = rotation * gaussians.scales.double()[:, None]
+    return axes @ axes.transpose(1, 2)
+
+
+def made(folder: Path, name: str, gaussians: Gaussians) -> Path:
+    """A file of the Gaussians in the format that `name` asks for."""
+    path = folder / name
+    if name in WRITTEN:
+        save_splat(path, gaussians)
+    elif path.suffix == ".ksplat":
+        write_ksplat(path, gaussians, level=1)
+    elif path.suffix == ".glb":
+        write_glb(path, *glb_table(half_turned(gaussians, ABOUT_Z)))
+    elif name == "plain.spz":
+        path.write_bytes(gzip.decompress(made(folder, "scene.spz", gaussians).read_bytes()))
+    elif path.suffix == ".spz":
+        write_spz_4(path, made(folder, "scene.spz", gaussians))
+    else:
+        write_sog(path, sog_files(gaussians))
+    return path
+
+
+def refused(path: Path, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as caught:
+        load_splat(path)
+    assert "\n" not in str(caught.value)
+
+
+# ------------------------------------------------------------------------------- round trips
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_ply_comes_back_exactly(tmp_path, degree):
+    save_ply(tmp_path / "a.ply", random_gaussians(300, sh_degree=degree))
+    save_splat(tmp_path / "b.ply", load_splat(tmp_path / "a.ply"))
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_compressed_ply_rounds_no_more_than_its_bits(tmp_path, degree):
+    gaussians = near_together(plausible(600, degree))
+    save_splat(tmp_path / "scene.compressed.ply", gaussians)
+    loaded = load_splat(tmp_path / "scene.compressed.ply")
+    extent = (gaussians.means.amax(0) - gaussians.means.amin(0)).max()
+    assert (loaded.means - gaussians.means).abs().max() <= extent / 1023 / 2 * 1.01
+    assert (loaded.scales.log() - gaussians.scales.log()).abs().max() <= 3 / 1023 / 2 * 1.01
+    assert (loaded.opacities - gaussians.opacities).abs().max() <= 0.51 / 255
+    assert (
+        (loaded.sh[:, 1:] - gaussians.sh[:, 1:]).abs().amax() <= 8 / 256 / 2 * 1.01
+        if degree
+        else True
+    )
+    assert psnr(loaded, gaussians) > 40
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_an_spz_rounds_no_more_than_its_bits(tmp_path, degree):
+    gaussians = plausible(300, degree)
+    save_splat(tmp_path / "scene.spz", gaussians)
+    loaded = load_splat(tmp_path / "scene.spz")
+    assert (loaded.means - gaussians.means).abs().max() <= 2**-16
+    assert (loaded.scales.log() - gaussians.scales.log()).abs().max() <= 1 / 32 * 1.01
+    assert (loaded.opacities - gaussians.opacities).abs().max() <= 0.51 / 255
+    assert (loaded.sh[:, :1] - gaussians.sh[:, :1]).abs().max() <= 0.51 / 255 / 0.15
+    if degree:
+        assert (loaded.sh[:, 1:] - gaussians.sh[:, 1:]).abs().max() <= 0.51 / 128
+    assert psnr(loaded, gaussians) > 35
+
+
+def test_a_splat_keeps_position_and_size_and_rounds_the_rest(tmp_path):
+    gaussians = plausible(300, 0)
+    save_splat(tmp_path / "scene.splat", gaussians)
+    loaded = load_splat(tmp_path / "scene.splat")
+    assert torch.equal(loaded.means, gaussians.means)
+    assert torch.equal(loaded.scales, gaussians.scales)
+    assert (loaded.opacities - gaussians.opacities).abs().max() <= 0.51 / 255
+    assert psnr(loaded, gaussians) > 35
+
+
+@pytest.mark.parametrize("name", FORMATS_BUT_PLY)
+def test_every_format_shows_the_same_picture(tmp_path, name):
+    """Frames, rotations and harmonics are right, or the picture would be another."""
+    gaussians = plausible(400, 0 if name.endswith(".splat") else 3)
+    loaded = load_splat(made(tmp_path, name, gaussians))
+    assert psnr(loaded, gaussians) > 33
+    assert len(loaded) == 400
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_ksplat_of_every_level(tmp_path, level, degree):
+    gaussians = plausible(50, degree)
+    loaded = load_splat(write_ksplat(tmp_path / "scene.ksplat", gaussians, level))
+    assert torch.allclose(loaded.means, gaussians.means, atol=0 if level == 0 else 1e-3)
+    assert torch.allclose(loaded.scales, gaussians.scales, rtol=1e-3)
+    assert torch.allclose(loaded.sh[:, 1:], gaussians.sh[:, 1:], atol=(0, 1e-3, 0.02)[level])
+    assert torch.allclose(covariances(loaded), covariances(gaussians), atol=2e-3)
+
+
+def test_spz_of_versions_2_3_and_4_are_the_same(tmp_path):
+    gaussians = plausible(100)
+    third = load_splat(made(tmp_path, "scene.spz", gaussians))
+    fourth = load_splat(write_spz_4(tmp_path / "4.spz", tmp_path / "scene.spz"))
+    second = load_splat(write_spz_2(tmp_path / "2.spz", tmp_path / "scene.spz", gaussians))
+    assert torch.equal(third.sh, fourth.sh)
+    assert torch.equal(third.quats, fourth.quats)
+    assert torch.equal(third.means, second.means)
+    assert torch.allclose(covariances(third), covariances(second), atol=2e-2)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("name", ["folder", "bundle.sog"])
+def test_sog_of_both_versions_as_folder_and_bundle(tmp_path, version, name):
+    gaussians = plausible(90, 2)
+    path = write_sog(tmp_path / name, sog_files(gaussians, version))
+    loaded = load_splat(path)
+    assert torch.allclose(loaded.means, gaussians.means, atol=1e-3)
+    assert (loaded.scales.log() - gaussians.scales.log()).abs().max() < 0.05
+    assert torch.allclose(loaded.opacities, gaussians.opacities, atol=0.02)
+    assert torch.allclose(loaded.sh, gaussians.sh, atol=0.02)
+    if path.is_dir():
+        assert torch.equal(load_splat(path / "meta.json").means, loaded.means)
+
+
+def test_nodes_of_a_glb_place_their_gaussians(tmp_path):
+    gaussians = plausible(60, 3)
+    table, binary = glb_table(gaussians)
+    turn = [0.1, 0.2, 0.3, (1 - 0.14) ** 0.5]
+    table["nodes"] = [
+        {"children": [1], "translation": [1, 2, 3], "scale": [2, 2, 2]},
+        {"mesh": 0, "rotation": turn},
+    ]
+    loaded = load_splat(write_glb(tmp_path / "scene.glb", table, binary))
+    x, y, z, w = turn
+    place = torch.eye(4)
+    place[:3, :3] = 2 * torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    place[:3, 3] = torch.tensor([1.0, 2, 3])
+    expected = half_turned(moved(gaussians, place), ABOUT_Z)
+    assert torch.allclose(loaded.means, expected.means, atol=1e-5)
+    assert torch.allclose(covariances(loaded), covariances(expected), atol=1e-5)
+    table["nodes"][1]["scale"] = [1, 2, 1]
+    refused(write_glb(tmp_path / "uneven.glb", table, binary), "unevenly")
+
+
+# ------------------------------------------------------------------------------------ frames
+
+
+def test_a_moved_scene_looks_the_same_to_a_camera_that_moved_with_it():
+    gaussians, camera = plausible(200, 3), camera_at(0.2, 0.1, yaw=10, size=64)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0))).Q
+    turn = turn * torch.linalg.det(turn).sign()
+    place = torch.eye(4)
+    place[:3, :3], place[:3, 3] = turn * 1.7, torch.tensor([3.0, -1.0, 2.0])
+    c2w = place @ camera.c2w
+    c2w[:3, :3] /= 1.7
+    there = CPU.render(moved(gaussians, place), replace(camera, c2w=c2w))
+    assert torch.allclose(there.image, CPU.render(gaussians, camera).image, atol=2e-3)
+
+
+@pytest.mark.parametrize("signs", [ABOUT_X, ABOUT_Z])
+def test_half_a_turn_is_exact_and_the_same_as_the_rotation(signs):
+    gaussians = plausible(50, 3)
+    turned = half_turned(gaussians, signs)
+    rotated = moved(gaussians, torch.diag(torch.tensor([*signs, 1.0])))
+    assert torch.allclose(turned.means, rotated.means, atol=1e-6)
+    assert torch.allclose(turned.sh, rotated.sh, atol=1e-5)
+    assert torch.allclose(covariances(turned), covariances(rotated), atol=1e-6)
+    assert torch.equal(half_turned(turned, signs).sh, gaussians.sh)
+    assert torch.equal(half_turned(turned, signs).quats, gaussians.quats)
+
+
+# ------------------------------------------------------------------------------------ labels
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_what_was_generated_is_known_after_every_conversion(tmp_path, name):
+    gaussians = plausible(300, 0)
+    labels = (torch.arange(300) % 7 // 3).to(torch.uint8)
+    save_splat(tmp_path / name, replace(gaussians, generated=labels))
+    loaded = load_splat(tmp_path / name)
+    nearest = torch.cdist(loaded.means, gaussians.means).argmin(1)
+    assert torch.equal(loaded.generated, labels[nearest])
+    assert place_of_labels(tmp_path / name).exists() == (name != "scene.ply")
+
+
+def test_labels_of_another_file_are_not_believed(tmp_path):
+    path, other = tmp_path / "scene.spz", tmp_path / "other.spz"
+    gaussians = plausible(20, 0)
+    save_splat(path, replace(gaussians, generated=torch.ones(20, dtype=torch.uint8)))
+    save_splat(other, gaussians[:10])
+    labels = place_of_labels(path)
+    shutil.copy(labels, place_of_labels(other))
+    refused(other, "labels of another state")
+    save_splat(other, gaussians[:10])
+    assert not place_of_labels(other).exists()
+    for text in (
+        "{}",
+        '{"sha256": 1, "generated": [[1]]}',
+        '{"sha256": "", "generated": 4}',
+        "[1]",
+    ):
+        labels.write_text(text)
+        refused(path, "remove it to go on")
+
+
+# ----------------------------------------------------------------------------------- refused
+
+
+@pytest.mark.parametrize("name", [n for n in FORMATS_BUT_PLY if not n.endswith(".splat")])
+def test_a_truncated_file_is_refused(tmp_path, name):
+    path = made(tmp_path, name, plausible(60, 2))
+    data = path.read_bytes()
+    for share in (0.1, 0.5, 0.9, 0.999):
+        path.write_bytes(data[: int(len(data) * share)])
+        refused(path, "again|bundle|.")
+
+
+def test_what_is_no_splat_is_refused(tmp_path):
+    refused(tmp_path / "absent.spz", "No such file")
+    refused(tmp_path, "folder without meta.json")
+    for name in ("a.ply", "a.splat", "a.spz"):
+        (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+        refused(tmp_path / name, "git lfs pull")
+    for name, data, sentence in [
+        ("empty.splat", b"", "is empty"),
+        ("a.txt", b"hello", "format that is known"),
+        ("b.spz", b"hello", "format that is known"),
+        ("c.splat", b"hello", "no multiple of 32"),
+        ("d.spz", gzip.compress(b"x" * 100), "no .spz"),
+        ("e.spz", b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0), "version 9"),
+        ("f.glb", b"glTF" + bytes(8), "no description"),
+        ("g.json", b'{"frames": []}', "no .sog"),
+        ("g.gltf", b'{"asset": {}}', "no .sog"),
+        ("h.ksplat", b"\x00\x07" + bytes(4094), "is empty"),
+        ("i.ksplat", b"\x09" + bytes(4095), "no .ksplat that is known"),
+    ]:
+        (tmp_path / name).write_bytes(data)
+        refused(tmp_path / name, sentence)
+
+
+def test_absurd_counts_are_refused_before_anything_is_unpacked(tmp_path):
+    huge = struct.pack("<4sIIBBBB", b"NGSP", 3, 4_000_000_000, 3, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(huge))
+    refused(tmp_path / "a.spz", "claim to hold")
+    (tmp_path / "bomb.spz").write_bytes(gzip.compress(bytes(50_000_000)))
+    refused(tmp_path / "bomb.spz", "no .spz")
+    files = sog_files(plausible(20, 0))
+    meta = json.loads(files["meta.json"]) | {"count": 10**12}
+    write_sog(tmp_path / "a.sog", files | {"meta.json": json.dumps(meta).encode()})
+    refused(tmp_path / "a.sog", "fewer pixels")
+    image = bytearray(files["quats.webp"])
+    struct.pack_into("<I", image, 21, 0x0FFFFFFF)
+    write_sog(tmp_path / "b.sog", files | {"quats.webp": bytes(image)})
+    refused(tmp_path / "b.sog", "claim to hold")
+    with zipfile.ZipFile(tmp_path / "c.sog", "w", zipfile.ZIP_DEFLATED) as bundle:
+        bundle.writestr("meta.json", bytes(100_000_000))
+    refused(tmp_path / "c.sog", "claim to hold")
+    table, binary = glb_table(plausible(20, 0))
+    table["accessors"][3]["count"] = 19
+    refused(write_glb(tmp_path / "b.glb", table, binary), "another size")
+    table["scenes"][0]["nodes"] = [0] * 100_000
+    refused(write_glb(tmp_path / "a.glb", table, binary), "contain each other|more Gaussians")
+
+
+def test_a_sog_opens_no_files_but_its_own(tmp_path):
+    files = sog_files(plausible(20, 0))
+    for name in ("../secret.webp", "/etc/passwd", "", None):
+        meta = json.loads(files["meta.json"])
+        meta["quats"]["files"] = [name]
+        folder = tmp_path / f"scene{len(os.listdir(tmp_path))}"
+        write_sog(folder, files | {"meta.json": json.dumps(meta).encode()})
+        refused(folder, "none of its own")
+
+
+@pytest.mark.parametrize("name", ["scene.splat", "scene.glb"])
+def test_numbers_that_are_none_are_counted_or_left_out(tmp_path, name):
+    gaussians = plausible(20, 0)
+    gaussians.means[3, 1] = float("nan")
+    path = made(tmp_path, "scene.glb", gaussians)
+    if name == "scene.splat":
+        path = tmp_path / name
+        save_splat(path, plausible(20, 0))
+        data = bytearray(path.read_bytes())
+        data[96:100] = struct.pack("<f", float("inf"))
+        path.write_bytes(data)
+    refused(path, "1 of 20 Gaussians with NaN")
+    assert len(load_splat(path, drop_nonfinite=True)) == 19
+
+
+def test_what_cannot_be_written_is_refused(tmp_path):
+    gaussians = plausible(10, 0)
+    for name in ("scene.sog", "scene.glb", "scene.txt"):
+        with pytest.raises(InputError, match="cannot be written"):
+            save_splat(tmp_path / name, gaussians)
+    with pytest.raises(InputError, match="cannot hold Gaussians"):
+        save_splat(tmp_path / "far.spz", scaled(gaussians, 1e8))
+    with pytest.raises(InputError, match="no Gaussian"):
+        save_splat(tmp_path / "scene.splat", gaussians[:0])
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", [*FORMATS_BUT_PLY, "plain.spz", "folder"])
+def test_mutated_files_are_read_or_refused(tmp_path, name):
+    from mutate_splats import refusals
+
+    path = made(tmp_path, name, plausible(40, 1))
+    if path.is_dir():
+        path = path / "meta.json"
+    assert 0 < refusals(path, count=40, seed=0) <= 40
+
+
+# ---------------------------------------------------------------------------------- commands
+
+
+def test_convert_writes_once_and_says_what_it_wrote(tmp_path, monkeypatch, capsys):
+    source, out = tmp_path / "a.ply", tmp_path / "b.spz"
+    save_splat(source, replace(plausible(30, 1), generated=torch.ones(30, dtype=torch.uint8)))
+    assert run(monkeypatch, "convert", source, out) == 0
+    assert "30 Gaussians, 30 of them generated" in capsys.readouterr().out.replace("\n", " ")
+    assert run(monkeypatch, "convert", source, out) == 2
+    assert "there already" in capsys.readouterr().err
+    assert run(monkeypatch, "convert", source, out, "--overwrite", "--quiet") == 0
+    assert run(monkeypatch, "convert", source, tmp_path / "b.glb") == 2
+    assert run(monkeypatch, "convert", out, tmp_path / "c.ply") == 0
+    assert load_splat(tmp_path / "c.ply").generated.tolist() == [1] * 30
+
+
+# ------------------------------------------------------------------------------- third party
+
+
+def test_files_of_others_are_read_as_a_third_party_reads_them(shared):
+    folder = shared / "formats" / "gaussians"
+    for ours, theirs in [
+        ("guitar.compressed.ply", "guitar.from-compressed.ply"),
+        ("playbot_sog", "playbot_lod4.from-sog.ply"),
+    ]:
+        loaded = load_splat(folder / ours)
+        finite = loaded.opacities < 1  # whose logit a .ply cannot hold
+        expected = load_splat(folder / theirs, drop_nonfinite=True)
+        for field in ("means", "scales", "opacities", "sh"):
+            a, b = getattr(loaded[finite], field), getattr(expected, field)
+            assert torch.allclose(a, b, atol=2e-5, rtol=1e-5), (ours, field)
+        assert torch.allclose(covariances(loaded[finite]), covariances(expected), atol=1e-6)
+
+
+def test_a_scene_in_two_formats_of_others_is_one_scene(shared):
+    """SPZ has other axes than a compressed .ply; the pictures tell whether they were turned."""
+    folder = shared / "formats" / "gaussians"
+    spz, ply = (load_splat(folder / name) for name in ("biker.spz", "biker.compressed.ply"))
+    camera = camera_at(-0.1, -1.6, -3.0, size=96)
+    a, b = (CPU.render(scene, camera).image for scene in (spz, ply))
+    assert a.std() > 0.1
+    assert -10 * (a - b).square().mean().log10() > 32
+
+
+def test_the_smallest_files_are_read(shared):
+    folder = shared / "formats" / "gaussians" / "minimal"
+    for path in sorted(folder.iterdir()):
+        loaded = load_splat(path)
+        assert len(loaded) == 4
+        assert loaded.means[:, 2].abs().tolist() == [1, 1, 0, 0], path.name
+        assert torch.allclose(loaded.scales, torch.tensor(0.1), rtol=0.04)
+    assert len(load_splat(folder.parent / "arkit_scene.splat")) == 116_906
+
+
+@pytest.fixture
+def splat_transform():
+    """A third-party converter, as a function of two paths."""
+    cli, node = os.environ.get("SPLAT_TRANSFORM"), shutil.which("node")
+    if node is None or cli is None or not Path(cli).is_file():
+        pytest.skip("needs node, and SPLAT_TRANSFORM with the cli.mjs of splat-transform")
+    return lambda a, b: subprocess.run([node, cli, "-w", "-q", a, b], check=True)
+
+
+@pytest.mark.third_party
+@pytest.mark.parametrize("name", ["scene.ply", "four.spz", "scene.sog", *FORMATS_BUT_PLY[:2]])
+def test_a_third_party_reads_every_file_the_same(tmp_path, splat_transform, name):
+    made(tmp_path, name, plausible(600, 3))
+    compare_with_a_third_party(tmp_path, splat_transform, name)
+
+
+@pytest.mark.third_party
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_a_third_party_reads_ksplat_the_same(tmp_path, splat_transform, level):
+    write_ksplat(tmp_path / "scene.ksplat", plausible(600, 2), level)
+    compare_with_a_third_party(tmp_path, splat_transform, "scene.ksplat")
+
+
+@pytest.mark.third_party
+def test_a_third_party_reads_sog_of_version_1_the_same(tmp_path, splat_transform):
+    write_sog(tmp_path / "scene.sog", sog_files(plausible(600, 2), version=1))
+    compare_with_a_third_party(tmp_path, splat_transform, "scene.sog")
+
+
+@pytest.mark.third_party
+def test_a_third_party_reads_our_splat_nearly_the_same(tmp_path, splat_transform):
+    """It takes bytes of a rotation from -1 at 0 to 1 at 255; then none of them is 0."""
+    made(tmp_path, "scene.splat", plausible(600, 0))
+    compare_with_a_third_party(tmp_path, splat_transform, "scene.splat", loose=1e-2)
+
+
+def compare_with_a_third_party(tmp_path, splat_transform, name, loose=1e-5):
+    splat_transform(tmp_path / name, tmp_path / "theirs.ply")
+    ours, theirs = load_splat(tmp_path / name), load_splat(tmp_path / "theirs.ply")
+    for field in ("means", "scales", "opacities", "sh"):
+        assert torch.allclose(getattr(ours, field), getattr(theirs, field), atol=1e-5, rtol=1e-4)
+    assert torch.allclose(covariances(ours), covariances(theirs), atol=loose)
+
+
+@pytest.mark.third_party
+@pytest.mark.parametrize("name", ["scene.compressed.ply", "scene.spz", "scene.glb"])
+def test_what_a_third_party_writes_is_read(tmp_path, splat_transform, name):
+    save_ply(tmp_path / "ours.ply", plausible(600, 3))
+    splat_transform(tmp_path / "ours.ply", tmp_path / name)
+    assert psnr(load_splat(tmp_path / name), load_splat(tmp_path / "ours.ply")) > 33
+
+
+def test_merging_keeps_the_labels_of_both():
+    parts = [plausible(5, 0), replace(plausible(5, 0), generated=torch.ones(5, dtype=torch.uint8))]
+    assert near_together(merge(parts)).generated.sum() == 5

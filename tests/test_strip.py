@@ -1,0 +1,148 @@
+"""A completed scene gives back the file that it was made of, byte for byte."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+
+from command import run
+from gscompleter import Gaussians, load_ply, load_splat, merge, save_ply, save_splat
+from gscompleter.splats.layout import save_like
+from gscompleter.splats.removed import save_removed
+from scenes import random_gaussians
+
+
+def added(count: int = 20, sh_degree: int = 0) -> Gaussians:
+    """What a completion adds, for two targets."""
+    new = random_gaussians(count, seed=9, sh_degree=sh_degree)
+    return replace(new, generated=(torch.arange(count) % 2 + 1).to(torch.uint8))
+
+
+def stripped(monkeypatch: pytest.MonkeyPatch, completed: Path, name: str = "context.ply") -> bytes:
+    out = completed.parent / f"stripped-{name}"
+    assert run(monkeypatch, "strip", completed, "--out", out, "--quiet") == 0
+    return out.read_bytes()
+
+
+def foreign(path: Path) -> Path:
+    """A .ply that is not ours: a comment, normals, two columns more, another order."""
+    save_ply(path, random_gaussians(60, sh_degree=1))
+    vertex = plyfile.PlyData.read(str(path))["vertex"].data
+    names = list(vertex.dtype.names)
+    layout = [("label", "<i4"), *((n, "<f4") for n in reversed(names)), ("confidence", "<f8")]
+    rows = np.zeros(60, layout)
+    for name in names:
+        rows[name] = vertex[name]
+    rows["nx"], rows["label"], rows["confidence"] = 0.6, np.arange(60), np.pi
+    element = plyfile.PlyElement.describe(rows, "vertex")
+    eyes = plyfile.PlyElement.describe(np.array([(1, 2)], [("a", "u1"), ("b", "<f4")]), "eyes")
+    plyfile.PlyData([element, eyes], comments=["element vertex 5"]).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("degrees", [(0, 0), (3, 3), (3, 0), (0, 2), (1, 3)])
+def test_a_scene_that_we_wrote_comes_back(tmp_path, monkeypatch, degrees):
+    """Padding for the harmonics of what was added goes again, too."""
+    given, new = degrees
+    save_ply(tmp_path / "given.ply", random_gaussians(50, sh_degree=given))
+    scene = merge([load_ply(tmp_path / "given.ply"), added(sh_degree=new)])
+    save_ply(tmp_path / "completed.ply", scene, provenance=True)
+    expected = (tmp_path / "given.ply").read_bytes()
+    assert stripped(monkeypatch, tmp_path / "completed.ply") == expected
+
+
+def test_a_scene_to_which_nothing_was_added_comes_back(tmp_path, monkeypatch):
+    save_ply(tmp_path / "given.ply", random_gaussians(50))
+    for provenance in (False, True):
+        save_ply(tmp_path / "completed.ply", load_ply(tmp_path / "given.ply"), provenance)
+        context = stripped(monkeypatch, tmp_path / "completed.ply", f"{provenance}.ply")
+        assert context == (tmp_path / "given.ply").read_bytes()
+
+
+def test_a_file_of_another_program_comes_back(tmp_path, monkeypatch):
+    given = foreign(tmp_path / "given.ply")
+    scene = merge([load_ply(given), added(sh_degree=1)])
+    save_like(tmp_path / "completed.ply", scene, given)
+    loaded = load_ply(tmp_path / "completed.ply")
+    for field in ("means", "quats", "scales", "opacities", "sh", "generated"):
+        assert torch.allclose(getattr(loaded, field), getattr(scene, field), rtol=1e-5)
+    assert len(plyfile.PlyData.read(str(tmp_path / "completed.ply"))["eyes"].data) == 1
+    assert stripped(monkeypatch, tmp_path / "completed.ply") == given.read_bytes()
+
+
+@pytest.mark.parametrize("options", [{"text": True}, {"byte_order": ">"}])
+def test_ascii_and_big_endian_scenes(tmp_path, monkeypatch, options):
+    save_ply(tmp_path / "ours.ply", random_gaussians(30))
+    data = plyfile.PlyData.read(str(tmp_path / "ours.ply"))
+    given = tmp_path / "given.ply"
+    plyfile.PlyData(list(data.elements), **options).write(str(given))
+    save_like(tmp_path / "completed.ply", merge([load_ply(given), added()]), given)
+    context = stripped(monkeypatch, tmp_path / "completed.ply")
+    # Of an ASCII file the values come back, not the digits.
+    kept = tmp_path / "ours.ply" if "text" in options else given
+    assert len(load_ply(tmp_path / "stripped-context.ply")) == 30
+    assert "text" in options or context == kept.read_bytes()
+
+
+@pytest.mark.parametrize("case", ["labelled", "fewer harmonics", "another scene", "spz"])
+def test_where_the_layout_cannot_be_kept_ours_is_written(tmp_path, case):
+    given, context = tmp_path / "given.ply", random_gaussians(30)
+    if case == "labelled":
+        context = replace(context, generated=torch.ones(30, dtype=torch.uint8))
+    if case == "spz":
+        given = tmp_path / "given.spz"
+    save_splat(given, context)
+    first = random_gaussians(30, seed=4) if case == "another scene" else load_splat(given)
+    scene = merge([first, added(sh_degree=1 if case == "fewer harmonics" else 0)])
+    save_like(tmp_path / "completed.ply", scene, given)
+    save_ply(tmp_path / "ours.ply", scene, provenance=True)
+    assert (tmp_path / "completed.ply").read_bytes() == (tmp_path / "ours.ply").read_bytes()
+
+
+@pytest.mark.parametrize("harmonics", [0, 2])
+def test_what_was_set_aside_is_put_back_in_order(tmp_path, monkeypatch, harmonics):
+    save_ply(tmp_path / "given.ply", random_gaussians(50, sh_degree=harmonics))
+    given = load_ply(tmp_path / "given.ply")
+    rows = torch.tensor([0, 7, 8, 30, 49])
+    kept = torch.ones(50, dtype=torch.bool)
+    kept[rows] = False
+    save_removed(tmp_path / "removed.ply", given[rows], rows)
+    assert torch.equal(load_ply(tmp_path / "removed.ply").means, given.means[rows])
+    for sh_degree in (0, 3):
+        scene = merge([given[kept], added(sh_degree=sh_degree)])
+        save_ply(tmp_path / "completed.ply", scene, provenance=True)
+        context = stripped(monkeypatch, tmp_path / "completed.ply", f"{sh_degree}.ply")
+        assert context == (tmp_path / "given.ply").read_bytes()
+
+
+def test_a_removed_ply_of_another_scene_is_refused(tmp_path, monkeypatch, capsys):
+    completed, removed = tmp_path / "completed.ply", tmp_path / "removed.ply"
+    save_ply(completed, merge([random_gaussians(10), added()]), provenance=True)
+
+    def refused(sentence: str) -> None:
+        assert run(monkeypatch, "strip", completed, "--out", tmp_path / "context.ply") == 2
+        assert sentence in capsys.readouterr().err
+
+    save_ply(removed, random_gaussians(2))
+    refused("does not say where its Gaussians belong")
+    save_removed(removed, random_gaussians(2), torch.tensor([3, 99]))
+    refused("another scene")
+    save_removed(removed, random_gaussians(2), torch.tensor([3, 3]))
+    refused("do not ascend")
+    removed.unlink()
+    save_ply(completed, added())
+    refused("all of it was generated")
+    assert run(monkeypatch, "strip", removed, "--out", tmp_path / "context.ply") == 2
+    assert not (tmp_path / "context.ply").exists()
+
+
+def test_other_formats_give_back_what_they_hold(tmp_path, monkeypatch):
+    scene = merge([random_gaussians(40), added()])
+    save_splat(tmp_path / "completed.splat", scene)
+    stripped(monkeypatch, tmp_path / "completed.splat", "context.splat")
+    context = load_splat(tmp_path / "stripped-context.splat")
+    assert torch.equal(context.means, scene.means[:40])
+    assert not context.generated.any()
