@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.types import Reconstruction, View
 from gscompleter.weights.published import PUBLISHED
 
@@ -97,6 +97,7 @@ def load_reconstructor(
     """
     if name not in RECONSTRUCTORS:
         raise InputError(
-            f"There is no reconstructor {name!r}; choose one of {', '.join(RECONSTRUCTORS)}."
+            f"There is no reconstructor '{quoted(name)}'; choose one of "
+            f"{', '.join(RECONSTRUCTORS)}."
         )
     return RECONSTRUCTORS[name](None if weights is None else Path(weights), device)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.types import Camera, Gaussians, Render
 
 OpacityRender = Callable[[Float[Tensor, "n"]], Render]
@@ -68,7 +68,7 @@ def load_renderer(name: str) -> Renderer:
         from gscompleter.render.cuda import CudaRenderer
 
         return CudaRenderer()
-    raise InputError(f"There is no renderer {name!r}; choose reference, cpu or cuda.")
+    raise InputError(f"There is no renderer '{quoted(name)}'; choose reference, cpu or cuda.")
 
 
 def choose_device(device: Literal["auto", "cpu", "cuda"] = "auto") -> Literal["cpu", "cuda"]:

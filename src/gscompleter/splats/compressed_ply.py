@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, UInt8, UInt32
 from numpy import ndarray
 
+from gscompleter.errors import quoted
 from gscompleter.io.files import replacing
 from gscompleter.io.ply import Element, encode, read_header
 from gscompleter.splats.decoding import check_size, damaged, gaussians_of, harmonics
@@ -81,7 +82,7 @@ def _tables(path: Path) -> dict[str, ndarray]:
 def _row(path: Path, element: Element) -> np.dtype:
     names = [p.name for p in element.properties]
     if element.has_lists or len(set(names)) < len(names):
-        raise damaged(path, f"its element {element.name!r} holds lists or a name twice")
+        raise damaged(path, f"its element '{quoted(element.name)}' holds lists or a name twice")
     return element.dtype("<")
 
 

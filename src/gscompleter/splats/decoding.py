@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.types import SH_C0, Gaussians, observed
 
 SLACK = 1 << 20
@@ -25,7 +25,7 @@ def content(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"Cannot read {path}: {error.strerror}.") from error
+        raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
 
 
 def check_growth(path: Path, unpacked: int, packed: int, most: int) -> None:
@@ -36,7 +36,7 @@ def check_growth(path: Path, unpacked: int, packed: int, most: int) -> None:
     """
     if unpacked > SLACK + most * packed:
         raise InputError(
-            f"{path} is damaged: its {packed:,} bytes claim to hold {unpacked:,}; fetch the file "
+            f"{quoted(path)} is damaged: its {packed:,} bytes claim to hold {unpacked:,}; fetch the file "
             "again."
         )
 
@@ -49,14 +49,14 @@ def check_size(path: Path, found: int, needed: int) -> None:
     """
     if found < needed:
         raise InputError(
-            f"{path} is truncated: {found:,} of {needed:,} bytes are there; fetch or write the "
+            f"{quoted(path)} is truncated: {found:,} of {needed:,} bytes are there; fetch or write the "
             "file again."
         )
 
 
 def damaged(path: Path, what: str) -> InputError:
     """The sentence for a file whose parts contradict each other."""
-    return InputError(f"{path} is damaged: {what}; fetch or write the file again.")
+    return InputError(f"{quoted(path)} is damaged: {what}; fetch or write the file again.")
 
 
 def gaussians_of(
@@ -89,7 +89,7 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
             `drop_nonfinite` is off.
     """
     if len(gaussians) == 0:
-        raise InputError(f"{path} is empty: it holds no Gaussian.")
+        raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     good = torch.stack([torch.isfinite(f).reshape(len(f), -1).all(1) for f in fields]).all(0)
     good &= (gaussians.quats != 0).any(1)
@@ -98,10 +98,12 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
         return gaussians
     if not drop_nonfinite:
         raise InputError(
-            f"{path} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a rotation of "
+            f"{quoted(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a rotation of "
             "zeros; mend it, or drop what is not finite.",
             "drop_nonfinite",
         )
     if bad == len(good):
-        raise InputError(f"{path} holds no Gaussian without NaN or infinity; write it anew.")
+        raise InputError(
+            f"{quoted(path)} holds no Gaussian without NaN or infinity; write it anew."
+        )
     return gaussians[good]

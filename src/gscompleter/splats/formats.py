@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.splats.compressed_ply import (
     is_compressed,
@@ -96,7 +96,7 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
     path = Path(path)
     format_ = writable_format(path)
     if len(gaussians) == 0:
-        raise InputError(f"There is no Gaussian to write to {path}.")
+        raise InputError(f"There is no Gaussian to write to {quoted(path)}.")
     if format_.write is save_ply:
         save_ply(path, gaussians)
         return
@@ -117,27 +117,29 @@ def format_of(path: Path) -> str:
     if path.is_dir():
         if (path / META).is_file():
             return "sog"
-        raise InputError(f"{path} is a folder without {META}; name a file of Gaussians.")
+        raise InputError(f"{quoted(path)} is a folder without {META}; name a file of Gaussians.")
     if path.exists() and not path.is_file():
-        raise InputError(f"{path} is a device; a file of Gaussians is needed.")
+        raise InputError(f"{quoted(path)} is a device; a file of Gaussians is needed.")
     try:
         with path.open("rb") as file:
             head = file.read(HEAD)
     except OSError as error:
-        raise InputError(f"Cannot read {path}: {error.strerror}.") from error
+        raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
     if head.startswith(b"version https://git-lfs"):
         raise InputError(
-            f"{path} is a git-lfs pointer, not the scene itself; run `git lfs pull` in its "
+            f"{quoted(path)} is a git-lfs pointer, not the scene itself; run `git lfs pull` in its "
             "repository to fetch it."
         )
     if not head:
-        raise InputError(f"{path} is empty; a file of Gaussians is needed.")
+        raise InputError(f"{quoted(path)} is empty; a file of Gaussians is needed.")
     for name, format_ in FORMATS.items():
         if format_.begins is not None and format_.begins(head):
             return name
     named = _by_name(path)
     if named is None or FORMATS[named].begins is not None:
-        raise InputError(f"{path} holds no Gaussians in a format that is known: {_known()}.")
+        raise InputError(
+            f"{quoted(path)} holds no Gaussians in a format that is known: {_known()}."
+        )
     return named
 
 
@@ -150,7 +152,7 @@ def writable_format(path: Path) -> Format:
     name = _by_name(path)
     if name is None or FORMATS[name].write is None:
         raise InputError(
-            f"{path} cannot be written in the format its name asks for; name it "
+            f"{quoted(path)} cannot be written in the format its name asks for; name it "
             f"{', '.join(f.extensions[0] for f in FORMATS.values() if f.write)}."
         )
     return FORMATS[name]

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.splats.decoding import check_size, content, damaged, gaussians_of
 from gscompleter.splats.frames import ABOUT_Z, half_turned, moved
 from gscompleter.types import Gaussians, merge
@@ -70,7 +70,7 @@ def read_glb(path: Path) -> Gaussians:
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise damaged(path, f"its description means nothing ({str(error)[:80]!r})") from error
     if not parts:
-        raise InputError(f"{path} holds no Gaussians: nothing in it uses {EXTENSION}.")
+        raise InputError(f"{quoted(path)} holds no Gaussians: nothing in it uses {EXTENSION}.")
     return half_turned(merge(parts), ABOUT_Z)
 
 

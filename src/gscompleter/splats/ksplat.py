@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.splats.decoding import (
     check_size,
     content,
@@ -88,7 +88,7 @@ def read_ksplat(path: Path) -> Gaussians:
         if section.count:
             parts.append(_decoded(path, data[start:end], header, section, rows))
     if not parts:
-        raise InputError(f"{path} is empty: it holds no Gaussian.")
+        raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
     return merge(parts)
 
 
@@ -99,7 +99,7 @@ def _header(path: Path, data: bytes) -> Header:
     lowest, highest = struct.unpack_from("<ff", data, 36)
     if major != 0 or minor < 1 or level > 2:
         raise InputError(
-            f"{path} is no .ksplat that is known (version {major}.{minor}, compression {level}); "
+            f"{quoted(path)} is no .ksplat that is known (version {major}.{minor}, compression {level}); "
             "convert it to .ply."
         )
     return Header(sections, level, lowest or -1.5, highest or 1.5)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
 from gscompleter.io.ply import load_ply, read_header, save_ply
 from gscompleter.types import Gaussians, merge
@@ -56,13 +56,15 @@ def load_removed(path: Path) -> tuple[Gaussians, Int[Tensor, "n"]]:
         layout = [(e.name, e.count, [(p.name, p.kind) for p in e.properties]) for e in others]
         if layout != [("place", len(removed), [("row", "u4")])]:
             raise InputError(
-                f"{path} does not say where its Gaussians belong in the scene; without it they "
+                f"{quoted(path)} does not say where its Gaussians belong in the scene; without it they "
                 "cannot be put back in order."
             )
         file.seek(vertex.count * vertex.dtype("<").itemsize, 1)
         rows = np.frombuffer(file.read(), "<u4")
     if len(rows) != len(removed) or (np.diff(rows.astype(np.int64)) <= 0).any():
-        raise InputError(f"{path} is damaged: its rows do not ascend; fetch the file again.")
+        raise InputError(
+            f"{quoted(path)} is damaged: its rows do not ascend; fetch the file again."
+        )
     return removed, torch.from_numpy(rows.astype(np.int64))
 
 
@@ -75,7 +77,7 @@ def put_back(kept: Gaussians, removed: Gaussians, rows: Int[Tensor, "n"], path: 
     total = len(kept) + len(removed)
     if len(rows) and int(rows.max()) >= total:
         raise InputError(
-            f"{path} belongs to another scene: it names row {int(rows.max()):,} of one that has "
+            f"{quoted(path)} belongs to another scene: it names row {int(rows.max()):,} of one that has "
             f"{total:,} Gaussians."
         )
     taken: Bool[Tensor, "n"] = torch.zeros(total, dtype=torch.bool)

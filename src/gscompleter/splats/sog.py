@@ -23,7 +23,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.splats.decoding import (
     check_growth,
     content,
@@ -120,7 +120,7 @@ def _entry(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
 def _plain(path: Path, name: object) -> str:
     """The name of a file right beside `meta.json`; nothing else is opened."""
     if not isinstance(name, str) or not name or Path(name).name != name or "\0" in name:
-        raise damaged(path, f"it names a file {name!r}, which is none of its own")
+        raise damaged(path, f"it names a file '{quoted(name)}', which is none of its own")
     return name
 
 

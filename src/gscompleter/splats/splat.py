@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
 from gscompleter.splats.decoding import content, gaussians_of, harmonics
 from gscompleter.types import SH_C0, Gaussians
@@ -27,7 +27,7 @@ def read_splat(path: Path) -> Gaussians:
     data = content(path)
     if len(data) % ROW.itemsize:
         raise InputError(
-            f"{path} is truncated or no .splat: its {len(data):,} bytes are no multiple of "
+            f"{quoted(path)} is truncated or no .splat: its {len(data):,} bytes are no multiple of "
             f"{ROW.itemsize}; fetch the file again."
         )
     rows = np.frombuffer(data, ROW)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
 from gscompleter.io.ply import encode
 from gscompleter.splats.decoding import (
@@ -93,14 +93,16 @@ def _header(path: Path, data: bytes) -> Header:
     check_size(path, len(data), HEADER.size)
     magic, version, count, degree, bits, _, streams = HEADER.unpack_from(data)
     if magic != MAGIC:
-        raise InputError(f"{path} is no .spz: it holds something else that is compressed.")
+        raise InputError(f"{quoted(path)} is no .spz: it holds something else that is compressed.")
     if version not in (2, 3, 4):
-        raise InputError(f"{path} is .spz version {version}; versions 2, 3 and 4 are known.")
+        raise InputError(
+            f"{quoted(path)} is .spz version {version}; versions 2, 3 and 4 are known."
+        )
     if count == 0:
-        raise InputError(f"{path} is empty: it holds no Gaussian.")
+        raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
     if degree >= len(COEFFICIENTS) or bits > 24:
         raise InputError(
-            f"{path} has harmonics of degree {degree} and {bits} fractional bits; a .spz of "
+            f"{quoted(path)} has harmonics of degree {degree} and {bits} fractional bits; a .spz of "
             "degree 0 to 3 and at most 24 bits is needed."
         )
     return Header(version, count, degree, bits, streams)
@@ -239,7 +241,7 @@ def _fractional_bits(path: Path, gaussians: Gaussians) -> int:
     bits = 23 - int(np.ceil(np.log2(farthest + 1)))
     if bits < 0:
         raise InputError(
-            f"{path} cannot hold Gaussians {farthest:.3g} from the origin; remove the floaters or "
+            f"{quoted(path)} cannot hold Gaussians {farthest:.3g} from the origin; remove the floaters or "
             "write a .ply."
         )
     return min(bits, MOST_FRACTIONAL_BITS)

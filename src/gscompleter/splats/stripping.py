@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
 from gscompleter.io.ply import save_ply
 from gscompleter.splats.formats import format_of, load_splat, save_splat, writable_format
 from gscompleter.splats.layout import Layout, read_layout, unlabelled, with_rows, write_layout
@@ -45,7 +45,7 @@ def as_given(completed: Gaussians, path: Path) -> Gaussians:
     if place.is_file():
         given = put_back(given, *load_removed(place), place)
     if len(given) == 0:
-        raise InputError(f"{path} holds nothing that was given: all of it was generated.")
+        raise InputError(f"{quoted(path)} holds nothing that was given: all of it was generated.")
     return given
 
 
