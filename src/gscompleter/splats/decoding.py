@@ -36,8 +36,8 @@ def check_growth(path: Path, unpacked: int, packed: int, most: int) -> None:
     """
     if unpacked > SLACK + most * packed:
         raise InputError(
-            f"{quoted(path)} is damaged: its {packed:,} bytes claim to hold {unpacked:,}; fetch the file "
-            "again."
+            f"{quoted(path)} is damaged: its {packed:,} bytes claim to hold {unpacked:,}; fetch "
+            "the file again."
         )
 
 
@@ -49,8 +49,8 @@ def check_size(path: Path, found: int, needed: int) -> None:
     """
     if found < needed:
         raise InputError(
-            f"{quoted(path)} is truncated: {found:,} of {needed:,} bytes are there; fetch or write the "
-            "file again."
+            f"{quoted(path)} is truncated: {found:,} of {needed:,} bytes are there; fetch or write "
+            "the file again."
         )
 
 
@@ -98,8 +98,8 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
         return gaussians
     if not drop_nonfinite:
         raise InputError(
-            f"{quoted(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a rotation of "
-            "zeros; mend it, or drop what is not finite.",
+            f"{quoted(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a "
+            "rotation of zeros; mend it, or drop what is not finite.",
             "drop_nonfinite",
         )
     if bad == len(good):

@@ -99,8 +99,8 @@ def _header(path: Path, data: bytes) -> Header:
     lowest, highest = struct.unpack_from("<ff", data, 36)
     if major != 0 or minor < 1 or level > 2:
         raise InputError(
-            f"{quoted(path)} is no .ksplat that is known (version {major}.{minor}, compression {level}); "
-            "convert it to .ply."
+            f"{quoted(path)} is no .ksplat that is known (version {major}.{minor}, compression "
+            f"{level}); convert it to .ply."
         )
     return Header(sections, level, lowest or -1.5, highest or 1.5)
 

@@ -56,8 +56,8 @@ def load_removed(path: Path) -> tuple[Gaussians, Int[Tensor, "n"]]:
         layout = [(e.name, e.count, [(p.name, p.kind) for p in e.properties]) for e in others]
         if layout != [("place", len(removed), [("row", "u4")])]:
             raise InputError(
-                f"{quoted(path)} does not say where its Gaussians belong in the scene; without it they "
-                "cannot be put back in order."
+                f"{quoted(path)} does not say where its Gaussians belong in the scene; without it "
+                "they cannot be put back in order."
             )
         file.seek(vertex.count * vertex.dtype("<").itemsize, 1)
         rows = np.frombuffer(file.read(), "<u4")
@@ -77,8 +77,8 @@ def put_back(kept: Gaussians, removed: Gaussians, rows: Int[Tensor, "n"], path: 
     total = len(kept) + len(removed)
     if len(rows) and int(rows.max()) >= total:
         raise InputError(
-            f"{quoted(path)} belongs to another scene: it names row {int(rows.max()):,} of one that has "
-            f"{total:,} Gaussians."
+            f"{quoted(path)} belongs to another scene: it names row {int(rows.max()):,} of one "
+            f"that has {total:,} Gaussians."
         )
     taken: Bool[Tensor, "n"] = torch.zeros(total, dtype=torch.bool)
     taken[rows] = True

@@ -102,8 +102,8 @@ def _header(path: Path, data: bytes) -> Header:
         raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
     if degree >= len(COEFFICIENTS) or bits > 24:
         raise InputError(
-            f"{quoted(path)} has harmonics of degree {degree} and {bits} fractional bits; a .spz of "
-            "degree 0 to 3 and at most 24 bits is needed."
+            f"{quoted(path)} has harmonics of degree {degree} and {bits} fractional bits; a .spz "
+            "of degree 0 to 3 and at most 24 bits is needed."
         )
     return Header(version, count, degree, bits, streams)
 
@@ -241,8 +241,8 @@ def _fractional_bits(path: Path, gaussians: Gaussians) -> int:
     bits = 23 - int(np.ceil(np.log2(farthest + 1)))
     if bits < 0:
         raise InputError(
-            f"{quoted(path)} cannot hold Gaussians {farthest:.3g} from the origin; remove the floaters or "
-            "write a .ply."
+            f"{quoted(path)} cannot hold Gaussians {farthest:.3g} from the origin; remove the "
+            "floaters or write a .ply."
         )
     return min(bits, MOST_FRACTIONAL_BITS)
 
