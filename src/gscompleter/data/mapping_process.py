@@ -8,10 +8,13 @@ COLMAP itself has to say goes to the standard error.
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -40,6 +43,10 @@ LENS = "SIMPLE_RADIAL"
 """COLMAP's camera model: one focal length, one coefficient of distortion."""
 GUESSED_FOCAL = 1.2
 """Focal length as a multiple of the longer side, where EXIF does not tell it."""
+MIN_FOR_CENTRE = 10
+"""Photographs by one camera that its principal point can be told from."""
+MAX_OFF_CENTRE = 0.1
+"""Distance of a believable principal point from the centre, in longer sides of the image."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +187,7 @@ def map_all(job: Job, teller: Teller) -> dict[str, Any]:
     models = sorted(_models(job, teller), key=lambda model: -model.num_reg_images())
     if not models:
         return {"registered": [], "models": [], "points": 0, "error": 0.0}
-    largest_one = models[0]
+    largest_one = with_principal_points(models[0])
     job.model.mkdir(parents=True)
     largest_one.write(job.model)
     return {
@@ -189,6 +196,29 @@ def map_all(job: Job, teller: Teller) -> dict[str, Any]:
         "points": largest_one.num_points3D(),
         "error": largest_one.compute_mean_reprojection_error(),
     }
+
+
+def with_principal_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The model with principal points that fit it, where they can be told.
+
+    The mapper leaves them in the centres of the images, because few photographs cannot tell one
+    from a turn of the camera; nor can photographs that all look alike, which is why a point far
+    from the centre is not believed.
+    """
+    numbers = Counter(model.images[i].camera_id for i in model.reg_image_ids())
+    if min(numbers.values()) < MIN_FOR_CENTRE:
+        return model
+    refined = deepcopy(model)
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
+    pycolmap.bundle_adjustment(refined, options)
+    refined.update_point_3d_errors()
+    return refined if all(map(_is_centred, (refined.cameras[n] for n in numbers))) else model
+
+
+def _is_centred(camera: pycolmap.Camera) -> bool:
+    x, y = camera.principal_point_x, camera.principal_point_y
+    off = math.hypot(x - camera.width / 2, y - camera.height / 2)
+    return bool(off <= MAX_OFF_CENTRE * max(camera.width, camera.height))
 
 
 def _models(job: Job, teller: Teller) -> list[Any]:
