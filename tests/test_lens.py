@@ -4,16 +4,19 @@ import cv2
 import numpy as np
 import pytest
 
+from gscompleter.data.colmap.lenses import MODELS, intrinsics_of
 from gscompleter.data.lens import Distortion, Pinhole, distort, undistorted, undistortion_map
 
 PINHOLE = Pinhole(fl_x=130.0, fl_y=127.5, cx=81.5, cy=59.0, width=160, height=120)
 
 LENSES = {
-    "phone": Distortion(False, (0.058, -0.08, 0.0, 0.0), (-0.001, 0.0002)),
-    "barrel": Distortion(False, (-0.3, 0.1, -0.01, 0.0), (0.001, 0.002)),
-    "pincushion": Distortion(False, (0.3, 0.0, 0.0, 0.0)),
-    "fisheye": Distortion(True, (0.05, -0.01, 0.002, -0.001)),
-    "equidistant": Distortion(True),
+    "phone": Distortion(radial=(0.058, -0.08), tangential=(-0.001, 0.0002)),
+    "barrel": Distortion(radial=(-0.3, 0.1, -0.01), tangential=(0.001, 0.002)),
+    "pincushion": Distortion(radial=(0.3,)),
+    "rational": Distortion(radial=(0.3, -0.1, 0.03), denominator=(0.2, -0.05, 0.01)),
+    "prism": Distortion(radial=(-0.1,), prism=(0.004, -0.005)),
+    "fisheye": Distortion("equidistant", radial=(0.05, -0.01, 0.002, -0.001)),
+    "equidistant": Distortion("equidistant"),
 }
 
 
@@ -27,14 +30,13 @@ def opencv_matrix(pinhole: Pinhole) -> np.ndarray:
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_the_map_is_that_of_opencv_half_a_pixel_apart(lens):
     new = undistorted(PINHOLE, lens)
-    k1, k2, k3, _ = lens.radial
-    if lens.fisheye:
-        rectify, coefficients = cv2.fisheye.initUndistortRectifyMap, np.array(lens.radial)
+    k1, k2, k3, k4 = (*lens.radial, 0.0, 0.0, 0.0, 0.0)[:4]
+    if lens.projection == "equidistant":
+        rectify, coefficients = cv2.fisheye.initUndistortRectifyMap, np.array([k1, k2, k3, k4])
     else:
-        rectify, coefficients = (
-            cv2.initUndistortRectifyMap,
-            np.array([k1, k2, *lens.tangential, k3]),
-        )
+        (s1, s3), below = lens.prism, (*lens.denominator, 0.0, 0.0, 0.0)[:3]
+        numbers = [k1, k2, *lens.tangential, k3, *below, s1, 0.0, s3, 0.0]
+        rectify, coefficients = cv2.initUndistortRectifyMap, np.array(numbers)
     x, y = rectify(
         opencv_matrix(PINHOLE),
         coefficients,
@@ -60,12 +62,12 @@ def test_every_pixel_comes_from_the_photograph_and_little_of_it_is_lost(lens):
 
 
 def test_the_radius_grows_by_the_polynomial_of_the_first_coefficient():
-    bent = distort(np.array([[0.5, 0.0], [0.0, -1.0]]), Distortion(False, (0.1, 0.0, 0.0, 0.0)))
+    bent = distort(np.array([[0.5, 0.0], [0.0, -1.0]]), Distortion(radial=(0.1,)))
     assert np.allclose(bent, [[0.5 * 1.025, 0.0], [0.0, -1.1]])
 
 
 def test_an_equidistant_fisheye_maps_angles_to_radii():
-    bent = distort(np.array([[1.0, 0.0], [0.0, 0.0]]), Distortion(True))
+    bent = distort(np.array([[1.0, 0.0], [0.0, 0.0]]), Distortion("equidistant"))
     assert np.allclose(bent, [[np.pi / 4, 0.0], [0.0, 0.0]])
 
 
@@ -78,3 +80,105 @@ def test_the_principal_point_stays_and_pixels_keep_their_shape():
     assert (new.cx, new.cy, new.width, new.height) == (81.5, 59.0, 160, 120)
     assert new.fl_x / new.fl_y == pytest.approx(130.0 / 127.5)
     assert new.fl_x > PINHOLE.fl_x
+
+
+POINTS = np.array([[0.3, -0.2], [0.7, 0.5], [-0.01, 0.4]])
+REFERENCE = {
+    "SIMPLE_PINHOLE": ([130, 81.5, 59], [[120.5, 33.0], [172.5, 124.0], [80.2, 111.0]]),
+    "PINHOLE": ([130, 127.5, 81.5, 59], [[120.5, 33.5], [172.5, 122.75], [80.2, 110.0]]),
+    "SIMPLE_RADIAL": (
+        [130, 81.5, 59, -0.08],
+        [[120.0944, 33.2704], [167.1128, 120.152], [80.21665, 110.33398]],
+    ),
+    "RADIAL": (
+        [130, 81.5, 59, -0.08, 0.02],
+        [[120.10758, 33.26161], [168.10943, 120.86388], [80.21598, 110.36064]],
+    ),
+    "OPENCV": (
+        [130, 127.5, 81.5, 59, 0.058, -0.08, -0.001, 0.002],
+        [[120.83753, 33.28483], [172.77539, 122.71379], [80.23331, 110.30574]],
+    ),
+    "OPENCV_FISHEYE": (
+        [130, 127.5, 81.5, 59, 0.05, -0.01, 0.002, -0.001],
+        [[119.14957, 34.38298], [158.36977, 112.85108], [80.25469, 107.85463]],
+    ),
+    "FULL_OPENCV": (
+        [130, 127.5, 81.5, 59, 0.3, -0.1, 0.001, 0.002, 0.03, 0.2, -0.05, 0.01],
+        [[121.02907, 33.19274], [177.46609, 126.18856], [80.22196, 110.79195]],
+    ),
+    "FOV": (
+        [130, 127.5, 81.5, 59, 0.9],
+        [[121.78502, 32.6598], [163.00251, 116.09654], [80.16838, 111.24039]],
+    ),
+    "SIMPLE_RADIAL_FISHEYE": (
+        [130, 81.5, 59, 0.04],
+        [[119.10999, 33.92667], [158.16747, 113.76248], [80.25622, 108.75101]],
+    ),
+    "RADIAL_FISHEYE": (
+        [130, 81.5, 59, 0.04, -0.01],
+        [[119.10462, 33.93025], [157.97606, 113.62576], [80.25648, 108.74063]],
+    ),
+    "THIN_PRISM_FISHEYE": (
+        [130, 127.5, 81.5, 59, 0.05, -0.01, 0.001, 0.002, 0.003, -0.001, 0.004, -0.005],
+        [[119.27177, 34.30307], [159.00891, 112.76567], [80.36678, 107.81597]],
+    ),
+    "SIMPLE_DIVISION": (
+        [130, 81.5, 59, -0.1],
+        [[120.00577, 33.32949], [166.60957, 119.79255], [80.22017, 110.19312]],
+    ),
+    "DIVISION": (
+        [130, 127.5, 81.5, 59, 0.08],
+        [[120.91426, 33.22914], [178.63851, 127.05033], [80.18291, 110.6705]],
+    ),
+    "SIMPLE_FISHEYE": (
+        [130, 81.5, 59],
+        [[118.9307, 34.0462], [156.65041, 112.67886], [80.26339, 108.46438]],
+    ),
+    "FISHEYE": (
+        [130, 127.5, 81.5, 59],
+        [[118.9307, 34.52608], [156.65041, 111.64658], [80.26339, 107.51314]],
+    ),
+    "EUCM": (
+        [130, 127.5, 81.5, 59, 0.6, 1.1],
+        [[118.94718, 34.51531], [156.82434, 111.76842], [80.26272, 107.53946]],
+    ),
+}
+"""Parameters of COLMAP's models, and where pycolmap 4.2.1 projects POINTS with them."""
+
+
+@pytest.mark.parametrize("name", REFERENCE)
+def test_every_lens_of_colmap_bends_as_colmap_says(name):
+    parameters, expected = REFERENCE[name]
+    intrinsics = intrinsics_of(MODELS[name], (160, 120), list(map(float, parameters)), "the camera")
+    pinhole = intrinsics.at(160, 120)
+    bent = distort(POINTS, intrinsics.distortion)
+    pixels = bent * [pinhole.fl_x, pinhole.fl_y] + [pinhole.cx, pinhole.cy]
+    assert np.allclose(pixels, expected, atol=1e-4)
+
+
+def test_all_models_that_are_read_have_a_reference():
+    assert set(REFERENCE) == set(MODELS)
+
+
+@pytest.mark.parametrize("name", REFERENCE)
+def test_every_lens_of_colmap_is_removed(name):
+    parameters, _ = REFERENCE[name]
+    intrinsics = intrinsics_of(MODELS[name], (160, 120), list(map(float, parameters)), "the camera")
+    new = undistorted(intrinsics.at(160, 120), intrinsics.distortion)
+    assert new is not None
+    source = undistortion_map(intrinsics.at(160, 120), intrinsics.distortion, new)
+    assert (source > -0.002).all()
+    assert (source < [159.002, 119.002]).all()
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Distortion("division", shape=(1e4,)),
+        Distortion("unified", shape=(1.0, -1e4)),
+        Distortion(radial=(-1e4, 1e4, -1e4)),
+    ],
+    ids=str,
+)
+def test_a_lens_that_shows_nothing_has_no_pinhole_camera(lens):
+    assert undistorted(PINHOLE, lens) is None

@@ -17,6 +17,7 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.origin import frame_from_photographs, told_from
 from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.data.scene import load_cameras
+from gscompleter.data.sparse_points import with_depth_range
 from gscompleter.errors import InputError, quoted
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
@@ -47,10 +48,14 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     Raises:
         InputError: anything about the input that the user can mend; nothing is written then.
     """
+    console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, options.overwrite)
     check_context(options)
     device = choose_device(options.device)
     given = open_photographs(options.folder, options.format, options.near, options.far)
+    given = with_depth_range(given, options.context, options.resolution)
+    for note in given.notes:
+        console.print(note, highlight=False, soft_wrap=True)
     targets = read_targets(given, options)
     cameras = [given.camera(frame, options.resolution) for frame in options.context]
     cameras += [target.camera for target in targets]
@@ -70,7 +75,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         "frame": {"method": "given", "transform": frame.tolist()},
     }
     with output_folder(options.out, options.overwrite) as folder:
-        with shown_on(None if options.quiet else Console(stderr=True)):
+        with shown_on(None if options.quiet else console):
             completion = completer(views, [t.camera.to(device) for t in targets], scene)
         summary = write_report(folder, completion, targets, completer.renderer, said)
     return summary, completion

@@ -56,18 +56,20 @@ class CompleteOptions(ModelOptions):
     """Fill what the photographs never saw, as seen from the targets, and write the scene."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Posed photographs: a folder with a nerfstudio transforms.json, a chunk of pixelSplat with
-    one scene in it, or a camera file of RealEstate10K beside its frames."""
+    """Posed photographs: a folder with a COLMAP model or a nerfstudio transforms.json, a
+    cameras.json beside its photographs, a poses_bounds.npy of LLFF, a sequence of KITTI, a scene
+    of DGP, a chunk of pixelSplat, or a camera file of RealEstate10K beside its frames."""
     context: tuple[Frame, ...]
     """Numbers of the frames to start from, in the order of the sorted file paths."""
     target: tuple[str, ...]
-    """Frames to complete the scene for, by number, or a JSON file of cameras. Several are
+    """Frames to complete the scene for, by number, or a file of cameras (transforms.json,
+    cameras.json, COLMAP's images.txt, SuperSplat's poses). Several are
     completed one after the other into one scene."""
     out: Path
     """Folder for completed.ply, context.ply, images/ and summary.json."""
     format: str | None = None
-    """What SCENE is: transforms, chunks or real-estate-10k. Found by what lies there if not
-    given."""
+    """What SCENE is: colmap, transforms, cameras-json, llff, kitti, dgp, chunks or
+    real-estate-10k. Found by what lies there if not given."""
     scene: Path | None = None
     """A .ply of Gaussians to complete, in the frame of the photographs. It is kept as it is.
     Without it the context is reconstructed from the photographs."""

@@ -11,8 +11,13 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
+from gscompleter.data.camera_list import holds_camera_list, open_camera_list
 from gscompleter.data.chunks import holds_chunks, open_chunks
+from gscompleter.data.colmap.scene import holds_colmap, open_colmap
+from gscompleter.data.dgp import holds_dgp, open_dgp
+from gscompleter.data.kitti import holds_kitti, open_kitti
 from gscompleter.data.limits import check_planes
+from gscompleter.data.llff import holds_llff, open_llff
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import holds_camera_files, open_camera_files
 from gscompleter.data.transforms import holds_transforms, open_transforms
@@ -38,9 +43,22 @@ FORMATS = {
         holds_chunks,
         open_chunks,
     ),
+    "dgp": Format("a scene file of DGP or DDAD beside its calibration", holds_dgp, open_dgp),
     "transforms": Format(
         "a folder with nerfstudio's transforms.json", holds_transforms, open_transforms
     ),
+    "colmap": Format(
+        "a folder with photographs and a COLMAP model (sparse/0, as .bin or .txt)",
+        holds_colmap,
+        open_colmap,
+    ),
+    "cameras-json": Format(
+        "a cameras.json of a 3DGS trainer beside its photographs",
+        holds_camera_list,
+        open_camera_list,
+    ),
+    "llff": Format("a folder with LLFF's poses_bounds.npy", holds_llff, open_llff),
+    "kitti": Format("a sequence of KITTI odometry", holds_kitti, open_kitti),
     "real-estate-10k": Format(
         "RealEstate10K camera files (.txt, with the frames of each in the folder of its name)",
         holds_camera_files,
@@ -71,7 +89,10 @@ def open_photographs(
             f"{quoted(str(path))} holds several scenes, such as {quoted(scenes[0].name)} and "
             f"{quoted(scenes[1].name)}; name a file or folder with one of them."
         )
-    return replace(scenes[0], near=near, far=far)
+    (scene,) = scenes
+    near, far = scene.near if near is None else near, scene.far if far is None else far
+    check_planes(near, far)
+    return replace(scene, near=near, far=far)
 
 
 def format_of(path: Path, name: str | None = None) -> Format:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -53,42 +54,98 @@ class Pinhole:
         )
 
 
+Projection = Literal["perspective", "equidistant", "field-of-view", "division", "unified"]
+"""How a lens maps directions to its image plane, before any polynomial:
+
+* perspective: as a pinhole does.
+* equidistant: radii are angles to the axis (fisheye).
+* field-of-view: one angle ω; the radius is atan(2 r tan(ω/2)) / ω.
+* division: one number k; the radius is the ρ with ρ / (1 + k ρ²) = r.
+* unified: two numbers α and β; points are divided by α √(β r² + 1) + 1 - α.
+"""
+
+
 @dataclass(frozen=True)
 class Distortion:
-    """Coefficients of OpenCV's lens models."""
+    """What a lens does to points of the image plane at z = 1: a projection, then polynomials.
 
-    fisheye: bool = False
-    """Angles are polynomials of the angle to the axis, rather than radii of the radius."""
-    radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """k1 to k4; the last one belongs to the fisheye model alone."""
+    The polynomials are those of OpenCV; with the equidistant projection they are its fisheye
+    model, and COLMAP's.
+    """
+
+    projection: Projection = "perspective"
+    shape: tuple[float, ...] = ()
+    """The numbers of the projection, where it has some."""
+    radial: tuple[float, ...] = ()
+    """k1, k2, … of the even powers of the radius, from the second on."""
     tangential: tuple[float, float] = (0.0, 0.0)
-    """p1 and p2; not for the fisheye model."""
+    """p1 and p2."""
+    denominator: tuple[float, ...] = ()
+    """k4, k5 and k6 of OpenCV's rational model, whose polynomial divides the radial one."""
+    prism: tuple[float, float] = (0.0, 0.0)
+    """s1 and s3 of a thin prism: what the squared radius adds to x and y."""
 
     def __bool__(self) -> bool:
         """Whether a photograph needs undistorting."""
-        return self.fisheye or any(self.radial) or any(self.tangential)
+        polynomials = (*self.radial, *self.tangential, *self.denominator, *self.prism)
+        return self.projection != "perspective" or any(polynomials)
 
 
 def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np.ndarray, "*n 2"]:
-    """Where the lens puts points of the image plane at z = 1."""
+    """Where the lens puts points of the image plane at z = 1; NaN where it shows none of them."""
+    # Far outside the photograph polynomials overflow, and a division has no solution.
+    with np.errstate(all="ignore"):
+        return _bent(_projected(points, distortion), distortion)
+
+
+def _projected(
+    points: Float[np.ndarray, "*n 2"], distortion: Distortion
+) -> Float[np.ndarray, "*n 2"]:
+    if distortion.projection == "perspective":
+        return points
+    r = np.linalg.norm(points, axis=-1)
+    small = r < 1e-6
+    scale = _radius(np.where(small, 1e-6, r), distortion) / np.where(small, 1e-6, r)
+    return points * scale[..., None]
+
+
+def _radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndarray, "*n"]:
+    """The radius in the image of what a pinhole shows at radius r > 0."""
+    if distortion.projection == "equidistant":
+        return np.arctan(r)
+    if distortion.projection == "field-of-view":
+        (omega,) = distortion.shape
+        return np.arctan(2 * r * np.tan(omega / 2)) / omega
+    if distortion.projection == "division":
+        (k,) = distortion.shape
+        return 2 * r / (1 + np.sqrt(1 - 4 * k * r * r))
+    alpha, beta = distortion.shape
+    return r / (alpha * np.sqrt(beta * r * r + 1) + 1 - alpha)
+
+
+def _bent(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np.ndarray, "*n 2"]:
+    """What the polynomials make of projected points."""
     x, y = points[..., 0], points[..., 1]
-    k1, k2, k3, k4 = distortion.radial
     r2 = x * x + y * y
-    if distortion.fisheye:
-        r = np.sqrt(r2)
-        angle = np.arctan(r)
-        a2 = angle * angle
-        bent = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
-        return points * np.where(r > 1e-12, bent / np.maximum(r, 1e-12), 1.0)[..., None]
-    p1, p2 = distortion.tangential
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial = _polynomial(r2, distortion.radial) / _polynomial(r2, distortion.denominator)
+    (p1, p2), (s1, s3) = distortion.tangential, distortion.prism
     return np.stack(
         [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2,
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2,
         ],
         axis=-1,
     )
+
+
+def _polynomial(
+    r2: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
+) -> Float[np.ndarray, "*n"]:
+    """1 + k1 r² + k2 r⁴ + …"""
+    value = np.zeros_like(r2)
+    for k in reversed(coefficients):
+        value = r2 * (k + value)
+    return 1 + value
 
 
 @lru_cache(maxsize=16)
@@ -123,7 +180,10 @@ def undistortion_map(
     """
     x, y = np.meshgrid(np.arange(new.width) + 0.5, np.arange(new.height) + 0.5)
     pixels = _pixels(pinhole, distort(_plane_points(new, x, y), distortion))
-    return (pixels - 0.5).astype(np.float32)
+    # Where the lens shows nothing, the nearest border stands in.
+    finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
+    with np.errstate(over="ignore"):
+        return finite.astype(np.float32)
 
 
 def remap(

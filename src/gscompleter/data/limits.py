@@ -11,6 +11,8 @@ from gscompleter.errors import InputError
 
 MAX_SIDE = 16_384
 """Largest width or height of an image, in pixels."""
+MAX_IN_PIXELS = 1e12
+"""Of focal lengths and principal points in pixels, before they are compared with the image."""
 MAX_COORDINATE = 1e9
 """Farthest a camera may stand from the origin along an axis, in scene units."""
 FOCAL_RANGE = (1e-3, 1e6)
@@ -21,6 +23,9 @@ MAX_COEFFICIENT = 1e4
 """Of the coefficients of a lens."""
 DEPTH_RANGE = (1e-9, 1e9)
 """Of near and far planes, and of the units of depth maps, in scene units."""
+
+MAX_PATH = 1024
+"""Of characters in the path of a file."""
 
 
 def check_planes(near: float | None, far: float | None) -> None:

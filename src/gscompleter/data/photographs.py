@@ -7,7 +7,7 @@ intrinsics are brought to a resolution together.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -78,6 +78,13 @@ class PosedPhotographs(Protocol):
     ) -> Bool[Tensor, "h w"] | None:
         """True where the photograph of a frame is to be ignored; None where nothing is."""
 
+    def points(self) -> Float[Tensor, "n 3"] | None:
+        """Points on the surfaces of the scene, told from `origin`; None where none are known.
+
+        Raises:
+            InputError: where the file that should hold them is damaged.
+        """
+
     def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
         """Why benchmarks leave the photographs out; None where they keep them.
 
@@ -98,6 +105,10 @@ class Photographs:
     """Smallest z-depth of the scene, in scene units, where known."""
     far: float | None = None
     """Largest z-depth of the scene, in scene units, where known."""
+    notes: tuple[str, ...] = ()
+    """Sentences about what was chosen or left out when they were opened."""
+    sparse: Callable[[], Float[np.ndarray, "n 3"]] | None = None
+    """Reads points on the scene's surfaces, in the files' own frame, where there are some."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -126,6 +137,11 @@ class Photographs:
             return None
         shown = read_pixels(found.mask).max(axis=-1)
         return torch.from_numpy(fitted(found, shown, found.size(), resolution)) == 0
+
+    def points(self) -> Float[Tensor, "n 3"] | None:
+        if self.sparse is None:
+            return None
+        return torch.from_numpy(self.sparse() - self.origin).float()
 
     def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
         for number, frame in enumerate(self.frames):

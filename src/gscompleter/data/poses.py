@@ -5,6 +5,8 @@ Poses are camera-to-world transforms in OpenCV axes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -48,3 +50,18 @@ def c2w_of(viewmat: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     An invalid one may have none. It stays as it is, for its defect to be found in it.
     """
     return viewmat if pose_defect(viewmat) is not None else np.linalg.inv(viewmat)
+
+
+def rotation_of(quaternion: Sequence[float]) -> Float[np.ndarray, "3 3"]:
+    """The rotation of a quaternion of any length, real part first; NaN where it has none."""
+    q = np.array(quaternion, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        q = q / np.abs(q).max()
+        w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

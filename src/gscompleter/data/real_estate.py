@@ -17,10 +17,10 @@ from gscompleter.errors import InputError
 
 
 def holds_camera_files(path: Path) -> bool:
-    """Whether `path` is a text file or a folder with RealEstate10K camera files."""
+    """Whether `path` is a RealEstate10K camera file or a folder with some."""
     if os.path.isdir(path):
         return bool(_camera_files(path))
-    return path.suffix == ".txt" and os.path.isfile(path)
+    return path.suffix == ".txt" and _is_camera_file(path)
 
 
 def open_camera_files(path: Path) -> Iterator[Photographs]:

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.transforms import OPENCV_FROM_OPENGL, read_frames
+from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
 from gscompleter.types import Camera, View
@@ -82,13 +83,15 @@ def load_cameras(
     far: float | None = None,
     origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Camera]:
-    """All cameras of a JSON file of the form of `transforms.json`, in its order.
+    """All cameras of a file of cameras, in its order.
 
-    No images are needed where `w` and `h` are given.
+    No images are needed where the file says how large they are.
 
     Args:
-        path: The JSON file, or a folder with a `transforms.json`.
-        resolution: As in `load_views`, and so `near` and `far`.
+        path: A JSON file of the form of nerfstudio's `transforms.json`, of Inria's `cameras.json`
+            or of SuperSplat's poses, a folder with a `transforms.json`, or the images.txt or
+            images.bin of a COLMAP model.
+        resolution: As in `load_views`, and so `near` and `far`. SuperSplat's poses need it.
         origin: Where the coordinates of the scene are counted from, which is
             `open_photographs(scene).origin`, in scene units.
 
@@ -96,7 +99,7 @@ def load_cameras(
         InputError: where the file or one of its cameras is missing or impossible.
     """
     check_planes(near, far)
-    zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_frames(Path(path)))
+    zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_cameras(Path(path), resolution))
     cameras = Photographs(Path(path).stem, str(path), frames, zero, near, far)
     return [cameras.camera(number, resolution) for number in range(len(cameras))]
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,20 @@ from jaxtyping import Float
 
 from gscompleter.data.frame import Frame, capital
 from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.json_numbers import optional_number, text_of
 from gscompleter.data.lens import Distortion
-from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_SIDE
+from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
 from gscompleter.data.photographs import Photographs, photographs_of
+from gscompleter.data.point_cloud import read_point_cloud
 from gscompleter.data.poses import made_rigid, pose_defect
 from gscompleter.errors import InputError, quoted
-from gscompleter.io.json_file import read_json
+from gscompleter.io.json_file import begins_a_list, read_json
 
 NAME = "transforms.json"
+SPLITS = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
+"""The files of a scene in parts, as of the synthetic scenes of NeRF."""
+HOMES = ("", "nerfstudio")
+"""Where the file lies in the folder of a scene; DL3DV has the second."""
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """nerfstudio's cameras look along -z with y up, ours along z with y down."""
@@ -30,10 +37,6 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 ANGLE_RANGE = (1e-5, 3.14159)
 """Of opening angles, in radians; below π."""
-LARGEST = 1e12
-"""Of numbers in pixels. They are compared with the size of the image once that is known."""
-MAX_PATH = 1024
-"""Of characters in the path of a file."""
 
 Pair = tuple[float | None, float | None]
 
@@ -45,29 +48,62 @@ _INTRINSICS = (
 
 
 def holds_transforms(path: Path) -> bool:
-    """Whether `path` is a folder with a `transforms.json`, or a JSON file."""
-    return os.path.isfile(path / NAME) or (path.suffix == ".json" and os.path.isfile(path))
+    """Whether `path` is a folder with a `transforms.json`, whole or in parts, or a JSON object."""
+    if os.path.isdir(path):
+        return bool(_files(path))
+    return path.suffix == ".json" and os.path.isfile(path) and not begins_a_list(path)
 
 
 def open_transforms(path: Path) -> Iterator[Photographs]:
     """The photographs of a `transforms.json`, called by the name of its folder.
 
-    Frames are numbered in the order of their sorted `file_path`. Where one has none, as in a
-    list of cameras, the order of the file counts.
+    Frames are numbered in the order of their sorted `file_path`, those of `transforms_train.json`,
+    `_val` and `_test` together. Where one has no path, as in a list of cameras, the order of the
+    file counts. Poses and points stay in the frame of the file: the `applied_transform`, which
+    tells how the exporter came from COLMAP's frame to it, is not undone.
 
     Raises:
         InputError: as `read_frames`.
     """
-    frames = read_frames(path)
+    files = _files(path) or [path / NAME]
+    frames = [frame for file in files for frame in read_frames(file)]
     if all(frame.image is not None for frame in frames):
         frames = sorted(frames, key=lambda frame: frame.name)
-    file = _json_path(path).resolve()
-    name = file.parent.name if file.name == NAME else file.stem
-    yield photographs_of(name, str(_json_path(path)), frames)
+    whole = len(files) == 1 and files[0].name not in (NAME, *SPLITS)
+    title = str(files[0] if len(files) == 1 else path)
+    scene = photographs_of(_name_of(files[0], whole), title, frames)
+    yield replace(scene, sparse=_points_of(files))
 
 
-def read_frames(scene: Path) -> list[Frame]:
-    """The frames of a scene in the order of the file.
+def _name_of(file: Path, whole: bool) -> str:
+    """What the scene of a file is called: as its folder, or as the file with a name of its own."""
+    folder = file.resolve().parent
+    return file.stem if whole else (folder.parent if folder.name in HOMES else folder).name
+
+
+def _files(scene: Path) -> list[Path]:
+    """The JSON files of a scene, or the file itself; none where there is none."""
+    if not os.path.isdir(scene):
+        return [scene]
+    for folder in (scene / home for home in HOMES):
+        for names in ((NAME,), SPLITS):
+            files = [folder / name for name in names if os.path.isfile(folder / name)]
+            if files:
+                return files
+    return []
+
+
+def _points_of(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
+    """What reads the points that one of the files names; None where there are none."""
+    for file in files:
+        name = text_of(_read_transforms(file), "ply_file_path", str(file))
+        if name is not None and os.path.isfile(file.parent / name):
+            return partial(read_point_cloud, file.parent / name)
+    return None
+
+
+def read_frames(path: Path) -> list[Frame]:
+    """The frames of a JSON file in its order.
 
     Poses within `MAX_RIGID_ERROR` of a rigid transform are made exactly rigid (the nearest
     rotation), unless they are so already up to `FLOAT_NOISE`.
@@ -76,21 +112,21 @@ def read_frames(scene: Path) -> list[Frame]:
         InputError: where the file is missing, is not JSON or has no frames, and where a pose
             or the intrinsics of one are missing or impossible.
     """
-    path = _json_path(scene)
-    content = read_json(path, "export the scene again")
-    if not isinstance(content, dict):
-        raise InputError(f"{path} is no transforms.json: it has to be an object with `frames`.")
+    content = _read_transforms(path)
     entries = content.get("frames")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} lists no frames; its `frames` has to be a list with cameras.")
     shared = {key: content[key] for key in _INTRINSICS if key in content}
-    unit = _number(content, "depth_unit_scale_factor", str(path), *DEPTH_RANGE)
+    unit = optional_number(content, "depth_unit_scale_factor", str(path), *DEPTH_RANGE)
     unit = 1e-3 if unit is None else unit
     return [_frame(entry, i, shared, unit, path) for i, entry in enumerate(entries)]
 
 
-def _json_path(scene: Path) -> Path:
-    return scene / NAME if os.path.isdir(scene) else scene
+def _read_transforms(path: Path) -> dict[str, Any]:
+    content = read_json(path, "export the scene again")
+    if not isinstance(content, dict):
+        raise InputError(f"{path} is no transforms.json: it has to be an object with `frames`.")
+    return content
 
 
 def _frame(
@@ -100,7 +136,7 @@ def _frame(
     if not isinstance(entry, dict):
         raise InputError(f"{capital(title)} is not an object with a `transform_matrix`.")
     file_path, depth_path, mask_path = (
-        _text(entry, key, title) for key in ("file_path", "depth_file_path", "mask_path")
+        text_of(entry, key, title) for key in ("file_path", "depth_file_path", "mask_path")
     )
     if file_path is not None:
         title = f"frame {quoted(file_path)} of {path}"
@@ -135,11 +171,11 @@ def _matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:
 
 
 def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def pair(*keys: str, low: float = -LARGEST, high: float = LARGEST) -> Pair:
-        x, y = (_number(entry, key, title, low, high) for key in keys)
+    def pair(*keys: str, low: float = -MAX_IN_PIXELS, high: float = MAX_IN_PIXELS) -> Pair:
+        x, y = (optional_number(entry, key, title, low, high) for key in keys)
         return x, y
 
-    focal = pair("fl_x", "fl_y", low=1 / LARGEST)
+    focal = pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
     angle = pair("camera_angle_x", "camera_angle_y", low=ANGLE_RANGE[0], high=ANGLE_RANGE[1])
     if focal == angle == (None, None):
         raise InputError(
@@ -170,38 +206,14 @@ def _distortion(entry: Mapping[str, Any], title: str) -> Distortion:
             f"images first, or use one of {', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}."
         )
     k1, k2, k3, k4, p1, p2 = (
-        _number(entry, key, title, -MAX_COEFFICIENT, MAX_COEFFICIENT) or 0.0
+        optional_number(entry, key, title, -MAX_COEFFICIENT, MAX_COEFFICIENT) or 0.0
         for key in ("k1", "k2", "k3", "k4", "p1", "p2")
     )
     if model in FISHEYE_MODELS:
-        return Distortion(True, (k1, k2, k3, k4))
+        return Distortion("equidistant", radial=(k1, k2, k3, k4))
     if k4:
         raise InputError(
             f"The coefficient k4 of {title} belongs to fisheye lenses, and its camera model is "
             f"{model}; set it to 0, or undistort the images first."
         )
-    return Distortion(False, (k1, k2, k3, 0.0), (p1, p2))
-
-
-def _number(
-    entry: Mapping[str, Any], key: str, title: str, low: float, high: float
-) -> float | None:
-    """The number at `key`, within `low` to `high`; None where there is none."""
-    value = entry.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise InputError(
-            f"The `{key}` of {title} is {quoted(value)}; a number from {low:g} to {high:g} is "
-            "needed."
-        )
-    return float(value)
-
-
-def _text(entry: Mapping[str, Any], key: str, title: str) -> str | None:
-    value = entry.get(key)
-    if value is not None and not (isinstance(value, str) and 0 < len(value) <= MAX_PATH):
-        raise InputError(
-            f"The `{key}` of {title} is {quoted(value)}; the path of a file is needed."
-        )
-    return value
+    return Distortion(radial=(k1, k2, k3), tangential=(p1, p2))

@@ -22,6 +22,9 @@ FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
 MAX_PIXELS = 178_956_970
 """Of an image: where Pillow too takes a small file for a bomb."""
 
+_ORIENTATION = 0x0112
+"""The EXIF tag of how a photograph is to be turned; 1 for not at all."""
+
 
 def read_image(path: Path | str) -> Float[Tensor, "h w 3"]:
     """The image in a file, in [0, 1]; transparent parts are composited over black.
@@ -65,6 +68,15 @@ def image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
     """
     with _decoded(stored, name) if isinstance(stored, bytes) else _opened(stored) as image:
         return image.size
+
+
+def is_turned(path: Path) -> bool:
+    """Whether the EXIF data of a photograph tell viewers to turn it; False where it has none."""
+    try:
+        with _opened(path) as image:
+            return bool(image.getexif().get(_ORIENTATION, 1) != 1)
+    except Exception:  # whatever a damaged file does to Pillow; who reads the photograph is told
+        return False
 
 
 def read_pixels(path: Path | str) -> UInt8[np.ndarray, "h w 3"]:

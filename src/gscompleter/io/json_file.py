@@ -40,3 +40,12 @@ def _integer(digits: str) -> int:
     if len(digits.lstrip("-")) > MAX_DIGITS:
         raise ValueError(f"an integer of {len(digits.lstrip('-'))} digits")
     return int(digits)
+
+
+def begins_a_list(path: Path) -> bool:
+    """Whether a JSON file holds a list, by its first character."""
+    try:
+        with path.open("rb") as file:
+            return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
+    except OSError:
+        return False

@@ -142,7 +142,7 @@ def _property(words: list[str]) -> Property:
     return Property(words[1], _SCALARS[words[0]])
 
 
-def _read_vertices(
+def read_vertices(
     file: BinaryIO, file_format: str, ahead: list[Element], vertex: Element, path: Path
 ) -> np.ndarray:
     """The rows of `vertex` as a structured array, what stands `ahead` of it skipped."""
@@ -241,7 +241,7 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
             file_format, elements = read_header(file, path)
             vertex = _gaussian_element(elements, path)
             ahead = elements[: elements.index(vertex)]
-            vertices = _read_vertices(file, file_format, ahead, vertex, path)
+            vertices = read_vertices(file, file_format, ahead, vertex, path)
     except OSError as error:
         raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
     return _whole(_gaussians(vertices, vertex), path, drop_nonfinite)

@@ -1,0 +1,35 @@
+"""Files of cameras alone, in whatever format a user or a program wrote them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from gscompleter.data.camera_list import read_camera_list
+from gscompleter.data.colmap.scene import is_image_file, read_image_file
+from gscompleter.data.frame import Frame
+from gscompleter.data.supersplat import is_supersplat, poses_of
+from gscompleter.data.transforms import NAME, read_frames
+from gscompleter.io.json_file import read_json
+
+
+def read_cameras(path: Path, resolution: tuple[int, int] | None = None) -> list[Frame]:
+    """The cameras of a file in its order.
+
+    Args:
+        path: A JSON file of the form of nerfstudio's `transforms.json`, of Inria's `cameras.json`
+            or of SuperSplat's poses, a folder with a `transforms.json`, or the images.txt or
+            images.bin of a COLMAP model.
+        resolution: Height and width in pixels of images of which the file does not tell them.
+
+    Raises:
+        InputError: where the file or one of its cameras is missing or impossible.
+    """
+    if is_image_file(path):
+        return read_image_file(path)
+    if os.path.isdir(path):
+        return read_frames(path / NAME)
+    content = read_json(path, "name a file of cameras")
+    if is_supersplat(content):
+        return poses_of(content, path, resolution)
+    return read_camera_list(path) if isinstance(content, list) else read_frames(path)

@@ -1,0 +1,87 @@
+"""Lists of cameras as 3DGS trainers write them: the `cameras.json` of Inria's code.
+
+Each entry has id, img_name, width, height, position, rotation, fx and fy. Position and rotation
+are camera-to-world in OpenCV axes; the principal point is the middle of the image.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.frame import Frame, capital
+from gscompleter.data.image_folders import ImageFinder, with_photographs
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.json_numbers import array_of, number_of, size_of, text_of
+from gscompleter.data.limits import MAX_IN_PIXELS
+from gscompleter.data.photographs import Photographs, photographs_of
+from gscompleter.data.poses import made_rigid, pose_defect
+from gscompleter.errors import InputError, quoted
+from gscompleter.io.json_file import begins_a_list, read_json
+
+NAME = "cameras.json"
+ADVICE = "export the cameras again"
+
+
+def holds_camera_list(path: Path) -> bool:
+    """Whether `path` is a JSON list of cameras, or a folder with one called `cameras.json`."""
+    file = path / NAME if os.path.isdir(path) else path
+    return file.suffix == ".json" and os.path.isfile(file) and begins_a_list(file)
+
+
+def open_camera_list(path: Path) -> Iterator[Photographs]:
+    """The photographs of a `cameras.json`, called by the name of its folder.
+
+    They lie beside it, in `images` or in one of the other folders of photographs. Frames are
+    numbered in the order of the sorted names of those whose photograph is there.
+
+    Raises:
+        InputError: as `read_camera_list`, and where none of the photographs is there.
+    """
+    file = path / NAME if os.path.isdir(path) else path
+    finder = ImageFinder([file.parent])
+    frames = [finder.placed(frame) for frame in read_camera_list(file)]
+    there, notes = with_photographs(frames, str(file))
+    name = file.resolve().parent.name if file.name == NAME else file.stem
+    yield replace(photographs_of(name, str(file), there), notes=notes)
+
+
+def read_camera_list(path: Path) -> list[Frame]:
+    """The cameras of a JSON list in its order, without photographs.
+
+    Raises:
+        InputError: where it is damaged, or a camera is impossible.
+    """
+    content = read_json(path, ADVICE)
+    if not isinstance(content, list) or not content:
+        raise InputError(f"{quoted(path)} lists no cameras; a list of cameras is needed, {ADVICE}.")
+    return [_frame(entry, number, path) for number, entry in enumerate(content)]
+
+
+def _frame(entry: Any, number: int, path: Path) -> Frame:
+    title = f"camera {number} of {quoted(path)}"
+    if not isinstance(entry, dict):
+        raise InputError(f"{capital(title)} is no object with a position and a rotation; {ADVICE}.")
+    fx, fy = (
+        number_of(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
+    )
+    name = text_of(entry, "img_name", title) or str(entry.get("id", number))
+    intrinsics = Intrinsics(size_of(entry, title), (fx, fy))
+    frame = Frame(name, title, _pose(entry, title), intrinsics, None)
+    defect = pose_defect(frame.c2w)
+    if defect is not None:
+        raise frame.unusable(defect)
+    return replace(frame, c2w=made_rigid(frame.c2w))
+
+
+def _pose(entry: dict[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
+    c2w = np.eye(4)
+    c2w[:3, :3] = array_of(entry, "rotation", (3, 3), title)
+    c2w[:3, 3] = array_of(entry, "position", (3,), title)
+    return c2w

@@ -1,0 +1,141 @@
+"""COLMAP's binary files: cameras.bin, images.bin and points3D.bin.
+
+What a file claims to hold is compared with its size before anything is made room for.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from struct import Struct
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.colmap.lenses import intrinsics_of, model_called
+from gscompleter.data.colmap.records import PosedImage, portable
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.errors import InputError, quoted
+
+MAX_NAME = 1024
+"""Of bytes in the name of an image."""
+
+_COUNT = Struct("<Q")
+_CAMERA = Struct("<IiQQ")
+_IMAGE = Struct("<I4d3dI")
+_FEATURE = Struct("<ddq")
+_POINT = Struct("<Q3d3Bd")
+_SIGHTING = Struct("<II")
+
+
+def read_cameras(path: Path) -> dict[int, Intrinsics]:
+    """The cameras of a cameras.bin by their numbers.
+
+    Raises:
+        InputError: where it cannot be read or is damaged, or a camera is impossible.
+    """
+    with _opened(path) as records:
+        count = records.count(_CAMERA.size)
+        return dict(_camera(records) for _ in range(count))
+
+
+def read_images(path: Path) -> list[PosedImage]:
+    """The images of an images.bin, in its order. Their features are skipped.
+
+    Raises:
+        InputError: where it cannot be read or is damaged.
+    """
+    with _opened(path) as records:
+        count = records.count(_IMAGE.size + 1 + _COUNT.size)
+        return [_image(records) for _ in range(count)]
+
+
+def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """The points of a points3D.bin, in scene units. Their sightings are skipped.
+
+    Raises:
+        InputError: where it cannot be read or is damaged.
+    """
+    coordinates = array("d")
+    with _opened(path) as records:
+        for _ in range(records.count(_POINT.size + _COUNT.size)):
+            coordinates.extend(records.numbers(_POINT)[1:4])
+            records.skip(records.count(_SIGHTING.size) * _SIGHTING.size)
+    return np.array(coordinates, dtype=np.float64).reshape(-1, 3)
+
+
+def _camera(records: _Records) -> tuple[int, Intrinsics]:
+    number, model_number, width, height = records.numbers(_CAMERA)
+    title = f"camera {number} of {quoted(records.path)}"
+    model = model_called(model_number, title)
+    numbers = records.numbers(Struct(f"<{len(model.parameters)}d"))
+    return number, intrinsics_of(model, (width, height), numbers, title)
+
+
+def _image(records: _Records) -> PosedImage:
+    _, *pose, camera = records.numbers(_IMAGE)
+    name = portable(records.text())
+    records.skip(records.count(_FEATURE.size) * _FEATURE.size)
+    return PosedImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Records]:
+    try:
+        with path.open("rb") as file:
+            if os.fstat(file.fileno()).st_size == 0:
+                raise InputError(f"{quoted(path)} is empty; export the model again.")
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                yield _Records(content, path)
+    except OSError as error:
+        raise InputError(
+            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+        ) from error
+
+
+class _Records:
+    """The values of a file, one after the other, and never one that it does not hold."""
+
+    def __init__(self, content: mmap.mmap, path: Path) -> None:
+        self.content = content
+        self.path = path
+        self.position = 0
+
+    def numbers(self, form: Struct) -> tuple[Any, ...]:
+        """The next numbers."""
+        start = self.position
+        self.skip(form.size)
+        return form.unpack_from(self.content, start)
+
+    def count(self, smallest: int) -> int:
+        """How many records of at least so many bytes come next, as the file claims."""
+        (count,) = self.numbers(_COUNT)
+        if count * smallest > len(self.content) - self.position:
+            raise self._damaged()
+        return int(count)
+
+    def text(self) -> str:
+        """The characters up to the next zero."""
+        end = self.content.find(b"\0", self.position, self.position + MAX_NAME)
+        if end < 0:
+            raise self._damaged()
+        text = os.fsdecode(self.content[self.position : end])
+        self.position = end + 1
+        return text
+
+    def skip(self, size: int) -> None:
+        """Go on `size` bytes later."""
+        if size > len(self.content) - self.position:
+            raise self._damaged()
+        self.position += size
+
+    def _damaged(self) -> InputError:
+        return InputError(
+            f"{quoted(self.path)} is truncated or no such file of COLMAP: it claims more than its "
+            f"{len(self.content):,} bytes hold; export the model again."
+        )

@@ -1,0 +1,113 @@
+"""COLMAP's camera models, as pinhole intrinsics and the distortion before them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.lens import Distortion, Projection
+from gscompleter.data.limits import MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
+from gscompleter.errors import InputError, quoted
+
+
+@dataclass(frozen=True)
+class Model:
+    """A camera model: its number in binary files, and what its parameters are."""
+
+    number: int
+    parameters: tuple[str, ...]
+    projection: Projection = "perspective"
+
+
+def _model(number: int, parameters: str, projection: Projection = "perspective") -> Model:
+    return Model(number, tuple(parameters.split()), projection)
+
+
+MODELS = {
+    "SIMPLE_PINHOLE": _model(0, "f cx cy"),
+    "PINHOLE": _model(1, "fx fy cx cy"),
+    "SIMPLE_RADIAL": _model(2, "f cx cy k1"),
+    "RADIAL": _model(3, "f cx cy k1 k2"),
+    "OPENCV": _model(4, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": _model(5, "fx fy cx cy k1 k2 k3 k4", "equidistant"),
+    "FULL_OPENCV": _model(6, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+    "FOV": _model(7, "fx fy cx cy omega", "field-of-view"),
+    "SIMPLE_RADIAL_FISHEYE": _model(8, "f cx cy k1", "equidistant"),
+    "RADIAL_FISHEYE": _model(9, "f cx cy k1 k2", "equidistant"),
+    "THIN_PRISM_FISHEYE": _model(10, "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3", "equidistant"),
+    "SIMPLE_DIVISION": _model(12, "f cx cy k", "division"),
+    "DIVISION": _model(13, "fx fy cx cy k", "division"),
+    "SIMPLE_FISHEYE": _model(14, "f cx cy", "equidistant"),
+    "FISHEYE": _model(15, "fx fy cx cy", "equidistant"),
+    "EUCM": _model(16, "fx fy cx cy alpha beta", "unified"),
+}
+"""By the names that COLMAP gives them. The coefficients k4 to k6 of FULL_OPENCV divide, and are
+called d1 to d3 here; s1 and s3 are COLMAP's sx1 and sy1."""
+
+NUMBERS = {model.number: name for name, model in MODELS.items()}
+"""The names of models by their numbers in binary files."""
+
+_SHAPES = ("omega", "k", "alpha", "beta")
+_CENTERS = ("f", "fx", "fy", "cx", "cy")
+
+
+def model_called(name: str | int, title: str) -> Model:
+    """The model of that name, or with that number.
+
+    Raises:
+        InputError: where it is not one of `MODELS`.
+    """
+    known = NUMBERS.get(name) if isinstance(name, int) else name
+    if known not in MODELS:
+        raise InputError(
+            f"The camera model {quoted(str(name))} of {title} is not supported; undistort the "
+            "photographs with `colmap image_undistorter`, which writes a PINHOLE model."
+        )
+    return MODELS[known]
+
+
+def intrinsics_of(
+    model: Model, size: tuple[int, int], numbers: Sequence[float], title: str
+) -> Intrinsics:
+    """The intrinsics and the lens of a camera.
+
+    Args:
+        model: One of `MODELS`.
+        size: Width and height in pixels.
+        numbers: As many as the model has parameters.
+        title: What error messages call the camera.
+
+    Raises:
+        InputError: where the size or a number is impossible.
+    """
+    if not all(1 <= side <= MAX_SIDE for side in size):
+        raise InputError(
+            f"The size of {title} is {quoted(size[0])} × {quoted(size[1])}; sides from 1 to "
+            f"{MAX_SIDE} pixels are needed."
+        )
+    values = dict(zip(model.parameters, numbers, strict=True))
+    for name, value in values.items():
+        limit = MAX_IN_PIXELS if name in _CENTERS else MAX_COEFFICIENT
+        if not abs(value) <= limit:
+            raise InputError(
+                f"The parameter {name} of {title} is {value:g}; a number of at most {limit:g} is "
+                "needed."
+            )
+    focal = values.get("f", values.get("fx", 0.0)), values.get("f", values.get("fy", 0.0))
+    center = values["cx"], values["cy"]
+    return Intrinsics(size, focal, center, distortion=_distortion(model, values))
+
+
+def _distortion(model: Model, values: dict[str, float]) -> Distortion:
+    def numbers(*names: str) -> tuple[float, ...]:
+        return tuple(values[name] for name in names if name in values)
+
+    return Distortion(
+        model.projection,
+        shape=numbers(*_SHAPES),
+        radial=numbers("k1", "k2", "k3", "k4"),
+        tangential=(values.get("p1", 0.0), values.get("p2", 0.0)),
+        denominator=numbers("d1", "d2", "d3"),
+        prism=(values.get("s1", 0.0), values.get("s3", 0.0)),
+    )

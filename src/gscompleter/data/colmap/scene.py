@@ -1,0 +1,204 @@
+"""Photographs with a COLMAP model, in the layouts in which users hold them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.colmap import binary, text
+from gscompleter.data.colmap.records import PosedImage
+from gscompleter.data.frame import Frame
+from gscompleter.data.image_folders import (
+    FOLDERS,
+    ORIGINALS,
+    ImageFinder,
+    find_path,
+    with_photographs,
+)
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.photographs import Photographs, photographs_of
+from gscompleter.data.point_cloud import read_point_cloud
+from gscompleter.errors import InputError, quoted
+from gscompleter.io.image import is_turned
+
+DISTORTED = "distorted"
+"""The folder of a model with its lens, beside the undistorted photographs of 3DGS's scripts."""
+HOMES = ("sparse", "colmap/sparse", f"{DISTORTED}/sparse", "")
+"""Where the models of a scene lie, in the order in which they are looked for. A home is a model
+itself, or holds some in folders with a number for a name."""
+FILES = ("cameras", "images")
+"""Without them there is no model. `rigs` and `frames`, since COLMAP 3.12, tell nothing that the
+poses of the images do not."""
+
+_READERS = {".bin": binary, ".txt": text}
+
+
+def holds_colmap(path: Path) -> bool:
+    """Whether `path` is a scene with a COLMAP model, a model, or the images file of one."""
+    return is_image_file(path) or bool(_models(path))
+
+
+def open_colmap(path: Path) -> Iterator[Photographs]:
+    """The photographs of a scene, called by the name of its folder.
+
+    Of several models the one with most images is opened. Frames are numbered in the order of
+    the sorted names of those images whose photograph is there.
+
+    Args:
+        path: The folder of a scene, the folder of a model, or its images file.
+
+    Raises:
+        InputError: where there is no model or it is damaged, and where none of its photographs
+            is there.
+    """
+    if is_image_file(path):
+        yield _scene(path.parent, path.parent, read_image_file(path), ())
+        return
+    models = _models(path)
+    if not models:
+        raise InputError(
+            f"There is no COLMAP model in {quoted(path)}; a folder sparse/0 with its cameras "
+            "and images, as .bin or .txt, is needed."
+        )
+    frames = [_frames_of(model) for model in models]
+    best = max(range(len(models)), key=lambda number: len(frames[number]))
+    notes = _choice(models, [len(f) for f in frames], best)
+    yield _scene(path, models[best], frames[best], notes)
+
+
+def read_image_file(path: Path) -> list[Frame]:
+    """The cameras of an images.txt or images.bin in its order, without photographs.
+
+    Raises:
+        InputError: where it is damaged, or there is no cameras file beside it.
+    """
+    cameras = _file(path.parent, "cameras")
+    if cameras is None:
+        raise InputError(
+            f"There is no cameras.txt or cameras.bin beside {quoted(path)}, and it holds "
+            "poses only; copy it there from the same model."
+        )
+    return _frames(cameras, path)
+
+
+def is_image_file(path: Path) -> bool:
+    """Whether `path` is the file of a COLMAP model that holds its poses."""
+    name = path.name.casefold()
+    return name in {f"images{ending}" for ending in _READERS} and os.path.isfile(path)
+
+
+def _models(path: Path) -> list[Path]:
+    """The folders of the models of a scene, all of one home."""
+    if not os.path.isdir(path):
+        return []
+    homes = [find_path(path, home) for home in HOMES]
+    found = ([f for f in (home, *_numbered(home)) if _is_model(f)] for home in homes if home)
+    return next((models for models in found if models), [])
+
+
+def _numbered(home: Path) -> list[Path]:
+    names = os.listdir(home) if os.path.isdir(home) else []
+    return [home / name for name in sorted(names) if name.isdecimal()]
+
+
+def _is_model(folder: Path) -> bool:
+    return all(_file(folder, name) is not None for name in FILES)
+
+
+def _file(folder: Path, name: str) -> Path | None:
+    """A file of a model, binary rather than text; None where there is none."""
+    found = (find_path(folder, name + ending) for ending in _READERS)
+    return next((path for path in found if path is not None and os.path.isfile(path)), None)
+
+
+def _frames_of(model: Path) -> list[Frame]:
+    cameras, images = (_file(model, name) for name in FILES)
+    assert cameras is not None
+    assert images is not None
+    return _frames(cameras, images)
+
+
+def _frames(cameras_file: Path, images_file: Path) -> list[Frame]:
+    """The frames of a model in the order of its file, without photographs."""
+    cameras = _READERS[cameras_file.suffix.lower()].read_cameras(cameras_file)
+    images = _READERS[images_file.suffix.lower()].read_images(images_file)
+    if not images:
+        raise InputError(f"{quoted(images_file)} lists no images; export the model again.")
+    return [_frame(image, cameras, images_file) for image in images]
+
+
+def _frame(image: PosedImage, cameras: dict[int, Intrinsics], path: Path) -> Frame:
+    title = f"image {quoted(image.name)} of {quoted(path)}"
+    if image.camera not in cameras:
+        raise InputError(
+            f"The {title} was taken by camera {image.camera}, which is not in the cameras file "
+            "beside it; export the model again."
+        )
+    return Frame(image.name, title, image.c2w(), cameras[image.camera], None)
+
+
+def _scene(
+    scene: Path, model: Path, frames: Sequence[Frame], notes: tuple[str, ...]
+) -> Photographs:
+    roots = _roots(scene, model)
+    # Beside a model with a lens, `images` may hold photographs that have lost theirs.
+    lens = any(root.name.casefold() == DISTORTED for root in roots)
+    finder = ImageFinder(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
+    there, missing = with_photographs([finder.placed(frame) for frame in frames], str(model))
+    notes += missing + _turned(there[0])
+    photographs = photographs_of(roots[-1].name, str(model), there)
+    return replace(photographs, notes=notes, sparse=_points_of(model))
+
+
+def _roots(scene: Path, model: Path) -> list[Path]:
+    """The folder of a model and those above it, up to that of the scene.
+
+    Where the path of the model itself was given, its name and the next ones tell where that is.
+    """
+    top, roots = Path(os.path.abspath(scene)), [Path(os.path.abspath(model))]
+    while top in roots[-1].parents or _is_part(roots[-1]):
+        roots.append(roots[-1].parent)
+    return roots
+
+
+def _is_part(folder: Path) -> bool:
+    """Whether a folder is one of `HOMES` or a numbered model in it, rather than a scene."""
+    parts = {part for home in HOMES if home for part in home.split("/")}
+    numbered = folder.name.isdecimal() and folder.parent.name.casefold() in parts
+    return numbered or folder.name.casefold() in parts
+
+
+def _choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
+    if len(models) == 1:
+        return ()
+    others = ", ".join(str(size) for number, size in enumerate(sizes) if number != best)
+    return (
+        f"{len(models)} models lie in {models[best].parent}: the one in {models[best].name} with "
+        f"{sizes[best]} images was opened, of the others with {others} nothing is used.",
+    )
+
+
+def _turned(frame: Frame) -> tuple[str, ...]:
+    """What is said where photographs are to be turned, which COLMAP does not do."""
+    if not isinstance(frame.image, Path) or not is_turned(frame.image):
+        return ()
+    return (
+        f"The photographs are to be turned by their EXIF data, as {quoted(frame.name)} is: they "
+        "are used as they are stored, which is how COLMAP saw them.",
+    )
+
+
+def _points_of(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
+    """What reads the points of a model; None where it has no file of points."""
+    path = _file(model, "points3D")
+    if path is not None:
+        return partial(_READERS[path.suffix.lower()].read_points, path)
+    # 3DGS's script leaves them as a PLY.
+    cloud = find_path(model, "points3D.ply")
+    return None if cloud is None else partial(read_point_cloud, cloud)

@@ -1,0 +1,107 @@
+"""COLMAP's text files: cameras.txt, images.txt and points3D.txt.
+
+Other programs write them too, and leave out the lines of features or add empty ones. So lines are
+told apart by what stands in them and not by counting.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.colmap.lenses import intrinsics_of, model_called
+from gscompleter.data.colmap.records import PosedImage, portable
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.errors import InputError, quoted
+
+
+def read_cameras(path: Path) -> dict[int, Intrinsics]:
+    """The cameras of a cameras.txt by their numbers.
+
+    Raises:
+        InputError: where it cannot be read, a line is damaged, or a camera is impossible.
+    """
+    return dict(_camera(line, place) for line, place in _lines(path))
+
+
+def read_images(path: Path) -> list[PosedImage]:
+    """The images of an images.txt, in its order. Their features are skipped.
+
+    Raises:
+        InputError: where it cannot be read, or a line is damaged.
+    """
+    return [_image(line, place) for line, place in _lines(path) if not _lists_features(line)]
+
+
+def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """The points of a points3D.txt, in scene units. Their sightings are skipped.
+
+    Raises:
+        InputError: where it cannot be read, or a line is damaged.
+    """
+    coordinates = array("d")
+    for line, place in _lines(path):
+        try:
+            _, x, y, z, *_ = line.split(maxsplit=4)
+            coordinates.extend((float(x), float(y), float(z)))
+        except ValueError as error:
+            raise _damaged(place, line, "POINT3D_ID X Y Z …") from error
+    return np.array(coordinates, dtype=np.float64).reshape(-1, 3)
+
+
+def _camera(line: str, place: str) -> tuple[int, Intrinsics]:
+    try:
+        number, name, width, height, *words = line.split()
+        size, numbers = (int(width), int(height)), [float(word) for word in words]
+        title = f"camera {int(number)} of {place}"
+    except ValueError as error:
+        raise _damaged(place, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…") from error
+    model = model_called(name, title)
+    if len(numbers) != len(model.parameters):
+        raise InputError(
+            f"The model {name} of {title} has the {len(model.parameters)} parameters "
+            f"{' '.join(model.parameters)}, and {len(numbers)} are given; export the model again."
+        )
+    return int(number), intrinsics_of(model, size, numbers, title)
+
+
+def _image(line: str, place: str) -> PosedImage:
+    try:
+        *words, camera, name = line.split(maxsplit=9)
+        _, *pose = (float(word) for word in words)
+        if len(pose) != 7:
+            raise ValueError
+        return PosedImage(portable(name.strip()), int(camera), tuple(pose[:4]), tuple(pose[4:]))
+    except ValueError as error:
+        form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+        raise _damaged(place, line, form) from error
+
+
+def _lists_features(line: str) -> bool:
+    """Whether a line holds triples X Y POINT3D_ID, rather than a pose and a name."""
+    words = line.split()
+    return len(words) % 3 == 0 and words[-1].lstrip("-").isdecimal()
+
+
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """The lines that say something, each with where it stands."""
+    try:
+        # Names may be of any encoding, and are handed on to the file system as they are.
+        with path.open(encoding="utf-8-sig", errors="surrogateescape") as file:
+            for number, line in enumerate(file, start=1):
+                if line.strip() and not line.lstrip().startswith("#"):
+                    yield line, f"line {number} of {quoted(path)}"
+    except OSError as error:
+        raise InputError(
+            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+        ) from error
+
+
+def _damaged(place: str, line: str, form: str) -> InputError:
+    return InputError(
+        f"The {place} is '{quoted(line.strip())}', where {form} is needed; export the model again."
+    )

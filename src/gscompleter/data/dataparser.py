@@ -1,0 +1,39 @@
+"""The frame that nerfstudio trains in, as the `dataparser_transforms.json` of a run tells it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.json_numbers import array_of, number_of
+from gscompleter.data.poses import pose_defect
+from gscompleter.errors import InputError, quoted
+from gscompleter.io.json_file import read_json
+
+SCALE_RANGE = (1e-9, 1e9)
+
+
+def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
+    """The similarity from the frame of `transforms.json` to that of the trained scene.
+
+    The file holds a rotation and a translation (`transform`, 3×4), and a `scale` that multiplies
+    what they give.
+
+    Raises:
+        InputError: where the file cannot be read, or holds no such transform.
+    """
+    content = read_json(path, "copy it from the folder of the nerfstudio run again")
+    if not isinstance(content, dict):
+        raise InputError(
+            f"{quoted(path)} is no object with `transform` and `scale`; copy it again."
+        )
+    rigid = np.vstack([array_of(content, "transform", (3, 4), str(path)), [0, 0, 0, 1]])
+    defect = pose_defect(rigid)
+    if defect is not None:
+        raise InputError(
+            f"The `transform` of {quoted(path)} cannot be used: {defect}; copy it again."
+        )
+    scale = number_of(content, "scale", str(path), *SCALE_RANGE)
+    return np.diag([scale, scale, scale, 1.0]) @ rigid

@@ -1,0 +1,143 @@
+"""DGP's scenes, as DDAD publishes them: a JSON file of all sensors, and one of calibrations.
+
+Every image has the pose of its camera, camera-to-world in OpenCV axes. A sample names the
+calibration that its images share, which lists intrinsics by the names of the cameras.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.frame import Frame
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.json_numbers import number_of, size_of, text_of
+from gscompleter.data.limits import MAX_COORDINATE, MAX_IN_PIXELS
+from gscompleter.data.photographs import Photographs, photographs_of
+from gscompleter.data.poses import rotation_of
+from gscompleter.errors import InputError, quoted
+from gscompleter.io.json_file import read_json
+
+CALIBRATIONS = "calibration"
+ADVICE = "download the scene again"
+MAX_SNIFFED = 1 << 26
+"""Bytes at the beginning of a file that tell whether it is a scene."""
+
+
+def holds_dgp(path: Path) -> bool:
+    """Whether `path` is the scene file of DGP, or a folder with one."""
+    return _scene_file(path) is not None
+
+
+def open_dgp(path: Path) -> Iterator[Photographs]:
+    """The photographs of a scene of DGP, called by the name of its folder.
+
+    Frames of all cameras are numbered together in the order of their sorted names, which are
+    paths below the folder: all of the first camera, then all of the second.
+
+    Raises:
+        InputError: where there is no scene file, it or the calibration is damaged, or no image is
+            listed.
+    """
+    file = _scene_file(path)
+    if file is None:
+        raise InputError(f"There is no scene of DGP in {quoted(path)}; name its scene.json.")
+    content = read_json(file, ADVICE)
+    cameras = _calibrations(file, content)
+    images = [datum for datum in _list(content, "data") if "image" in _object(datum, "datum")]
+    frames = sorted((_frame(d, cameras, file) for d in images), key=lambda frame: frame.name)
+    if not frames:
+        raise InputError(f"{quoted(file)} lists no images; name a scene with cameras.")
+    yield photographs_of(file.resolve().parent.name, str(file), frames)
+
+
+def _frame(datum: Any, cameras: Mapping[str, Intrinsics], file: Path) -> Frame:
+    image, camera = _object(datum["datum"], "image"), _object(datum, "id").get("name")
+    name = text_of(image, "filename", str(file))
+    title = f"image {quoted(name)} of {quoted(file)}"
+    if name is None or not isinstance(camera, str) or camera not in cameras:
+        raise InputError(
+            f"The {title} has no file name, or its camera {quoted(camera)} is not in the "
+            f"calibration; {ADVICE}."
+        )
+    given = cameras[camera]
+    intrinsics = Intrinsics(size_of(image, title), given.focal, given.center)
+    return Frame(name, title, _pose(_object(image, "pose"), title), intrinsics, file.parent / name)
+
+
+def _pose(pose: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
+    def numbers(part: str, *keys: str) -> list[float]:
+        entry = _object(pose, part)
+        return [number_of(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
+
+    c2w = np.eye(4)
+    c2w[:3, :3] = rotation_of(numbers("rotation", "qw", "qx", "qy", "qz"))
+    c2w[:3, 3] = numbers("translation", "x", "y", "z")
+    return c2w
+
+
+def _calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
+    """The intrinsics of the cameras by their names, without the size of their images."""
+    file = _calibration_file(scene, content)
+    calibration = read_json(file, ADVICE)
+    names, entries = _list(calibration, "names"), _list(calibration, "intrinsics")
+    # Those of other sensors than cameras are zeros.
+    pairs = [(n, e) for n, e in zip(names, entries, strict=False) if _is_camera(n, e)]
+    return {
+        name: _intrinsics(entry, f"camera {quoted(name)} of {quoted(file)}")
+        for name, entry in pairs
+    }
+
+
+def _is_camera(name: Any, entry: Any) -> bool:
+    return isinstance(name, str) and isinstance(entry, dict) and entry.get("fx") not in (None, 0)
+
+
+def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
+    fx, fy = (
+        number_of(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
+    )
+    cx, cy = (number_of(entry, key, title, -MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("cx", "cy"))
+    return Intrinsics(None, (fx, fy), (cx, cy))
+
+
+def _calibration_file(scene: Path, content: Any) -> Path:
+    """The calibration of the first sample: `calibration/KEY.json`, or calibration.json."""
+    samples = _list(content, "samples")
+    key = samples[0].get("calibration_key") if samples and isinstance(samples[0], dict) else None
+    folder = scene.parent / CALIBRATIONS
+    candidates = [folder / f"{key}.json", scene.with_name(f"{CALIBRATIONS}.json")]
+    found = next((path for path in candidates if os.path.isfile(path)), None)
+    if found is None:
+        raise InputError(
+            f"The calibration of {quoted(scene)} is missing; put it at {quoted(candidates[0])}."
+        )
+    return found
+
+
+def _scene_file(path: Path) -> Path | None:
+    """The scene file that `path` is or holds; None where there is none."""
+    files = sorted(path.glob("scene*.json")) if os.path.isdir(path) else [path]
+    return next((file for file in files if _is_scene(file)), None)
+
+
+def _is_scene(path: Path) -> bool:
+    if path.suffix != ".json" or not os.path.isfile(path):
+        return False
+    with path.open("rb") as file:
+        return b'"datum"' in file.read(MAX_SNIFFED)
+
+
+def _list(content: Any, key: str) -> list[Any]:
+    value = content.get(key) if isinstance(content, dict) else None
+    return value if isinstance(value, list) else []
+
+
+def _object(content: Any, key: str) -> dict[str, Any]:
+    value = content.get(key) if isinstance(content, dict) else None
+    return value if isinstance(value, dict) else {}

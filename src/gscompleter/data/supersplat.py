@@ -1,0 +1,93 @@
+"""Camera poses that SuperSplat keeps: the `poseSets` of a project's document.json, or the list.
+
+A pose has a position and a target in SuperSplat's world, which is that of the splat turned by half
+a turn about z, so that y points up. It says neither how large the image is nor how it is rolled:
+SuperSplat's cameras stand upright, and their opening angle is that of the longer side.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.frame import Frame, capital
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.json_numbers import array_of, optional_number
+from gscompleter.errors import InputError, quoted
+
+DEFAULT_FOV = 60.0
+"""Opening angle that SuperSplat gives poses without one, in degrees."""
+FOV_RANGE = (1.0, 179.0)
+"""Of opening angles, in degrees."""
+SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
+"""What the axes of SuperSplat's world are multiplied by: half a turn about z."""
+ADVICE = "export the camera poses from SuperSplat again"
+
+
+def is_supersplat(content: Any) -> bool:
+    """Whether the content of a JSON file holds poses of SuperSplat."""
+    if isinstance(content, dict):
+        return "poseSets" in content
+    first = content[0] if isinstance(content, list) and content else None
+    return isinstance(first, dict) and "target" in first and "rotation" not in first
+
+
+def poses_of(content: Any, path: Path, resolution: tuple[int, int] | None) -> list[Frame]:
+    """The cameras of SuperSplat's poses in the frame of the splat, in the order of the file.
+
+    Args:
+        content: Of the JSON file.
+        path: The file, for error messages.
+        resolution: Height and width in pixels of the images.
+
+    Raises:
+        InputError: where the poses are damaged, or no resolution is given.
+    """
+    if resolution is None:
+        raise InputError(
+            f"The poses of SuperSplat in {quoted(path)} do not say how large the images are; give "
+            "--resolution HEIGHT WIDTH."
+        )
+    poses = _poses(content)
+    if not isinstance(poses, list) or not poses:
+        raise InputError(f"{quoted(path)} holds no poses; {ADVICE}.")
+    return [_frame(pose, f"pose {n} of {quoted(path)}", resolution) for n, pose in enumerate(poses)]
+
+
+def _poses(content: Any) -> Any:
+    if isinstance(content, list):
+        return content
+    sets = content["poseSets"]
+    first = sets[0] if isinstance(sets, list) and sets else None
+    return first.get("poses") if isinstance(first, dict) else None
+
+
+def _frame(pose: Any, title: str, resolution: tuple[int, int]) -> Frame:
+    if not isinstance(pose, dict):
+        raise InputError(f"{capital(title)} is no object with a position and a target; {ADVICE}.")
+    position, target = (
+        array_of(pose, key, (3,), title) * SPLAT_FROM_WORLD for key in ("position", "target")
+    )
+    height, width = resolution
+    fov = optional_number(pose, "fov", title, *FOV_RANGE) or DEFAULT_FOV
+    focal = max(height, width) / 2 / math.tan(math.radians(fov) / 2)
+    intrinsics = Intrinsics((width, height), (focal, focal))
+    return Frame(title, title, _upright(position, target), intrinsics, None)
+
+
+def _upright(
+    position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """Camera-to-world of an upright camera that looks at a target; NaN where it looks along y."""
+    with np.errstate(all="ignore"):
+        z = (target - position) / np.linalg.norm(target - position)
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x = x / np.linalg.norm(x)
+    c2w = np.eye(4)
+    c2w[:3, :3] = np.stack([x, np.cross(z, x), z], axis=-1)
+    c2w[:3, 3] = position
+    return c2w

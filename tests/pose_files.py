@@ -1,0 +1,177 @@
+"""A synthetic room photographed, written down in every format of posed photographs."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gscompleter.data.colmap.lenses import MODELS
+from gscompleter.io.image import write_image
+from gscompleter.types import Camera, View
+from scenes import Room, camera_at, view_of
+
+SIZE = 64
+CAMERAS = [camera_at(x=0.1 * i, y=0.05 * i, z=-0.03 * i, yaw=4.0 * i, size=SIZE) for i in range(5)]
+VIEWS = [view_of(Room(), camera) for camera in CAMERAS]
+NAMES = [f"{i}.png" for i in range(len(VIEWS))]
+PARAMETERS = (0.9 * SIZE, 0.9 * SIZE, SIZE / 2, SIZE / 2)
+"""Of COLMAP's PINHOLE."""
+
+
+def write_photographs(
+    folder: Path, names: Sequence[str] = NAMES, views: Sequence[View] = VIEWS
+) -> Path:
+    """The photographs of the room under these names."""
+    for name, view in zip(names, views, strict=True):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_image(folder / name, view.image)
+    return folder
+
+
+def quaternion_of(rotation: np.ndarray) -> np.ndarray:
+    """Of a rotation by less than half a turn, real part first."""
+    w = np.sqrt(1 + np.trace(rotation)) / 2
+    r = rotation
+    axis = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    return np.array([w, *(axis / (4 * w))])
+
+
+def world_to_camera(camera: Camera) -> tuple[list[float], list[float]]:
+    """The quaternion and the translation of COLMAP."""
+    viewmat = np.linalg.inv(camera.c2w.double().numpy())
+    return quaternion_of(viewmat[:3, :3]).tolist(), viewmat[:3, 3].tolist()
+
+
+def surface_points(count: int = 400) -> np.ndarray:
+    """Points on the surfaces that the photographs show."""
+    generator = torch.Generator().manual_seed(5)
+    points = []
+    for view in VIEWS:
+        assert view.depth is not None
+        rays = view.camera.z_rays().reshape(-1, 3)
+        chosen = torch.randint(len(rays), (count // len(VIEWS),), generator=generator)
+        points.append(view.camera.center + view.depth.reshape(-1, 1)[chosen] * rays[chosen])
+    return torch.cat(points).double().numpy()
+
+
+def write_colmap_binary(
+    folder: Path,
+    names: Sequence[str] = NAMES,
+    model: str = "PINHOLE",
+    parameters: Sequence[float] = PARAMETERS,
+    size: tuple[int, int] = (SIZE, SIZE),
+    points: np.ndarray | None = None,
+) -> Path:
+    """cameras.bin, images.bin and points3D.bin of the room's first cameras, with features."""
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = struct.pack(f"<{len(parameters)}d", *parameters)
+    camera = struct.pack("<QIiQQ", 1, 7, MODELS[model].number, *size) + numbers
+    (folder / "cameras.bin").write_bytes(camera)
+    images = struct.pack("<Q", len(names))
+    for number, (name, camera_) in enumerate(zip(names, CAMERAS, strict=False)):
+        quaternion, translation = world_to_camera(camera_)
+        images += struct.pack("<I4d3dI", number + 1, *quaternion, *translation, 7)
+        images += name.encode() + b"\0" + struct.pack("<Q", 2) + 2 * struct.pack("<ddq", 1, 2, -1)
+    (folder / "images.bin").write_bytes(images)
+    points = surface_points() if points is None else points
+    content = struct.pack("<Q", len(points))
+    for number, point in enumerate(points):
+        content += struct.pack("<Q3d3Bd", number, *point, 1, 2, 3, 0.5)
+        content += struct.pack("<QIIII", 2, 1, 0, 2, 0)
+    (folder / "points3D.bin").write_bytes(content)
+    return folder
+
+
+def write_colmap_text(folder: Path, names: Sequence[str] = NAMES, features: str = "1 2 -1") -> Path:
+    """cameras.txt, images.txt and points3D.txt of the room, each image with a line of features."""
+    folder.mkdir(parents=True, exist_ok=True)
+    parameters = " ".join(map(repr, PARAMETERS))
+    (folder / "cameras.txt").write_text(f"# Cameras\n7 PINHOLE {SIZE} {SIZE} {parameters}\n")
+    lines = ["# Images"]
+    for number, (name, camera) in enumerate(zip(names, CAMERAS, strict=False)):
+        quaternion, translation = world_to_camera(camera)
+        pose = " ".join(map(repr, quaternion + translation))
+        lines += [f"{number + 1} {pose} 7 {name}", features]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = [f"{n} {x} {y} {z} 1 2 3 0.5 1 0" for n, (x, y, z) in enumerate(surface_points())]
+    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def write_camera_list(path: Path, names: Sequence[str] = NAMES) -> Path:
+    """A cameras.json as Inria's code writes it, with the endings of names left out."""
+    entries = [
+        {
+            "id": number,
+            "img_name": Path(name).stem,
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.center.tolist(),
+            "rotation": camera.c2w[:3, :3].tolist(),
+            "fy": camera.K[1, 1].item(),
+            "fx": camera.K[0, 0].item(),
+        }
+        for number, (name, camera) in enumerate(zip(names, CAMERAS, strict=False))
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(entries))
+    return path
+
+
+def write_llff(path: Path) -> Path:
+    """A poses_bounds.npy of the room, whose surfaces lie between 1 and 6."""
+    rows = []
+    for camera in CAMERAS:
+        right, down, forward, center = camera.c2w[:3].double().numpy().T
+        size = [camera.height, camera.width, camera.K[0, 0].item()]
+        matrix = np.stack([down, right, -forward, center, size], axis=1)
+        rows.append([*matrix.ravel(), 1.0, 6.0])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, np.array(rows))
+    return path
+
+
+def write_kitti(folder: Path, labels: bool = True, aside: float = 0.0) -> Path:
+    """calib.txt and poses.txt of the room; camera 2 stands `aside` to the right of camera 0."""
+    folder.mkdir(parents=True, exist_ok=True)
+    K = CAMERAS[0].K.double().numpy()
+    lines, rows = [], []
+    for number in range(4):
+        offset = np.array([-aside if number == 2 else 0.0, 0.0, 0.0])
+        projection = K @ np.concatenate([np.eye(3), offset[:, None]], axis=1)
+        label = f"P{number}: " if labels else ""
+        lines.append(label + " ".join(f"{value:.12e}" for value in projection.ravel()))
+    for camera in CAMERAS:
+        first = camera.c2w.double().numpy().copy()
+        first[:3, 3] -= aside * first[:3, 0]
+        rows.append(" ".join(f"{value:.12e}" for value in first[:3].ravel()))
+    (folder / "calib.txt").write_text("\n".join(lines) + "\n")
+    (folder / "poses.txt").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def write_dgp(folder: Path) -> Path:
+    """A scene of DGP with one camera and a laser."""
+    data = [{"id": {"name": "LIDAR"}, "datum": {"point_cloud": {"filename": "0.npz"}}}]
+    for name, camera in zip(NAMES, CAMERAS, strict=True):
+        q = quaternion_of(camera.c2w[:3, :3].double().numpy())
+        pose = {
+            "rotation": dict(zip(("qw", "qx", "qy", "qz"), q.tolist(), strict=True)),
+            "translation": dict(zip("xyz", camera.center.tolist(), strict=True)),
+        }
+        image = {"filename": f"rgb/CAMERA_01/{name}", "height": SIZE, "width": SIZE, "pose": pose}
+        data.append({"id": {"name": "CAMERA_01"}, "datum": {"image": image}})
+    (folder / "calibration").mkdir(parents=True, exist_ok=True)
+    scene = {"data": data, "samples": [{"calibration_key": "abc"}]}
+    (folder / "scene_1.json").write_text(json.dumps(scene))
+    fx, fy, cx, cy = PARAMETERS
+    lenses = [dict.fromkeys(("fx", "fy", "cx", "cy", "skew"), 0.0)]
+    lenses.append({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": 0.0})
+    content = {"names": ["LIDAR", "CAMERA_01"], "intrinsics": lenses, "extrinsics": []}
+    (folder / "calibration" / "abc.json").write_text(json.dumps(content))
+    return folder

@@ -1,0 +1,468 @@
+"""COLMAP's models: every layout, both ways of writing, every lens; what is damaged is said."""
+
+import shutil
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from command import run
+from gscompleter import InputError, load_cameras
+from gscompleter.data.colmap.lenses import MODELS, intrinsics_of
+from gscompleter.data.colmap.scene import _roots
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.lens import Distortion, distort
+from gscompleter.data.sparse_points import with_depth_range
+from gscompleter.io.image import write_image
+from gscompleter.types import Camera, View
+from pose_files import (
+    CAMERAS,
+    NAMES,
+    SIZE,
+    VIEWS,
+    surface_points,
+    write_colmap_binary,
+    write_colmap_text,
+    write_photographs,
+)
+from scenes import Room, camera_at, cast, view_of
+from test_pose_formats import check_room, write_cloud
+
+LAYOUTS = [
+    ("sparse/0", "images"),
+    ("sparse", "images"),
+    ("colmap/sparse/0", "images"),
+    ("distorted/sparse/0", "input"),
+    ("distorted/sparse/0", "distorted/images"),
+    ("", "images"),
+    ("", ""),
+    ("Sparse/0", "Images"),
+    ("sparse/0", "images_2"),
+    ("sparse/0", "input"),
+]
+
+
+@pytest.mark.parametrize(("model", "images"), LAYOUTS)
+def test_every_layout_opens(tmp_path, model, images):
+    scene = tmp_path / "room"
+    write_photographs(scene / images)
+    write_colmap_binary(scene / model)
+    photographs = open_photographs(scene)
+    assert photographs.name == "room"
+    check_room(photographs)
+
+
+def test_the_folder_of_a_model_and_its_images_file_open_too(tmp_path):
+    scene = tmp_path / "room"
+    write_photographs(scene / "images")
+    model = write_colmap_text(scene / "sparse" / "0")
+    for path in (scene / "sparse", model, model / "images.txt"):
+        photographs = open_photographs(path)
+        assert photographs.name == "room"
+        check_room(photographs)
+
+
+def test_a_scene_may_be_called_by_a_number(tmp_path):
+    """The model of scene 360 does not reach for the photographs beside the folder 360."""
+    write_photographs(tmp_path / "images", views=VIEWS[::-1])
+    for model in ("", "sparse/0", "0"):
+        scene = tmp_path / f"36{len(model)}"
+        write_photographs(scene / "images")
+        write_colmap_binary(scene / model)
+        photographs = open_photographs(scene)
+        assert photographs.name == scene.name
+        check_room(photographs)
+
+
+def test_the_images_file_that_is_named_is_read(tmp_path):
+    """A user's choice of lines of images.txt counts, also where images.bin lies beside it."""
+    write_photographs(tmp_path / "images")
+    model = write_colmap_binary(tmp_path / "sparse")
+    lines = (write_colmap_text(model) / "images.txt").read_text().splitlines()
+    (model / "images.txt").write_text("\n".join(lines[:5]))
+    check_room(open_photographs(model / "images.txt"), [0, 1])
+    assert len(load_cameras(model / "images.txt")) == 2
+    check_room(open_photographs(tmp_path))
+
+
+def test_a_model_at_the_top_of_the_file_system_ends_the_search():
+    assert _roots(Path("/sparse/0"), Path("/sparse/0"))[-1] == Path("/")
+
+
+def test_names_of_files_may_be_written_in_any_case(tmp_path):
+    model = write_colmap_text(tmp_path / "room" / "SPARSE" / "0")
+    for name in ("cameras", "images", "points3D"):
+        (model / f"{name}.txt").rename(model / f"{name.title()}.TXT")
+    write_photographs(tmp_path / "room" / "Images", [name.upper() for name in NAMES])
+    photographs = open_photographs(tmp_path / "room")
+    check_room(photographs)
+    assert photographs.points() is not None
+
+
+def test_photographs_of_a_lens_do_not_come_from_those_without_it(tmp_path):
+    """`images` beside `distorted` are undistorted, and belong to another model."""
+    scene = tmp_path / "room"
+    write_photographs(scene / "input")
+    write_photographs(scene / "images", views=VIEWS[::-1])
+    write_colmap_binary(scene / "distorted" / "sparse" / "0")
+    check_room(open_photographs(scene))
+
+
+def test_images_lie_in_subfolders_with_slashes_of_either_kind(tmp_path):
+    names = [f"left/{name}" if number % 2 else f"right/{name}" for number, name in enumerate(NAMES)]
+    write_photographs(tmp_path / "images", names)
+    for write in (write_colmap_binary, write_colmap_text):
+        model = tmp_path / "sparse"
+        shutil.rmtree(model, ignore_errors=True)
+        write(model, [name.replace("/", "\\") for name in names])
+        photographs = open_photographs(tmp_path)
+        assert photographs.names == tuple(sorted(names))
+        check_room(photographs, [1, 3, 0, 2, 4])
+
+
+def test_names_with_spaces_and_of_any_encoding_are_found(tmp_path):
+    names = ["a b.png", "ä.png", "1 2 3.png", "c.png", "0 0.png"]
+    write_photographs(tmp_path / "images", names)
+    for write in (write_colmap_binary, write_colmap_text):
+        shutil.rmtree(tmp_path / "sparse", ignore_errors=True)
+        write(tmp_path / "sparse", names)
+        check_room(open_photographs(tmp_path), [4, 2, 0, 3, 1])
+
+
+def test_intrinsics_follow_the_size_on_the_disk(tmp_path):
+    """The camera says twice the size, or half of it, and nothing that is seen changes."""
+    for factor in (2.0, 0.5):
+        scene = tmp_path / f"{factor}"
+        write_photographs(scene / "images")
+        size, parameters = int(SIZE * factor), [0.9 * SIZE * factor] * 2 + [SIZE * factor / 2] * 2
+        write_colmap_binary(scene / "sparse", parameters=parameters, size=(size, size))
+        check_room(open_photographs(scene))
+
+
+def test_missing_photographs_are_left_out_and_named(tmp_path, monkeypatch, capsys):
+    write_photographs(tmp_path / "images")
+    write_colmap_binary(tmp_path / "sparse")
+    (tmp_path / "images" / "1.png").unlink()
+    (tmp_path / "images" / "3.png").unlink()
+    photographs = open_photographs(tmp_path)
+    check_room(photographs, [0, 2, 4])
+    (note,) = photographs.notes
+    assert "2 of 5 photographs of" in note
+    assert "are missing (1.png, 3.png) and are left out" in note
+    where = ("--context", 0, 1, "--target", 2, "--out", tmp_path / "out")
+    assert run(monkeypatch, "complete", tmp_path, *where) == 0
+    said = "".join(capsys.readouterr().err.split())
+    assert "".join(note.split()) in said
+
+
+def test_without_any_photograph_it_is_said_where_they_belong(tmp_path):
+    write_colmap_binary(tmp_path / "sparse")
+    with pytest.raises(InputError, match=r"None of the 5 .* folder `images` .* such as 0.png"):
+        open_photographs(tmp_path)
+
+
+def test_of_several_models_the_largest_is_opened(tmp_path):
+    write_photographs(tmp_path / "images")
+    write_colmap_binary(tmp_path / "sparse" / "0", NAMES[:2])
+    write_colmap_text(tmp_path / "sparse" / "1")
+    write_colmap_binary(tmp_path / "sparse" / "2", NAMES[:3])
+    photographs = open_photographs(tmp_path)
+    check_room(photographs)
+    (note,) = photographs.notes
+    assert "3 models lie in" in note
+    assert "the one in 1 with 5 images was opened" in note
+
+
+def test_photographs_are_used_as_they_are_stored_and_that_is_said(tmp_path):
+    write_photographs(tmp_path / "images")
+    write_colmap_binary(tmp_path / "sparse")
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    for name in NAMES:
+        Image.open(tmp_path / "images" / name).save(tmp_path / "images" / name, exif=turned)
+    photographs = open_photographs(tmp_path)
+    check_room(photographs)
+    (note,) = photographs.notes
+    assert "used as they are stored, which is how COLMAP saw them" in note
+    (tmp_path / "images" / "0.png").write_bytes(b"no image")
+    assert open_photographs(tmp_path).notes == ()
+
+
+@pytest.mark.parametrize("features", ["1 2 -1 3 4 7", "", "\n", "#", "\n1 2 -1\n", "1 2 -1 " * 4])
+def test_lines_of_features_may_be_empty_or_absent(tmp_path, features):
+    write_photographs(tmp_path / "images")
+    model = write_colmap_text(tmp_path / "sparse", features=features)
+    check_room(open_photographs(tmp_path))
+    # The last one is lost where an editor trims the end of the file.
+    content = (model / "images.txt").read_text()
+    (model / "images.txt").write_text(content.rstrip())
+    check_room(open_photographs(tmp_path))
+
+
+def test_lines_of_windows_are_lines(tmp_path):
+    write_photographs(tmp_path / "images")
+    model = write_colmap_text(tmp_path / "sparse")
+    for path in model.glob("*.txt"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    photographs = open_photographs(tmp_path)
+    check_room(photographs)
+    assert photographs.points() is not None
+
+
+def test_files_of_rigs_and_frames_change_nothing(tmp_path):
+    write_photographs(tmp_path / "images")
+    model = write_colmap_binary(tmp_path / "sparse" / "0")
+    for name in ("rigs.bin", "frames.bin"):
+        (model / name).write_bytes(b"\xff" * 100)
+    check_room(open_photographs(tmp_path))
+
+
+@pytest.mark.parametrize("write", [write_colmap_binary, write_colmap_text])
+def test_points_lie_on_the_surfaces(tmp_path, write):
+    write_photographs(tmp_path / "images")
+    write(tmp_path / "sparse")
+    points = open_photographs(tmp_path).points()
+    assert points is not None
+    assert torch.allclose(points.double(), torch.from_numpy(surface_points()), atol=1e-5)
+
+
+def test_points_may_lie_in_a_ply_or_be_absent(tmp_path):
+    write_photographs(tmp_path / "images")
+    model = write_colmap_binary(tmp_path / "sparse")
+    (model / "points3D.bin").unlink()
+    assert open_photographs(tmp_path).points() is None
+    write_cloud(model / "points3D.ply", surface_points())
+    points = open_photographs(tmp_path).points()
+    assert points is not None
+    assert len(points) == len(surface_points())
+
+
+FAR = np.array([5e6, 0.0, 0.0])
+
+
+def test_points_are_told_from_the_origin_of_the_cameras(tmp_path):
+    write_photographs(tmp_path / "images")
+    model = write_colmap_binary(tmp_path / "sparse", points=surface_points() + FAR)
+    content = bytearray((model / "images.bin").read_bytes())
+    position = 8
+    for camera, name in zip(CAMERAS, NAMES, strict=True):
+        rotation = camera.c2w[:3, :3].double().numpy()
+        center = camera.center.double().numpy() + FAR
+        struct.pack_into("<3d", content, position + 36, *(-rotation.T @ center))
+        position += 64 + len(name) + 1 + 8 + 48
+    (model / "images.bin").write_bytes(content)
+    photographs = open_photographs(tmp_path)
+    points = photographs.points()
+    assert points is not None
+    offset = photographs.origin - FAR
+    assert np.abs(offset).max() < 1
+    assert np.allclose(points.double(), surface_points() - offset, atol=1e-5)
+
+
+# Lenses.
+
+
+LENS_SIZE = 160
+LENS_NUMBERS = {
+    "k1": -0.1,
+    "k2": 0.04,
+    "k3": -0.01,
+    "k4": 0.005,
+    "p1": 0.004,
+    "p2": -0.006,
+    "d1": 0.05,
+    "d2": -0.02,
+    "d3": 0.01,
+    "s1": 0.005,
+    "s3": -0.004,
+    "k": -0.15,
+    "omega": 0.9,
+    "alpha": 0.55,
+    "beta": 1.1,
+    **dict.fromkeys(("f", "fx", "fy"), 0.9 * LENS_SIZE),
+    **dict.fromkeys(("cx", "cy"), LENS_SIZE / 2),
+}
+"""A value for each parameter of COLMAP's models."""
+
+
+@dataclass(frozen=True)
+class BentCamera(Camera):
+    """A camera whose pixels look where a lens makes them look."""
+
+    lens: Distortion = Distortion()
+
+    def z_rays(self):
+        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.width / 2) / self.K[0, 0]
+        bent = torch.stack(torch.meshgrid(x, x, indexing="xy"), dim=-1).numpy()
+        straight = bent.copy()
+        for _ in range(100):
+            straight += bent - distort(straight, self.lens)
+        rays = np.concatenate([straight, np.ones((*straight.shape[:2], 1))], axis=-1)
+        return torch.from_numpy(rays).float() @ self.c2w[:3, :3].T
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_photographs_of_every_lens_show_the_room_without_it(tmp_path, model):
+    size = (LENS_SIZE, LENS_SIZE)
+    parameters = [LENS_NUMBERS[name] for name in MODELS[model].parameters]
+    lens = intrinsics_of(MODELS[model], size, parameters, "the camera").distortion
+    straight = camera_at(size=LENS_SIZE)
+    photograph, _ = cast(Room(), BentCamera(straight.c2w, straight.K, *size, lens=lens))
+    (tmp_path / "images").mkdir()
+    write_image(tmp_path / "images" / "0.png", photograph)
+    write_colmap_binary(tmp_path / "sparse", ["0.png"], model, parameters, size)
+    (view,) = open_photographs(tmp_path).views([0])
+    seen = view_of(Room(), view.camera).image
+    error = (view.image - seen).abs().mean()
+    assert error < 0.01
+    if lens:
+        assert (photograph - seen).abs().mean() > 3 * error
+
+
+def test_a_lens_that_is_not_known_is_refused_with_what_to_do(tmp_path):
+    write_photographs(tmp_path / "images")
+    model = write_colmap_binary(tmp_path / "sparse")
+    content = bytearray((model / "cameras.bin").read_bytes())
+    struct.pack_into("<i", content, 12, 17)
+    (model / "cameras.bin").write_bytes(content)
+    with pytest.raises(InputError, match="camera model 17 of camera 7 .* image_undistorter"):
+        open_photographs(tmp_path)
+
+
+# Damage.
+
+
+def packed(path: Path, form: str, offset: int, *values: float) -> None:
+    content = bytearray(path.read_bytes())
+    struct.pack_into(form, content, offset, *values)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "offset", "value", "sentence"),
+    [
+        ("cameras.bin", "<Q", 0, 10**18, "claims more than its"),
+        ("cameras.bin", "<Q", 0, 2**64 - 1, "claims more than its"),
+        ("cameras.bin", "<I", 8, 8, "taken by camera 7, which is not in the cameras file"),
+        ("cameras.bin", "<Q", 16, 10**12, "The size of camera 7"),
+        ("cameras.bin", "<Q", 24, 0, "The size of camera 7"),
+        ("cameras.bin", "<d", 32, float("nan"), "parameter fx of camera 7 .* is nan"),
+        ("cameras.bin", "<d", 32, 0.0, "focal length is 0 times the size"),
+        ("images.bin", "<Q", 0, 2**63, "claims more than its"),
+        ("images.bin", "<Q", 0, 0, "lists no images"),
+        ("images.bin", "<Q", 78, 2**61, "claims more than its"),
+        ("images.bin", "<d", 12, float("inf"), "pose holds NaN"),
+        ("images.bin", "<4d", 12, 0.0, "pose holds NaN"),
+        ("images.bin", "<d", 44, 1e300, "above 1e"),
+        ("points3D.bin", "<Q", 0, 10**15, "claims more than its"),
+        ("points3D.bin", "<Q", 51, 10**15, "claims more than its"),
+    ],
+)
+def test_binary_files_are_believed_as_far_as_they_go(tmp_path, name, form, offset, value, sentence):
+    write_photographs(tmp_path / "images")
+    model = write_colmap_binary(tmp_path / "sparse")
+    packed(model / name, form, offset, *[value] * (4 if form == "<4d" else 1))
+    with pytest.raises(InputError, match=sentence) as error:
+        photographs = open_photographs(tmp_path)
+        photographs.views([0])
+        photographs.points()
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_truncated_and_empty_files_are_refused(tmp_path, name):
+    write_photographs(tmp_path / "images")
+    model = write_colmap_binary(tmp_path / "sparse")
+    whole = (model / name).read_bytes()
+    for length in (0, 3, 20, len(whole) // 2, len(whole) - 1):
+        (model / name).write_bytes(whole[:length])
+        with pytest.raises(InputError, match=f"{name} is (empty|truncated)"):
+            open_photographs(tmp_path).points()
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "sentence"),
+    [
+        ("cameras.txt", "7 PINHOLE 64", "line 1 of .*cameras.txt is '7 PINHOLE 64', where CAM"),
+        ("cameras.txt", "7 PINHOLE 64 64 50 50 32", "PINHOLE of camera 7 .* 4 parameters .* 3 are"),
+        ("cameras.txt", "7 PANORAMA 64 64 50", "camera model PANORAMA of camera 7"),
+        ("cameras.txt", "7 PINHOLE 64 64 50 x 32 32", "line 1 of .*cameras.txt"),
+        ("cameras.txt", "7 PINHOLE 64 64 50 1e400 32 32", "parameter fy of camera 7 .* is inf"),
+        ("cameras.txt", "", "taken by camera 7, which is not in"),
+        ("images.txt", "1 1 0 0 0 0 0 0", "line 1 of .*images.txt .* IMAGE_ID"),
+        ("images.txt", "1 1 0 0 0 0 zero 0 7 0.png", "line 1 of .*images.txt"),
+        ("images.txt", "", "lists no images"),
+        ("images.txt", "1 0 0 0 0 0 0 0 7 0.png", "pose holds NaN"),
+        ("points3D.txt", "1 2", "line 1 of .*points3D.txt .* POINT3D_ID"),
+        ("points3D.txt", "1 2 3 four 5", "line 1 of .*points3D.txt"),
+    ],
+)
+def test_a_damaged_line_is_named(tmp_path, name, line, sentence):
+    write_photographs(tmp_path / "images")
+    model = write_colmap_text(tmp_path / "sparse")
+    (model / name).write_text(line + "\n")
+    with pytest.raises(InputError, match=sentence) as error:
+        photographs = open_photographs(tmp_path)
+        photographs.views([0])
+        photographs.points()
+    assert "\n" not in str(error.value)
+
+
+def test_masks_and_photographs_of_a_lens_are_undistorted_together(tmp_path):
+    """What is masked in the photograph is masked where the undistorted one shows it."""
+    parameters = [0.9 * SIZE, SIZE / 2, SIZE / 2, -0.2]
+    write_colmap_binary(tmp_path / "sparse", ["0.png"], "SIMPLE_RADIAL", parameters)
+    dark = np.zeros((SIZE, SIZE), np.uint8)
+    dark[20:40, 10:50] = 255
+    for folder, name in (("images", "0.png"), ("masks", "0.png.png")):
+        (tmp_path / folder).mkdir()
+        Image.fromarray(dark).save(tmp_path / folder / name)
+    photographs = open_photographs(tmp_path)
+    (view,) = photographs.views([0])
+    mask = photographs.mask(0)
+    assert mask is not None
+    assert ((view.image.mean(-1) < 0.5) != mask).float().mean() < 0.03
+
+
+def epipolar_error(first: View, second: View) -> float:
+    """Median distance in pixels of SIFT matches from their epipolar lines."""
+    sift = cv2.SIFT_create(2000)
+    grey = [(view.image.mean(-1) * 255).to(torch.uint8).numpy() for view in (first, second)]
+    (keys, ours), (others, theirs) = (sift.detectAndCompute(image, None) for image in grey)
+    pairs = [
+        a for a, b in cv2.BFMatcher().knnMatch(ours, theirs, k=2) if a.distance < b.distance / 2
+    ]
+    # OpenCV puts the centre of the top-left pixel at (0, 0).
+    p = np.array([[*keys[pair.queryIdx].pt, 0.5] for pair in pairs]) + 0.5
+    q = np.array([[*others[pair.trainIdx].pt, 0.5] for pair in pairs]) + 0.5
+    K1, K2, c2w1, c2w2 = (
+        value.double().numpy()
+        for value in (first.camera.K, second.camera.K, first.camera.c2w, second.camera.c2w)
+    )
+    relative = np.linalg.inv(c2w2) @ c2w1
+    essential = np.cross(relative[:3, 3], relative[:3, :3].T).T
+    lines = p @ (np.linalg.inv(K2).T @ essential @ np.linalg.inv(K1)).T
+    distances = np.abs((lines * q).sum(-1)) / np.linalg.norm(lines[:, :2], axis=-1)
+    return float(np.median(distances))
+
+
+def test_features_of_a_real_scene_lie_on_the_epipolar_lines_of_every_file(shared):
+    fox = shared / "splats" / "fox"
+    if not fox.is_dir():
+        pytest.skip(f"needs {fox}")
+    places = (fox, fox / "distorted", fox / "cameras.json", shared / "data" / "fox")
+    for path in places:
+        assert epipolar_error(*open_photographs(path).views([0, 2])) < 0.4, path
+
+
+def test_points_of_a_real_scene_enclose_it(shared):
+    fox = shared / "splats" / "fox"
+    if not fox.is_dir():
+        pytest.skip(f"needs {fox}")
+    photographs = with_depth_range(open_photographs(fox), [0, 4])
+    assert (photographs.near, photographs.far) == (pytest.approx(2.3, 0.1), pytest.approx(17, 0.1))

@@ -1,0 +1,100 @@
+"""Files of the community, byte for byte: each is opened right, or refused with its sentence."""
+
+from pathlib import Path
+
+import pytest
+
+from gscompleter import InputError
+from gscompleter.data.formats import open_photographs
+
+OPENED = {
+    "colmap_bonsai": (3, 1188.1, 699),
+    "colmap_bonsai/images.bin": (3, 1188.1, 699),
+    "dgp_ddad": (9, 2167.7, 1936),
+    "dgp_ddad/scene.json": (9, 2167.7, 1936),
+    "nerfstudio_fox": (67, None, 1080),
+    "nerfstudio_fox/transforms.json": (67, None, 1080),
+    "re10k/000000.torch": (93, None, 640),
+}
+"""How many frames, the focal length of the first one where no lens is removed, and its width."""
+
+NOTHING = "There are no posed photographs in"
+NO_FRAMES = "lists no frames"
+REFUSED = {
+    "colmap_bonsai/DSCF5574.JPG": NOTHING,
+    "colmap_bonsai/DSCF5575.JPG": NOTHING,
+    "colmap_bonsai/DSCF5597.JPG": NOTHING,
+    "colmap_bonsai/cameras.bin": NOTHING,
+    "colmap_bonsai/points3D.bin": NOTHING,
+    "dgp_ddad/calibration.json": NO_FRAMES,
+    "evaluation_index/dl3dv_start_0_distance_10_ctx_2v_tgt_4v.json": NO_FRAMES,
+    "evaluation_index/evaluation_index_acid.json": NO_FRAMES,
+    "evaluation_index/evaluation_index_re10k.json": NO_FRAMES,
+    "gaussians/arkit_scene.splat": NOTHING,
+    "gaussians/biker.compressed.ply": NOTHING,
+    "gaussians/biker.spz": NOTHING,
+    "gaussians/guitar.compressed.ply": NOTHING,
+    "gaussians/guitar.from-compressed.ply": NOTHING,
+    "gaussians/minimal/minimal-raw.spz": NOTHING,
+    "gaussians/minimal/minimal-v2.spz": NOTHING,
+    "gaussians/minimal/minimal-v3.spz": NOTHING,
+    "gaussians/minimal/minimal-v4.spz": NOTHING,
+    "gaussians/minimal/minimal.ksplat": NOTHING,
+    "gaussians/minimal/minimal.splat": NOTHING,
+    "gaussians/playbot_lod4.from-sog.ply": NOTHING,
+    "gaussians/playbot_sog": NOTHING,
+    "gaussians/playbot_sog/means_l.webp": NOTHING,
+    "gaussians/playbot_sog/means_u.webp": NOTHING,
+    "gaussians/playbot_sog/meta.json": NO_FRAMES,
+    "gaussians/playbot_sog/quats.webp": NOTHING,
+    "gaussians/playbot_sog/scales.webp": NOTHING,
+    "gaussians/playbot_sog/sh0.webp": NOTHING,
+    "gaussians/playbot_sog/shN_centroids.webp": NOTHING,
+    "gaussians/playbot_sog/shN_labels.webp": NOTHING,
+    "gsplat_garden/test_garden.npz": NOTHING,
+    "idr_dtu/cameras_sphere.npz": NOTHING,
+    "kitti/odometry00_poses_first200.txt": r"poses only, and there is no calib.txt in",
+    "kitti/raw_calib_cam_to_cam.partial.txt": NOTHING,
+    "kitti/raw_calib_velo_to_cam.txt": NOTHING,
+    "kitti/seq1_calib.txt": NOTHING,
+    "kitti/seq1_poses.txt": "no photographs in .*; a folder image_2 or image_0",
+    "lfs_pointers/point_cloud.ply": NOTHING,
+    "lfs_pointers/splat.ply": NOTHING,
+    "llff": NOTHING,
+    "llff/gnomes_poses_bounds.npy": "has 103 rows, which belong to as many photographs",
+    "llff/liberty_poses_bounds.npy": "has 135 rows, which belong to as many photographs",
+    "NOTES.md": NOTHING,
+    "nuscenes_mmdet3d/info.pkl": NOTHING,
+    "re10k/0d4de33c6888a754.head.txt": "size of frame 0 of .* is not known",
+    "waymo_mmdet3d/0000000.png": NOTHING,
+    "waymo_mmdet3d/waymo_infos_val.pkl": NOTHING,
+}
+
+
+def place(shared: Path, name: str) -> Path:
+    path = shared / "formats" / name
+    if not path.exists():
+        pytest.skip(f"needs {path}")
+    return path
+
+
+@pytest.mark.parametrize("name", OPENED)
+def test_a_file_is_opened(shared, name):
+    photographs = open_photographs(place(shared, name))
+    count, focal, width = OPENED[name]
+    camera = photographs.camera(0)
+    assert (len(photographs), camera.width) == (count, width)
+    assert focal is None or camera.K[0, 0].item() == pytest.approx(focal, abs=0.1)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_file_is_refused_with_its_sentence(shared, name):
+    with pytest.raises(InputError, match=REFUSED[name]) as error:
+        open_photographs(place(shared, name)).camera(0)
+    assert "\n" not in str(error.value)
+
+
+def test_every_file_has_a_row(shared):
+    folder = shared / "formats"
+    files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert files <= set(OPENED) | set(REFUSED)

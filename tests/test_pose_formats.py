@@ -1,0 +1,446 @@
+"""Every format of posed photographs shows the room that was photographed from where it says."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gscompleter import InputError, load_cameras
+from gscompleter.data.dataparser import read_dataparser_transforms
+from gscompleter.data.formats import FORMATS, open_photographs
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.scene import write_cameras
+from gscompleter.data.sparse_points import MIN_POINTS, depth_range_of_points, with_depth_range
+from gscompleter.types import Camera
+from pose_files import (
+    CAMERAS,
+    NAMES,
+    SIZE,
+    VIEWS,
+    surface_points,
+    write_camera_list,
+    write_colmap_binary,
+    write_colmap_text,
+    write_dgp,
+    write_kitti,
+    write_llff,
+    write_photographs,
+)
+from scenes import Room, view_of
+
+
+def binary(folder: Path) -> Path:
+    write_photographs(folder / "images")
+    write_colmap_binary(folder / "sparse" / "0")
+    return folder
+
+
+def text(folder: Path) -> Path:
+    write_photographs(folder / "images")
+    write_colmap_text(folder / "sparse")
+    return folder
+
+
+def camera_list(folder: Path) -> Path:
+    write_photographs(folder / "images")
+    write_camera_list(folder / "cameras.json")
+    return folder
+
+
+def llff(folder: Path) -> Path:
+    write_photographs(folder / "images")
+    write_llff(folder / "poses_bounds.npy")
+    return folder
+
+
+def kitti(folder: Path, aside: float = 0.0, labels: bool = True) -> Path:
+    names = [f"{number:06d}.png" for number in range(len(VIEWS))]
+    write_photographs(folder / "image_2", names)
+    return write_kitti(folder, labels, aside)
+
+
+def kitti_aside(folder: Path) -> Path:
+    return kitti(folder, aside=0.54, labels=False)
+
+
+def dgp(folder: Path) -> Path:
+    write_photographs(folder / "rgb" / "CAMERA_01")
+    return write_dgp(folder)
+
+
+def transforms(folder: Path) -> Path:
+    write_photographs(folder)
+    write_cameras(folder / "transforms.json", CAMERAS, NAMES)
+    return folder
+
+
+def splits(folder: Path) -> Path:
+    """As the synthetic scenes of NeRF: three files, names without endings, one opening angle."""
+    write_photographs(folder)
+    parts = {"train": (0, 3), "val": (1, 4), "test": (2,)}
+    for part, numbers in parts.items():
+        path = folder / f"transforms_{part}.json"
+        chosen = [CAMERAS[number] for number in numbers]
+        write_cameras(path, chosen, [f"./{number}" for number in numbers])
+        content = json.loads(path.read_text())
+        frames = [{k: f[k] for k in ("file_path", "transform_matrix")} for f in content["frames"]]
+        angle = 2 * np.arctan(0.5 / 0.9)
+        path.write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    return folder
+
+
+WRITERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "colmap-binary": ("colmap", binary),
+    "colmap-text": ("colmap", text),
+    "cameras-json": ("cameras-json", camera_list),
+    "llff": ("llff", llff),
+    "kitti": ("kitti", kitti),
+    "kitti-aside": ("kitti", kitti_aside),
+    "dgp": ("dgp", dgp),
+    "transforms": ("transforms", transforms),
+    "splits": ("transforms", splits),
+}
+"""How a folder of each kind is written, and the name of its format."""
+
+
+def check(camera: Camera, truth: Camera) -> None:
+    assert torch.allclose(camera.c2w, truth.c2w, atol=2e-6)
+    assert torch.allclose(camera.K, truth.K, atol=1e-3)
+    assert (camera.width, camera.height) == (truth.width, truth.height)
+
+
+def check_room(photographs: Photographs, numbers: list[int] | None = None) -> None:
+    """The photographs are those of the room from their cameras, for both are compared."""
+    numbers = list(range(len(CAMERAS))) if numbers is None else numbers
+    assert len(photographs) == len(numbers)
+    for view, number in zip(photographs.views(range(len(numbers))), numbers, strict=True):
+        check(view.camera, CAMERAS[number])
+        seen = view_of(Room(), view.camera).image
+        assert (view.image - seen).abs().mean() < 0.003
+        # From any other place the room looks different.
+        other = view_of(Room(), CAMERAS[number - 1]).image
+        assert (view.image - other).abs().mean() > 0.01
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_every_format_shows_the_room_from_where_it_says(tmp_path, kind):
+    name, write = WRITERS[kind]
+    scene = write(tmp_path / "room")
+    photographs = open_photographs(scene)
+    check_room(photographs)
+    assert (photographs.name, photographs.notes) == ("room", ())
+    assert photographs.camera(2, (32, 48)).K[0, 0] == pytest.approx(0.9 * 48)
+    check_room(open_photographs(scene, format=name))
+
+
+def test_every_format_is_tried_here_or_in_the_file_of_its_own():
+    assert {name for name, _ in WRITERS.values()} | {"chunks", "real-estate-10k"} == set(FORMATS)
+
+
+# Cameras as targets.
+
+
+def test_cameras_come_from_every_file_of_cameras(tmp_path):
+    write_colmap_text(tmp_path / "text")
+    write_colmap_binary(tmp_path / "binary")
+    files = (
+        write_camera_list(tmp_path / "cameras.json"),
+        tmp_path / "text" / "images.txt",
+        tmp_path / "binary" / "images.bin",
+    )
+    for path in files:
+        for camera, truth in zip(load_cameras(path), CAMERAS, strict=True):
+            check(camera, truth)
+    (tmp_path / "text" / "cameras.txt").unlink()
+    with pytest.raises(InputError, match="no cameras.txt or cameras.bin beside .*images.txt"):
+        load_cameras(tmp_path / "text" / "images.txt")
+
+
+def supersplat_pose(camera: Camera) -> dict:
+    """A pose as SuperSplat keeps it: in a world turned by half a turn about z."""
+    turn = np.array([-1.0, -1.0, 1.0])
+    position, forward = camera.center.double().numpy(), camera.c2w[:3, 2].double().numpy()
+    return {
+        "name": "camera_0",
+        "frame": 0,
+        "position": (position * turn).tolist(),
+        "target": ((position + 3 * forward) * turn).tolist(),
+        "fov": float(np.degrees(2 * np.arctan(0.5 / 0.9))),
+    }
+
+
+@pytest.mark.parametrize("project", [False, True])
+def test_poses_of_supersplat_show_the_room_upright(tmp_path, project):
+    poses = [supersplat_pose(camera) for camera in CAMERAS]
+    content = {"poseSets": [{"name": "set0", "poses": poses}]} if project else poses
+    path = tmp_path / "document.json"
+    path.write_text(json.dumps(content))
+    for camera, view in zip(load_cameras(path, (SIZE, SIZE)), VIEWS, strict=True):
+        check(camera, view.camera)
+        assert (view_of(Room(), camera).image - view.image).abs().mean() < 0.003
+    # The opening angle is that of the longer side.
+    wide = load_cameras(path, (SIZE, 2 * SIZE))[0]
+    assert wide.K[0, 0] == pytest.approx(0.9 * 2 * SIZE, rel=1e-4)
+    with pytest.raises(InputError, match="do not say how large the images are; give --resolution"):
+        load_cameras(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ([], "lists no cameras"),
+        ([3], "Camera 0 of .* is no object"),
+        ([{"position": [0, 0, 0]}], "`fx` of camera 0 .* missing"),
+        ({"poseSets": []}, "holds no poses"),
+        ({"poseSets": [{"poses": [3]}]}, "Pose 0 of .* is no object"),
+        ([{"position": [0, 0, 0], "target": [0, 0]}], "`target` of pose 0 .* 3 numbers"),
+        ([{"position": [0, 0, 0], "target": [0, 9, 0]}], "NaN"),
+        ([{"position": [0, 0, 0], "target": [0, 0, 1], "fov": 180}], "`fov` of pose 0"),
+    ],
+)
+def test_a_wrong_file_of_cameras_has_its_sentence(tmp_path, content, sentence):
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=sentence) as error:
+        load_cameras(path, (SIZE, SIZE))
+    assert "\n" not in str(error.value)
+
+
+def changed_camera(tmp_path: Path, **values) -> Path:
+    path = write_camera_list(tmp_path / "cameras.json")
+    content = json.loads(path.read_text())
+    content[0].update(values)
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "reflection"),
+        ({"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "not a rigid transform"),
+        ({"rotation": [1, 2, 3]}, "`rotation` of camera 0 .* 3 × 3 numbers"),
+        ({"position": "here"}, "`position` of camera 0"),
+        ({"position": [0, 0, 1e300]}, "above 1e"),
+        ({"fx": -1}, "`fx` of camera 0"),
+        ({"width": 1e9}, "`width` of camera 0"),
+        ({"img_name": 7}, "`img_name` of camera 0"),
+    ],
+)
+def test_an_impossible_camera_of_a_list_is_refused(tmp_path, values, sentence):
+    with pytest.raises(InputError, match=sentence):
+        load_cameras(changed_camera(tmp_path, **values))
+
+
+def test_photographs_of_a_list_that_are_missing_are_left_out_and_named(tmp_path):
+    scene = camera_list(tmp_path / "room")
+    (scene / "images" / "1.png").unlink()
+    photographs = open_photographs(scene)
+    check_room(photographs, [0, 2, 3, 4])
+    (note,) = photographs.notes
+    assert note.startswith("1 of 5 photographs of")
+    assert "is missing (1) and is left out" in note
+    shutil.rmtree(scene / "images")
+    with pytest.raises(InputError, match="None of the 5 photographs .* folder `images`"):
+        open_photographs(scene)
+
+
+# nerfstudio.
+
+
+def test_a_whole_transforms_json_wins_over_its_parts(tmp_path):
+    scene = splits(tmp_path / "room")
+    write_cameras(scene / "transforms.json", CAMERAS[:2], NAMES[:2])
+    check_room(open_photographs(scene), [0, 1])
+
+
+def test_dl3dv_keeps_its_file_and_small_copies_in_a_folder_nerfstudio(tmp_path):
+    home = tmp_path / "room" / "nerfstudio"
+    write_photographs(home / "images_4")
+    write_cameras(home / "transforms.json", CAMERAS, [f"images/{name}" for name in NAMES])
+    content = json.loads((home / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame.update({k: 4 * frame[k] for k in ("w", "h", "fl_x", "fl_y", "cx", "cy")})
+    (home / "transforms.json").write_text(json.dumps(content))
+    photographs = open_photographs(tmp_path / "room")
+    assert photographs.name == "room"
+    check_room(photographs)
+
+
+def write_cloud(path: Path, points: np.ndarray) -> None:
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz") + "property uchar red\n"
+    rows = "\n".join(" ".join([*map(repr, point), "7"]) for point in points.tolist())
+    path.write_text(f"{header}end_header\n{rows}\n")
+
+
+def test_points_of_nerfstudio_lie_in_the_frame_of_the_cameras(tmp_path):
+    scene = transforms(tmp_path / "room")
+    assert open_photographs(scene).points() is None
+    write_cloud(scene / "sparse_pc.ply", surface_points())
+    content = json.loads((scene / "transforms.json").read_text())
+    content["ply_file_path"] = "sparse_pc.ply"
+    content["applied_transform"] = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    (scene / "transforms.json").write_text(json.dumps(content))
+    photographs = open_photographs(scene)
+    check_room(photographs)
+    points = photographs.points()
+    assert points is not None
+    assert torch.allclose(points.double(), torch.from_numpy(surface_points()), atol=1e-5)
+    (scene / "sparse_pc.ply").write_text("ply\nformat ascii 1.0\nelement face 0\nend_header\n")
+    with pytest.raises(InputError, match="holds no points with x, y and z"):
+        open_photographs(scene).points()
+    (scene / "sparse_pc.ply").unlink()
+    assert open_photographs(scene).points() is None
+
+
+def test_the_frame_of_a_nerfstudio_run_turns_shifts_and_scales(tmp_path):
+    path = tmp_path / "dataparser_transforms.json"
+    rows = [[0.0, -1.0, 0.0, 3.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+    path.write_text(json.dumps({"transform": rows, "scale": 0.5}))
+    trained_from_file = read_dataparser_transforms(path)
+    # (1, 2, 4) is turned to (-2, 1, 4), shifted to (1, 1, 4), and halved.
+    assert (trained_from_file @ [1, 2, 4, 1]).tolist() == [0.5, 0.5, 2.0, 1.0]
+    for content in ([], {}, {"transform": rows}, {"transform": rows[:2], "scale": 1.0}):
+        path.write_text(json.dumps(content))
+        with pytest.raises(InputError, match="dataparser_transforms.json"):
+            read_dataparser_transforms(path)
+    path.write_text(json.dumps({"transform": (2 * np.array(rows)).tolist(), "scale": 1.0}))
+    with pytest.raises(InputError, match="not a rigid transform"):
+        read_dataparser_transforms(path)
+
+
+# LLFF, KITTI, DGP.
+
+
+def test_bounds_of_llff_enclose_the_scene_with_room(tmp_path):
+    scene = llff(tmp_path / "room")
+    camera = open_photographs(scene).camera(0)
+    assert (camera.near, camera.far) == (0.5, 12.0)
+    camera = open_photographs(scene, near=2.0).camera(0)
+    assert (camera.near, camera.far) == (2.0, 12.0)
+
+
+def test_rows_of_llff_need_as_many_photographs(tmp_path):
+    scene = llff(tmp_path / "room")
+    (scene / "images" / "3.png").rename(scene / "images_aside.png")
+    with pytest.raises(InputError, match="has 5 rows, .* there are 4 in .*images, 1 in"):
+        open_photographs(scene)
+
+
+@pytest.mark.parametrize(
+    ("array", "sentence"),
+    [
+        (np.zeros((5, 15)), r"shape \[5, 15\], where a row of 17"),
+        (np.zeros((0, 17)), r"shape \[0, 17\]"),
+        (np.zeros((5, 17), dtype=complex), "complex128"),
+        (np.zeros((5, 17)), "are no z-depths, nearest first"),
+        (np.array([["a"]]), "where a row of 17"),
+        (np.array([None]), "is no array of numbers"),
+    ],
+)
+def test_a_wrong_array_of_llff_is_refused(tmp_path, array, sentence):
+    scene = llff(tmp_path / "room")
+    np.save(scene / "poses_bounds.npy", array, allow_pickle=True)
+    with pytest.raises(InputError, match=sentence):
+        open_photographs(scene)
+
+
+def test_an_array_of_llff_that_claims_more_than_its_file_is_refused(tmp_path):
+    scene = llff(tmp_path / "room")
+    content = (scene / "poses_bounds.npy").read_bytes()
+    for claim in (b"(5000000000, 17)", b"(6, 17)"):
+        (scene / "poses_bounds.npy").write_bytes(content.replace(b"(5, 17)" + b" " * 12, claim))
+        if claim in (scene / "poses_bounds.npy").read_bytes():
+            with pytest.raises(InputError, match="is no array of numbers"):
+                open_photographs(scene)
+
+
+def test_a_sequence_of_kitti_is_found_in_the_folders_of_the_data_set(tmp_path):
+    scene = kitti(tmp_path / "sequences" / "07", aside=0.54)
+    (tmp_path / "poses").mkdir()
+    (scene / "poses.txt").rename(tmp_path / "poses" / "07.txt")
+    for path in (scene, tmp_path / "poses" / "07.txt"):
+        photographs = open_photographs(path)
+        assert photographs.name == "07"
+        check_room(photographs)
+
+
+def test_kitti_says_what_is_missing(tmp_path):
+    scene = kitti(tmp_path / "room")
+    shutil.move(scene / "image_2", scene / "pictures")
+    with pytest.raises(InputError, match="no photographs in .* folder image_2 or image_0"):
+        open_photographs(scene)
+    (scene / "calib.txt").rename(scene / "other.txt")
+    with pytest.raises(InputError, match=r"poses only, and there is no calib.txt"):
+        open_photographs(scene / "poses.txt")
+    with pytest.raises(InputError, match="no posed photographs"):
+        open_photographs(scene)
+
+
+def test_dgp_says_what_is_missing(tmp_path):
+    scene = dgp(tmp_path / "room")
+    path = scene / "scene_1.json"
+    content = json.loads(path.read_text())
+    content["data"][1]["id"]["name"] = "CAMERA_09"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="camera CAMERA_09 is not in the calibration"):
+        open_photographs(scene)
+    (scene / "calibration" / "abc.json").unlink()
+    with pytest.raises(InputError, match="calibration of .* is missing; put it at .*abc.json"):
+        open_photographs(scene)
+
+
+# Depth from sparse points.
+
+
+def test_planes_enclose_the_points_in_sight():
+    camera = CAMERAS[0]
+    depths = torch.linspace(2.0, 4.0, MIN_POINTS + 1)
+    points = depths[:, None] * torch.tensor([0.1, 0.0, 1.0])
+    # Points behind the camera and beside the image tell nothing.
+    behind, beside = torch.tensor([[0.0, 0, -9]]), torch.tensor([[50.0, 0, 9]])
+    near, far = depth_range_of_points(torch.cat([points, behind, beside]), [camera])
+    assert (near, far) == (pytest.approx(0.5 * 2.02), pytest.approx(2 * 3.98))
+    assert depth_range_of_points(points[: MIN_POINTS - 1], [camera]) is None
+    assert depth_range_of_points(points, []) is None
+
+
+def test_planes_of_points_fill_in_what_is_not_given(tmp_path):
+    scene = binary(tmp_path / "room")
+    found = with_depth_range(open_photographs(scene), [0, 2])
+    depths = torch.cat([VIEWS[number].depth.flatten() for number in (0, 2)])
+    assert found.near is not None
+    assert found.far is not None
+    assert 0.25 * depths.min() < found.near < depths.min()
+    assert depths.max() < found.far < 3 * depths.max()
+    given = with_depth_range(open_photographs(scene, near=0.1), [0, 2])
+    assert (given.near, given.far) == (0.1, found.far)
+    beyond = with_depth_range(open_photographs(scene, near=1e3), [0, 2])
+    assert (beyond.near, beyond.far) == (1e3, None)
+
+
+def test_photographs_without_points_keep_their_planes(tmp_path):
+    photographs = open_photographs(transforms(tmp_path / "room"))
+    assert with_depth_range(photographs, [0, 1]) is photographs
+
+
+# COLMAP masks and lists of both kinds.
+
+
+def test_masks_lie_in_a_folder_beside_the_photographs(tmp_path):
+    scene = binary(tmp_path / "room")
+    shown = np.full((SIZE, SIZE), 255, np.uint8)
+    shown[:, :16] = 0
+    (scene / "masks").mkdir()
+    Image.fromarray(shown).save(scene / "masks" / "0.png.png")
+    Image.fromarray(shown).save(scene / "masks" / "1.png")
+    photographs = open_photographs(scene)
+    for number in (0, 1):
+        assert torch.equal(photographs.mask(number), torch.from_numpy(shown == 0))
+    assert photographs.mask(2) is None
