@@ -201,6 +201,37 @@ def test_other_formats_become_png(tmp_path):
         assert (written.format, written.mode) == ("PNG", "RGB")
 
 
+def test_names_that_colmap_cannot_list_are_changed(tmp_path):
+    for name in ("a b.png", "a_b.png"):
+        Image.new("RGB", (64, 48), "red").save(tmp_path / name)
+    assert write_upright(tmp_path, "a b.png", tmp_path / "images").name == "a_b.png"
+    with pytest.raises(InputError, match="would be called a_b.png"):
+        write_upright(tmp_path, "a_b.png", tmp_path / "images")
+
+
+def test_masks_hidden_files_and_our_own_results_are_no_photographs(tmp_path):
+    folder = blank(tmp_path / "p", 3)
+    for name in ("masks", "images_2", ".cache", "out"):
+        blank(folder / name, 1)
+    (folder / "out" / "summary.json").write_text("{}")
+    Image.new("RGB", (64, 48)).save(folder / ".hidden.png")
+    assert photographs_in(folder) == ["0.png", "1.png", "2.png"]
+
+
+def test_photographs_alone_are_completed_and_their_cameras_kept(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    given, out = photographs(tmp_path / "room"), tmp_path / "out"
+    words = ["complete", given, "--context", 0, 2, "--out", out, "--resolution", 48, 48, "--quiet"]
+    assert run(monkeypatch, *words, "--target", 99) == 2  # found out once there are cameras
+    assert [path.name for path in out.iterdir()] == ["colmap"]
+
+    monkeypatch.setattr(structure_from_motion, "PROCESS", "nobody")
+    assert run(monkeypatch, *words, "--target", 4) == 0
+    assert (out / "completed.ply").exists()
+    assert (out / "colmap" / "sparse" / "0" / "cameras.bin").exists()
+    assert run(monkeypatch, *words, "--target", 4) == 2  # nothing is replaced unasked
+
+
 def test_names_are_sorted_as_people_count():
     assert sorted(["10.jpg", "9.jpg", "b.jpg"], key=in_order) == ["9.jpg", "10.jpg", "b.jpg"]
 

@@ -18,6 +18,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
 
+from gscompleter.data.frame import DOWNSCALED
+from gscompleter.data.image_folders import MASKS
 from gscompleter.data.match_pairs import in_order
 from gscompleter.data.upright import Upright, write_upright
 from gscompleter.errors import InputError, quoted
@@ -27,6 +29,8 @@ from gscompleter.progress import track
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Of photographs, in any case."""
+NO_PHOTOGRAPHS = (MASKS, *(f"images_{n}" for n in DOWNSCALED))
+"""Folders beside those of photographs."""
 MIN_PHOTOGRAPHS = 3
 """With two, neither the focal length nor a wrong match can be told."""
 MAX_THREADS = 4
@@ -96,8 +100,8 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
     return found
 
 
-def holds_photographs_only(path: Path) -> bool:
-    """Whether `path` is a folder with photographs in it."""
+def holds_photographs(path: Path) -> bool:
+    """Whether `path` is a folder with photographs in it, with or without cameras."""
     return os.path.isdir(path) and bool(_listed(path))
 
 
@@ -132,10 +136,21 @@ def check_pycolmap() -> None:
 
 
 def _listed(folder: Path) -> list[str]:
-    """Hidden files, and those in hidden folders, are none of the user's photographs."""
-    files = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-    shown = (f for f in files if not any(part.startswith(".") for part in f.parts))
-    return sorted((f.as_posix() for f in shown if f.suffix.lower() in ENDINGS), key=in_order)
+    """All photographs below a folder that are the user's own."""
+    found: list[Path] = []
+    for home, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if _is_own(Path(home, name))]
+        shown = (Path(home, name) for name in files if not name.startswith("."))
+        found += [path.relative_to(folder) for path in shown if path.suffix.lower() in ENDINGS]
+    return sorted((path.as_posix() for path in found), key=in_order)
+
+
+def _is_own(folder: Path) -> bool:
+    """Whether photographs are looked for in a folder: not where it is hidden, holds masks or
+    smaller copies, or is a result of ours."""
+    if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
+        return False
+    return not os.path.isfile(folder / SUMMARY)
 
 
 def _fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:

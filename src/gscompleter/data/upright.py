@@ -5,6 +5,7 @@ COLMAP ignores the orientation that a camera writes into EXIF, so the pixels the
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,14 +50,13 @@ def write_upright(root: Path, source: str, folder: Path) -> Upright:
     format that COLMAP may not read becomes a PNG.
 
     Raises:
-        InputError: where it is damaged or no image.
+        InputError: where it is damaged or no image, or another copy has its name.
     """
     try:
         with Image.open(root / source, formats=FORMATS) as image:
             exif = image.getexif()
-            name = source if image.format in ("JPEG", "PNG") else f"{source}.png"
-            target = folder / name
-            target.parent.mkdir(parents=True, exist_ok=True)
+            name = _name(source, image.format)
+            target = _free(folder / name, root / source)
             width, height = _write(image, exif, root / source, target)
             return Upright(name, source, width, height, _focal(exif, width, height), _lens(exif))
     except InputError:
@@ -67,6 +67,22 @@ def write_upright(root: Path, source: str, folder: Path) -> Upright:
             f"{quoted(root / source)} is no image that can be read ({quoted(str(error))}); copy it "
             "again, or take it out of the folder."
         ) from error
+
+
+def _name(source: str, format: str | None) -> str:
+    """What the copy is called. In COLMAP's lists a space ends a name, and # begins a comment."""
+    return re.sub(r"[\s#]", "_", source) + ("" if format in ("JPEG", "PNG") else ".png")
+
+
+def _free(target: Path, source: Path) -> Path:
+    """Where to write the copy of `source`; no other one is there."""
+    if target.exists():
+        raise InputError(
+            f"The copy of {quoted(source)} would be called {target.name} like that of another "
+            "photograph; rename one of them."
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    return target
 
 
 def _write(image: Image.Image, exif: Image.Exif, source: Path, target: Path) -> tuple[int, int]:
