@@ -207,10 +207,13 @@ def test_a_linked_folder_stays_a_link(tmp_path):
 
 
 WRITES = """
-import os, sys, time
+import os, signal, sys, time
 from gscompleter.interrupts import treat_stops_alike
 from gscompleter.io.files import output_folder, replacing
 
+for number in (signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, signal.SIG_DFL)  # nohup and shells in the background ignore some
+signal.signal(signal.SIGINT, signal.default_int_handler)
 treat_stops_alike()
 out, renames = sys.argv[1], int(sys.argv[2])
 rename = os.rename

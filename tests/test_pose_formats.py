@@ -186,7 +186,7 @@ def test_poses_of_supersplat_show_the_room_upright(tmp_path, project):
     # The opening angle is that of the longer side.
     wide = load_cameras(path, (SIZE, 2 * SIZE))[0]
     assert wide.K[0, 0] == pytest.approx(0.9 * 2 * SIZE, rel=1e-4)
-    with pytest.raises(InputError, match="do not say how large the images are; give --resolution"):
+    with pytest.raises(InputError, match="do not say how large the images are; give a resolution"):
         load_cameras(path)
 
 

@@ -50,7 +50,8 @@ def poses_of(content: Any, path: Path, resolution: tuple[int, int] | None) -> li
     if resolution is None:
         raise InputError(
             f"The poses of SuperSplat in {quoted(path)} do not say how large the images are; give "
-            "--resolution HEIGHT WIDTH."
+            "a resolution (height and width).",
+            "resolution",
         )
     poses = _poses(content)
     if not isinstance(poses, list) or not poses:
