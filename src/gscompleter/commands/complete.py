@@ -54,8 +54,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
             cameras that were found.
     """
     console = Console(stderr=True, quiet=options.quiet)
-    overwrite = options.overwrite or holds_poses_only(options.out)
-    check_output(options.out, overwrite)
+    check_output(options.out, options.overwrite or holds_poses_only(options.out))
     check_context(options)
     device = choose_device(options.device)
     given = open_scene(options, console)
@@ -80,6 +79,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         "device": device,
         "frame": {"method": "given", "transform": frame.tolist()},
     }
+    overwrite = options.overwrite or holds_poses_only(options.out)
     with output_folder(options.out, overwrite) as folder:
         with shown_on(None if options.quiet else console):
             completion = completer(views, [t.camera.to(device) for t in targets], scene)
