@@ -26,6 +26,7 @@ from gscompleter.commands.options import (
     ModelsOptions,
     TablesOptions,
 )
+from gscompleter.commands.poses import PosesOptions
 from gscompleter.commands.strip import StripOptions
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import checked
@@ -42,6 +43,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "index": (IndexOptions, "gscompleter.commands.evaluate", "run_index"),
     "models": (ModelsOptions, "gscompleter.commands.models", "run_models"),
     "convert": (ConvertOptions, "gscompleter.commands.convert", "run_convert"),
+    "poses": (PosesOptions, "gscompleter.commands.poses", "run_poses"),
     "strip": (StripOptions, "gscompleter.commands.strip", "run_strip"),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -13,14 +14,15 @@ from rich.table import Table
 
 from gscompleter.commands.options import CompleteOptions
 from gscompleter.completer import GSCompleter
-from gscompleter.data.formats import open_photographs
+from gscompleter.data.formats import open_photographs, recognised
 from gscompleter.data.origin import frame_from_photographs, told_from
-from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.photographs import Photographs, PosedPhotographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sparse_points import with_depth_range
+from gscompleter.data.structure_from_motion import find_poses, holds_photographs
 from gscompleter.errors import InputError, quoted
 from gscompleter.generators import load_generator
-from gscompleter.io.files import check_output, output_folder
+from gscompleter.io.files import SUMMARY, check_output, output_folder
 from gscompleter.io.ply import load_ply
 from gscompleter.memory import check_memory
 from gscompleter.progress import shown_on
@@ -31,6 +33,8 @@ from gscompleter.types import Camera, Completion, View
 
 MIN_SIZE = 16
 """Shorter side of an image, in pixels, under which there is nothing to match and to score."""
+POSES = "colmap"
+"""The folder of the output with the cameras that were found."""
 MAX_DIGITS = 9
 """Characters of the longest number of a frame."""
 
@@ -46,13 +50,14 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     """Complete the scene of `options.folder` and write `options.out`; also returns the summary.
 
     Raises:
-        InputError: anything about the input that the user can mend; nothing is written then.
+        InputError: anything about the input that the user can mend; nothing is written then but
+            cameras that were found.
     """
     console = Console(stderr=True, quiet=options.quiet)
-    check_output(options.out, options.overwrite)
+    check_output(options.out, options.overwrite or holds_poses_only(options.out))
     check_context(options)
     device = choose_device(options.device)
-    given = open_photographs(options.folder, options.format, options.near, options.far)
+    given = open_scene(options, console)
     given = with_depth_range(given, options.context, options.resolution)
     for note in given.notes:
         console.print(note, highlight=False, soft_wrap=True)
@@ -74,11 +79,35 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         "device": device,
         "frame": {"method": "given", "transform": frame.tolist()},
     }
-    with output_folder(options.out, options.overwrite) as folder:
+    overwrite = options.overwrite or holds_poses_only(options.out)
+    with output_folder(options.out, overwrite) as folder:
         with shown_on(None if options.quiet else console):
             completion = completer(views, [t.camera.to(device) for t in targets], scene)
         summary = write_report(folder, completion, targets, completer.renderer, said)
     return summary, completion
+
+
+def open_scene(options: CompleteOptions, console: Console) -> Photographs:
+    """The posed photographs of `options.folder`. Where it has no cameras, they are found first, and
+    kept in the output folder, whatever becomes of the completion.
+
+    Raises:
+        InputError: as `open_photographs` and `find_poses`.
+    """
+    folder, poses = options.folder, options.out / POSES
+    if options.format is None and holds_photographs(folder) and recognised(folder) is None:
+        ours = options.overwrite or os.path.isfile(poses / SUMMARY)
+        with shown_on(None if options.quiet else console):
+            found = find_poses(folder, poses, overwrite=ours)
+        for note in found.notes:
+            console.print(note, highlight=False, soft_wrap=True)
+        folder = poses
+    return open_photographs(folder, options.format, options.near, options.far)
+
+
+def holds_poses_only(out: Path) -> bool:
+    """Whether a folder has nothing in it but the poses that an earlier run found."""
+    return os.path.isdir(out) and os.listdir(out) == [POSES]
 
 
 def completer_for(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:

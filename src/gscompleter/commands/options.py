@@ -58,7 +58,8 @@ class CompleteOptions(ModelOptions):
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Posed photographs: a folder with a COLMAP model or a nerfstudio transforms.json, a
     cameras.json beside its photographs, a poses_bounds.npy of LLFF, a sequence of KITTI, a scene
-    of DGP, a chunk of pixelSplat, or a camera file of RealEstate10K beside its frames."""
+    of DGP, a chunk of pixelSplat, or a camera file of RealEstate10K beside its frames. The cameras
+    of photographs that have none are found by COLMAP and kept in OUT/colmap."""
     context: tuple[Frame, ...]
     """Numbers of the frames to start from, in the order of the sorted file paths."""
     target: tuple[str, ...]

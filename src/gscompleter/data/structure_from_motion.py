@@ -1,0 +1,261 @@
+"""Photographs without poses: their cameras are found by COLMAP, on the CPU.
+
+The folder that is written has COLMAP's standard layout: upright copies in `images`, the model in
+`sparse/0`. A `summary.json` beside them says which photographs it was made from, so that the next
+run need not find them again. COLMAP runs in a process of its own (`mapping_process`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO, Any
+
+from gscompleter.data.frame import DOWNSCALED
+from gscompleter.data.image_folders import MASKS
+from gscompleter.data.match_pairs import in_order
+from gscompleter.data.upright import Upright, write_upright
+from gscompleter.errors import InputError, quoted
+from gscompleter.io.files import SUMMARY, output_folder
+from gscompleter.io.json_file import read_json
+from gscompleter.progress import track
+
+ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+"""Of photographs, in any case."""
+NO_PHOTOGRAPHS = (MASKS, *(f"images_{n}" for n in DOWNSCALED))
+"""Folders beside those of photographs."""
+MIN_PHOTOGRAPHS = 3
+"""With two, neither the focal length nor a wrong match can be told."""
+MAX_THREADS = 4
+MAX_NAMED = 5
+"""Photographs that a note names at most."""
+PROCESS = "gscompleter.data.mapping_process"
+
+
+@dataclass(frozen=True)
+class FoundPoses:
+    """What came out of a folder of photographs."""
+
+    photographs: int
+    """How many there were."""
+    missing: tuple[str, ...]
+    """Those whose camera was not found."""
+    models: tuple[int, ...]
+    """Cameras in each of the models that do not connect, the largest first; it was kept."""
+    points: int
+    """Points of the model."""
+    error: float
+    """Mean distance of a point to its features, in pixels of the copies."""
+    reused: bool = False
+    """Whether an earlier run had found them."""
+
+    @property
+    def registered(self) -> int:
+        """How many cameras were found."""
+        return self.photographs - len(self.missing)
+
+    @property
+    def notes(self) -> list[str]:
+        """What the user should know, in sentences."""
+        notes = []
+        if self.missing:
+            names = ", ".join(quoted(name) for name in self.missing[:MAX_NAMED])
+            more = len(self.missing) - MAX_NAMED
+            notes.append(
+                f"No camera was found for {names}{f' and {more} more' if more > 0 else ''}; they "
+                "are left out."
+            )
+        if len(self.models) > 1:
+            notes.append(
+                f"The photographs fall into {len(self.models)} parts that do not connect, of "
+                f"{' and '.join(map(str, self.models))} cameras; the largest is kept."
+            )
+        return notes
+
+
+def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPoses:
+    """Find the cameras of the `photographs` in a folder and write them to the folder `out`.
+
+    Raises:
+        InputError: where there are too few photographs or one is damaged, no cameras are found,
+            pycolmap is not installed or gives up, or `out` cannot be written.
+    """
+    names = photographs_in(photographs)
+    known = _fingerprint(photographs, names)
+    earlier = _found_earlier(out, known)
+    if earlier is not None:
+        return earlier
+    check_pycolmap()
+    with output_folder(out, overwrite) as folder:
+        found = _find(photographs, names, folder)
+        content = {"found": asdict(found), "photographs": known}
+        (folder / SUMMARY).write_text(json.dumps(content, indent=1))
+    return found
+
+
+def holds_photographs(path: Path) -> bool:
+    """Whether `path` is a folder with photographs in it, with or without cameras."""
+    return os.path.isdir(path) and bool(_listed(path))
+
+
+def photographs_in(folder: Path) -> list[str]:
+    """The photographs below a folder, relative to it, as people count.
+
+    Raises:
+        InputError: where there is no such folder, or too few photographs are in it.
+    """
+    if not os.path.isdir(folder):
+        raise InputError(f"There is no folder {quoted(folder)}; name a folder of photographs.")
+    names = _listed(folder)
+    if len(names) < MIN_PHOTOGRAPHS:
+        raise InputError(
+            f"There are {len(names)} photographs ({', '.join(ENDINGS)}) in {quoted(folder)}, and "
+            f"at least {MIN_PHOTOGRAPHS} are needed to find their cameras; add more."
+        )
+    return names
+
+
+def check_pycolmap() -> None:
+    """Refuse to go on without pycolmap.
+
+    Raises:
+        InputError: where it is not installed.
+    """
+    if find_spec("pycolmap") is None:
+        raise InputError(
+            "Finding the cameras of photographs needs pycolmap, which is not installed; run "
+            "pip install 'gscompleter[poses]'."
+        )
+
+
+def _listed(folder: Path) -> list[str]:
+    """All photographs below a folder that are the user's own."""
+    found: list[Path] = []
+    for home, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if _is_own(Path(home, name))]
+        shown = (Path(home, name) for name in files if not name.startswith("."))
+        found += [path.relative_to(folder) for path in shown if path.suffix.lower() in ENDINGS]
+    return sorted((path.as_posix() for path in found), key=in_order)
+
+
+def _is_own(folder: Path) -> bool:
+    """Whether photographs are looked for in a folder: not where it is hidden, holds masks or
+    smaller copies, or is a result of ours."""
+    if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
+        return False
+    return not os.path.isfile(folder / SUMMARY)
+
+
+def _fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
+    """Size in bytes and time of the last change of each photograph."""
+    stats = {name: (folder / name).stat() for name in names}
+    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
+
+
+def _found_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
+    """What an earlier run found for these very photographs; None where none did."""
+    if not os.path.isfile(out / SUMMARY) or not os.path.isdir(out / "sparse" / "0"):
+        return None
+    content = read_json(out / SUMMARY, "name another folder")
+    if not isinstance(content, dict) or content.get("photographs") != known:
+        return None
+    found = content["found"]
+    return FoundPoses(
+        found["photographs"],
+        tuple(found["missing"]),
+        tuple(found["models"]),
+        found["points"],
+        found["error"],
+        reused=True,
+    )
+
+
+def _find(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
+    """Write `images` and `sparse/0` into `folder`."""
+    copies = [
+        write_upright(photographs, name, folder / "images")
+        for name in track(names, "Turning photographs upright")
+    ]
+    result = _mapped(copies, folder)
+    if not result["registered"]:
+        raise InputError(
+            f"COLMAP found no cameras for the {len(names)} photographs in {quoted(photographs)}; "
+            "add photographs of the same scene that overlap by two thirds and are sharp."
+        )
+    registered = set(result["registered"])
+    missing = tuple(copy.source for copy in copies if copy.name not in registered)
+    return FoundPoses(
+        len(names), missing, tuple(result["models"]), result["points"], result["error"]
+    )
+
+
+def _mapped(copies: Sequence[Upright], folder: Path) -> dict[str, Any]:
+    """What `mapping_process` says of the copies in `folder/images`."""
+    with tempfile.TemporaryDirectory(dir=folder) as work:
+        job = {
+            "images": str(folder / "images"),
+            "work": work,
+            "model": str(folder / "sparse" / "0"),
+            "photographs": [asdict(copy) for copy in copies],
+            "threads": min(MAX_THREADS, os.cpu_count() or 1),
+        }
+        (Path(work) / "job.json").write_text(json.dumps(job), encoding="utf-8")
+        with (Path(work) / "complaints.txt").open("w+", errors="replace") as complaints:
+            return _result_of(Path(work) / "job.json", complaints)
+
+
+def _result_of(job: Path, complaints: IO[str]) -> dict[str, Any]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", PROCESS, str(job)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=complaints,
+        text=True,
+    )
+    try:
+        phase, result = _followed(process)
+        process.wait()
+    finally:
+        process.kill()
+        process.wait()
+    if result is None:
+        raise InputError(_gave_up(phase, process.returncode, complaints))
+    return result
+
+
+def _followed(process: subprocess.Popen[str]) -> tuple[str, dict[str, Any] | None]:
+    """Show the progress of a process; returns the last phase it began, and its result."""
+    assert process.stdout is not None
+    phase, result = "Starting", None
+    lines = (json.loads(line) for line in process.stdout)
+    for line in lines:
+        result = line.get("result", result)
+        if "begin" in line:
+            phase = line["begin"]
+            _show(lines, phase, line["steps"])
+    return phase, result
+
+
+def _show(lines: Iterator[dict[str, Any]], phase: str, steps: int) -> None:
+    """A bar that follows the steps of a phase until there are no more."""
+    for _ in track(range(steps), phase):
+        if "step" not in next(lines, {}):
+            return
+
+
+def _gave_up(phase: str, code: int, complaints: IO[str]) -> str:
+    """Why there is no result."""
+    complaints.seek(0)
+    said = [line.strip() for line in complaints if line.strip()]
+    reason = f": {quoted(said[-1], 200)}" if said else f" with exit code {code}"
+    return (
+        f"COLMAP gave up while {phase[0].lower()}{phase[1:]}{reason}; leave out photographs that "
+        "may be damaged, and try again."
+    )

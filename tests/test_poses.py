@@ -1,0 +1,277 @@
+"""The cameras of photographs that come without any."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from command import run
+from gscompleter.data import structure_from_motion
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.match_pairs import (
+    alike,
+    all_pairs,
+    in_order,
+    is_sequence,
+    likeness,
+    neighbours,
+)
+from gscompleter.data.structure_from_motion import FoundPoses, find_poses, photographs_in
+from gscompleter.data.upright import MAX_SIDE, write_upright
+from gscompleter.errors import InputError
+from gscompleter.io.image import write_image
+from scenes import Room, camera_at, view_of
+
+CAMERAS = [
+    camera_at(x=0.3 * i - 1.05, y=0.1 * (i % 3), z=0.05 * i, yaw=14 - 4 * i, size=160)
+    for i in range(8)
+]
+ORIENTATION, FOCAL_35 = 0x0112, 0xA405
+
+
+def photographs(folder: Path) -> Path:
+    """Eight photographs of the room, numbered from 5, so that 10.png is no second."""
+    folder.mkdir()
+    for number, camera in enumerate(CAMERAS, start=5):
+        write_image(folder / f"{number}.png", view_of(Room(), camera).image)
+    return folder
+
+
+def blank(folder: Path, count: int) -> Path:
+    """Photographs with nothing to see in them."""
+    folder.mkdir()
+    for number in range(count):
+        Image.new("RGB", (64, 48), "grey").save(folder / f"{number}.png")
+    return folder
+
+
+def similarity_removed(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """`found` positions [n, 3] moved, turned and scaled as one to lie on the `true` ones."""
+    a, b = found - found.mean(0), true - true.mean(0)
+    U, S, Vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1, 1, np.sign(np.linalg.det(U @ Vt))])
+    scale = (S * signs).sum() / (a**2).sum()
+    return scale * a @ (U @ np.diag(signs) @ Vt).T + true.mean(0)
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> None:
+    """Let a script stand in for the process that runs COLMAP."""
+    (tmp_path / "stand_in_mapping.py").write_text(script)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(structure_from_motion, "PROCESS", "stand_in_mapping")
+
+
+def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pycolmap")
+    given, out = photographs(tmp_path / "room"), tmp_path / "poses"
+    assert run(monkeypatch, "poses", given, "--out", out) == 0
+    assert capsys.readouterr().out.startswith("8 of 8 cameras and ")
+    assert {path.name for path in out.iterdir()} == {"images", "sparse", "summary.json"}
+
+    opened = open_photographs(out)
+    order = [int(name.removesuffix(".png")) - 5 for name in opened.names]
+    found = np.stack([opened.camera(i).center.numpy() for i in range(len(opened))])
+    true = np.stack([CAMERAS[i].center.numpy() for i in order])
+    off = np.linalg.norm(similarity_removed(found, true) - true, axis=1)
+    assert off.max() < 0.02  # of an extent of 2.1
+    focal = float(opened.camera(0).K[0, 0])
+    assert focal == pytest.approx(float(CAMERAS[0].K[0, 0]), rel=0.03)
+
+
+def test_the_next_run_keeps_what_was_found(tmp_path, monkeypatch):
+    given, out = blank(tmp_path / "photos", 3), tmp_path / "poses"
+    stand_in(monkeypatch, tmp_path, MODEL_OF_TWO)
+    first = find_poses(given, out)
+    stand_in(monkeypatch, tmp_path, "raise SystemExit('asked again')")
+    again = find_poses(given, out)
+    assert again.reused
+    assert (again.missing, again.models) == (first.missing, first.models)
+
+    os.utime(given / "0.png", ns=(1, 1))
+    with pytest.raises(InputError, match="asked again"):
+        find_poses(given, out, overwrite=True)
+    assert find_poses_summary(out)["found"]["models"] == [2]  # what was there survives
+
+
+MODEL_OF_TWO = """
+import json, pathlib, sys
+job = json.loads(pathlib.Path(sys.argv[1]).read_text())
+pathlib.Path(job["model"]).mkdir(parents=True)
+for line in ({"begin": "Placing cameras", "steps": 3}, {"step": 1}, {"end": "Placing cameras"}):
+    print(json.dumps(line))
+print(json.dumps({"result": {"registered": ["0.png", "2.png"], "models": [2], "points": 9,
+    "error": 0.5}}))
+"""
+
+
+def find_poses_summary(out: Path) -> dict:
+    return json.loads((out / "summary.json").read_text())
+
+
+def test_photographs_without_a_camera_are_named(tmp_path, monkeypatch, capsys):
+    stand_in(monkeypatch, tmp_path, MODEL_OF_TWO)
+    assert run(monkeypatch, "poses", blank(tmp_path / "p", 3), "--out", tmp_path / "out") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "No camera was found for 1.png; they are left out."
+    assert said[1].startswith("2 of 3 cameras and 9 points, 0.50 px off on average: ")
+
+
+def test_parts_that_do_not_connect_are_told():
+    (note,) = FoundPoses(9, (), (5, 4), 100, 0.5).notes
+    assert "2 parts that do not connect, of 5 and 4 cameras" in note
+
+
+def test_photographs_of_nothing_have_no_cameras(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pycolmap")
+    out = tmp_path / "out"
+    assert run(monkeypatch, "poses", blank(tmp_path / "p", 3), "--out", out, "--quiet") == 2
+    assert "COLMAP found no cameras for the 3 photographs" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_process_that_aborts_is_a_sentence_and_leaves_nothing(tmp_path, monkeypatch):
+    abort = """
+import json, os, sys
+print(json.dumps({"begin": "Matching features", "steps": 5}), flush=True)
+print("Check failed: x > 0", file=sys.stderr, flush=True)
+os.abort()
+"""
+    stand_in(monkeypatch, tmp_path, abort)
+    with pytest.raises(InputError, match="gave up while matching features: Check failed: x > 0;"):
+        find_poses(blank(tmp_path / "p", 3), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_photographs_are_too_few(tmp_path):
+    with pytest.raises(InputError, match="There are 2 photographs"):
+        find_poses(blank(tmp_path / "p", 2), tmp_path / "out")
+
+
+def test_a_folder_of_other_files_has_no_photographs(tmp_path):
+    (tmp_path / "notes.txt").write_text("no photograph")
+    with pytest.raises(InputError, match="There are 0 photographs"):
+        photographs_in(tmp_path)
+
+
+def test_a_file_that_is_no_image_is_named(tmp_path):
+    folder = blank(tmp_path / "p", 3)
+    (folder / "1.png").write_bytes(b"no image")
+    with pytest.raises(InputError, match="1.png is no image that can be read"):
+        find_poses(folder, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_package_is_told_how_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'gscompleter\[poses\]'"):
+        find_poses(blank(tmp_path / "p", 3), tmp_path / "out")
+
+
+def test_copies_stand_upright_and_know_their_focal_length(tmp_path):
+    image = Image.new("RGB", (2000, 1000), "red")
+    image.paste("blue", (0, 0, 1000, 1000))
+    exif = image.getexif()
+    exif[ORIENTATION] = 6  # stored lying on its left side: its left is the top
+    exif.get_ifd(0x8769)[FOCAL_35] = 43
+    image.save(tmp_path / "a.jpg", exif=exif)
+    copy = write_upright(tmp_path, "a.jpg", tmp_path / "images")
+    assert (copy.width, copy.height) == (800, MAX_SIDE)
+    assert copy.focal == pytest.approx(43 / 43.2666 * (800**2 + 1600**2) ** 0.5)
+    with Image.open(tmp_path / "images" / "a.jpg") as written:
+        assert written.size == (800, MAX_SIDE)
+        assert written.getexif().get(ORIENTATION, 1) == 1
+        assert written.getpixel((400, 100))[2] > 200  # blue above
+
+
+def test_an_upright_small_photograph_is_copied_byte_for_byte(tmp_path):
+    Image.new("RGB", (64, 48), "red").save(tmp_path / "a.jpg")
+    write_upright(tmp_path, "a.jpg", tmp_path / "images")
+    assert (tmp_path / "images/a.jpg").read_bytes() == (tmp_path / "a.jpg").read_bytes()
+
+
+def test_other_formats_become_png(tmp_path):
+    Image.new("RGBA", (64, 48), "red").save(tmp_path / "a.tif")
+    copy = write_upright(tmp_path, "a.tif", tmp_path / "images")
+    assert copy.name == "a.tif.png"
+    assert copy.source == "a.tif"
+    with Image.open(tmp_path / "images" / copy.name) as written:
+        assert (written.format, written.mode) == ("PNG", "RGB")
+
+
+def test_names_that_colmap_cannot_list_are_changed(tmp_path):
+    for name in ("a b.png", "a_b.png"):
+        Image.new("RGB", (64, 48), "red").save(tmp_path / name)
+    assert write_upright(tmp_path, "a b.png", tmp_path / "images").name == "a_b.png"
+    with pytest.raises(InputError, match="would be called a_b.png"):
+        write_upright(tmp_path, "a_b.png", tmp_path / "images")
+
+
+def test_masks_hidden_files_and_our_own_results_are_no_photographs(tmp_path):
+    folder = blank(tmp_path / "p", 3)
+    for name in ("masks", "images_2", ".cache", "out"):
+        blank(folder / name, 1)
+    (folder / "out" / "summary.json").write_text("{}")
+    Image.new("RGB", (64, 48)).save(folder / ".hidden.png")
+    assert photographs_in(folder) == ["0.png", "1.png", "2.png"]
+
+
+def test_photographs_alone_are_completed_and_their_cameras_kept(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    given, out = photographs(tmp_path / "room"), tmp_path / "out"
+    words = ["complete", given, "--context", 0, 2, "--out", out, "--resolution", 48, 48, "--quiet"]
+    assert run(monkeypatch, *words, "--target", 4) == 0
+    assert (out / "completed.ply").exists()
+    assert (out / "colmap" / "sparse" / "0" / "cameras.bin").exists()
+    assert run(monkeypatch, *words, "--target", 4) == 2  # nothing is replaced unasked
+
+    (out / "colmap").rename(tmp_path / "colmap")
+    shutil.rmtree(out)
+    out.mkdir()
+    (tmp_path / "colmap").rename(out / "colmap")
+    monkeypatch.setattr(structure_from_motion, "PROCESS", "nobody")
+    assert run(monkeypatch, *words, "--target", 4) == 0  # with the cameras that are there
+
+
+def test_names_are_sorted_as_people_count():
+    assert sorted(["10.jpg", "9.jpg", "b.jpg"], key=in_order) == ["9.jpg", "10.jpg", "b.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("names", "counts"),
+    [
+        (["IMG_0001.jpg", "IMG_0002.jpg"], True),
+        (["7.png", "10.png"], True),
+        (["2024-05-01 frame 3.png", "2024-05-01 frame 4.png"], True),
+        (["left/1.png", "right/2.png"], False),
+        (["door.png", "window.png"], False),
+    ],
+)
+def test_names_with_a_number_are_a_sequence(names, counts):
+    assert is_sequence(names) is counts
+
+
+def test_neighbours_reach_ten_on_and_then_by_doubling():
+    assert {j for i, j in neighbours(40) if i == 0} == {*range(1, 11), 16, 32}
+    assert neighbours(3) == all_pairs(3) == {(0, 1), (0, 2), (1, 2)}
+
+
+def test_photographs_with_the_same_features_look_alike():
+    generator = np.random.default_rng(0)
+    near, far = (generator.standard_normal((40, 128)).astype(np.float32) for _ in range(2))
+    near, far = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (near, far))
+    nothing = np.zeros((0, 128), np.float32)
+    shared = likeness([near, far, near[::-1].copy(), nothing])
+    assert shared[0, 2] == 40
+    assert alike(shared) == {(0, 2)}
+
+
+@pytest.mark.slow
+def test_forty_real_photographs_are_all_placed(shared, tmp_path):
+    pytest.importorskip("pycolmap")
+    found = find_poses(shared / "data" / "fox" / "images", tmp_path / "fox")
+    assert found.registered == 40
+    assert found.error < 0.5
