@@ -102,7 +102,7 @@ def test_a_moderate_mismatch_is_noticed_and_mended(views, splat):
     larger = np.diag([1.2, 1.2, 1.2, 1.0])
     found = find(views, splat, larger)
     assert found.method == "similarity"
-    assert found.fit.psnr > found.given.psnr + 1
+    assert found.fit.psnr > found.given.psnr + 2
     assert_takes_to(found.transform, larger, 0.03)
 
 
@@ -139,16 +139,16 @@ def test_nerfstudio_turns_up_to_z(views):
 def test_one_wrong_pose_among_four_moves_a_similarity_by_nothing(views):
     before = poses_of(views)
     after = np.stack([moved_pose(pose, ARBITRARY) for pose in before])
-    assert_takes_to(similarity_between(list(before), list(after)), ARBITRARY, 1e-9)
+    assert_takes_to(similarity_between(list(before), list(after)), ARBITRARY, 1e-6)
     after[3] = moved_pose(after[3], similarity(1.0, np.diag([1.0, -1, -1]), np.ones(3)))
-    assert_takes_to(similarity_between(list(before), list(after)), ARBITRARY, 0.5)
+    assert_takes_to(similarity_between(list(before), list(after)), ARBITRARY, 1e-6)
 
 
 def test_a_moved_camera_sees_the_moved_splat_as_before(views, splat):
     scene = moved(splat, torch.from_numpy(ARBITRARY).float())
     before = RENDERER.render(splat, views[0].camera)
     after = RENDERER.render(scene, moved_camera(views[0].camera, ARBITRARY))
-    assert (before.image - after.image).abs().mean() < 1e-3
+    assert (before.image - after.image).abs().mean() < 1e-2  # equal depths change order
     assert torch.allclose(before.depth * 0.3, after.depth, rtol=1e-2, atol=1e-2)
     view = moved_view(views[0], ARBITRARY)
     assert view.camera.near == pytest.approx(0.3 * views[0].camera.near)

@@ -19,8 +19,9 @@ from gscompleter.frames.witnesses import have_baseline, rough_points
 from gscompleter.render import Renderer
 from gscompleter.types import Gaussians, View
 
-CLEARLY = 1.0
-"""dB by which a frame must fit better than a simpler one to take its place."""
+CLEARLY = 2.0
+"""dB by which a frame must fit better than a simpler one to take its place. A blurred splat in the
+right frame gains one from being a little smaller."""
 
 Method = Literal["given", "dataparser", "normalised", "similarity"]
 

@@ -73,8 +73,8 @@ def pose_of(camera: Camera) -> Matrix:
 def similarity_between(before: Sequence[Matrix], after: Sequence[Matrix]) -> Matrix:
     """The similarity that takes poses to others of the same cameras, where most of these are right.
 
-    The rotation is the one closest to all, the scale the median ratio of distances between
-    cameras, the shift the median: a minority of wrong poses moves none of them far. Poses [n, 4, 4]
+    The rotation is the one closest to most, the scale the median over cameras of their median
+    ratio of distances to others, the shift the median: a minority of wrong poses moves none far. Poses [n, 4, 4]
     with n >= 2, and not all of `before` in one place.
     """
     turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
@@ -82,6 +82,8 @@ def similarity_between(before: Sequence[Matrix], after: Sequence[Matrix]) -> Mat
     rotation = turns[np.median(closeness, axis=1).argmax()]
     old, new = np.stack(before)[:, :3, 3], np.stack(after)[:, :3, 3]
     apart = np.linalg.norm(old[:, None] - old, axis=-1)
-    pairs = apart > 0.3 * apart.max()
-    scale = float(np.median(np.linalg.norm(new[:, None] - new, axis=-1)[pairs] / apart[pairs]))
+    # Of two cameras that are farthest apart, one is far enough from any other.
+    apart[apart < 0.3 * apart.max()] = np.nan
+    ratios = np.linalg.norm(new[:, None] - new, axis=-1) / apart
+    scale = float(np.median(np.nanmedian(ratios, axis=1)))
     return similarity(scale, rotation, np.median(new - scale * old @ rotation.T, axis=0))
