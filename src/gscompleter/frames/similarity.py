@@ -74,8 +74,8 @@ def similarity_between(before: Sequence[Matrix], after: Sequence[Matrix]) -> Mat
     """The similarity that takes poses to others of the same cameras, where most of these are right.
 
     The rotation is the one closest to most, the scale the median over cameras of their median
-    ratio of distances to others, the shift the median: a minority of wrong poses moves none far. Poses [n, 4, 4]
-    with n >= 2, and not all of `before` in one place.
+    ratio of distances to others, the shift the median: a minority of wrong poses moves none far.
+    There are at least two poses, and not all of `before` stand in one place.
     """
     turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
     closeness = np.einsum("iab,jab->ij", turns, turns)
