@@ -21,6 +21,8 @@ from gscompleter.data.scene import load_cameras
 from gscompleter.data.sparse_points import with_depth_range
 from gscompleter.data.structure_from_motion import find_poses, holds_photographs
 from gscompleter.errors import InputError, quoted
+from gscompleter.frames.placing import frame_of_splat
+from gscompleter.frames.similarity import moved_camera, moved_view
 from gscompleter.generators import load_generator
 from gscompleter.io.files import SUMMARY, check_output, output_folder
 from gscompleter.io.ply import load_ply
@@ -67,17 +69,22 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     check_sizes(cameras)
     views = [view.to(device) for view in given.views(options.context, options.resolution)]
     targets = [with_photograph(target, given, options) for target in targets]
-    scene = None
+    scene, frame, method = None, frame_from_photographs(given.origin), "given"
     if options.scene is not None:
         scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite)
         scene = told_from(given.origin, scene, cameras).to(device)
+        renderer = load_renderer(device)
+        found = frame_of_splat(options.scene, scene, given, options.context, renderer)
+        console.print(found.sentence(), highlight=False, soft_wrap=True)
+        views = [moved_view(view, found.transform) for view in views]
+        targets = [replace(t, camera=moved_camera(t.camera, found.transform)) for t in targets]
+        frame, method = found.transform @ frame, found.method
     completer = completer_for(options, targets, device)
-    frame = frame_from_photographs(given.origin)
     said = {
         "settings": settings_of(options),
         "seed": options.seed,
         "device": device,
-        "frame": {"method": "given", "transform": frame.tolist()},
+        "frame": {"method": method, "transform": frame.tolist()},
     }
     overwrite = options.overwrite or holds_poses_only(options.out)
     with output_folder(options.out, overwrite) as folder:
@@ -230,7 +237,7 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
     for note in notes:
         console.print(note)
     offset = [-row[3] for row in summary["frame"]["transform"][:3]]
-    if any(offset):
+    if summary["frame"]["method"] == "given" and any(offset):
         console.print(
             f"The coordinates are large against the baselines, so the result is relative to "
             f"{' '.join(map(str, offset))}; summary.json has the transform.",

@@ -1,0 +1,90 @@
+"""A similarity made exact: matched features of all photographs must agree with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from gscompleter.frames.matching import MAX_ERROR, Located, Photograph, located
+from gscompleter.frames.similarity import (
+    Matrix,
+    moved_camera,
+    pose_of,
+    similarity,
+    similarity_between,
+)
+from gscompleter.render import Renderer
+from gscompleter.types import Gaussians
+
+ROUNDS = 2
+"""Each draws the splat where the former has put the cameras."""
+
+
+def refined(
+    scene: Gaussians, photographs: Sequence[Photograph], transform: Matrix, renderer: Renderer
+) -> Matrix | None:
+    """The similarity near `transform` that features agree with; None where too few are found.
+
+    Args:
+        transform: From the frame of the photographs to that of `scene`.
+    """
+    for _ in range(ROUNDS):
+        found = [
+            place
+            for photograph in photographs
+            for place in located(
+                scene, moved_camera(photograph.camera, transform), [photograph], renderer
+            )
+        ]
+        better = similarity_of(found)
+        if better is None:
+            return None
+        transform = better
+    return transform
+
+
+def similarity_of(found: Sequence[Located]) -> Matrix | None:
+    """Photographs' frame to the splat's, by located photographs; None where they are too few."""
+    before = [pose_of(place.photograph.camera) for place in found]
+    centers = np.array([pose[:3, 3] for pose in before]).reshape(-1, 3)
+    if len(found) < 2 or np.ptp(centers, axis=0).max() <= 1e-6 * np.abs(centers).max():
+        return None
+    start = similarity_between(before, [place.pose for place in found])
+    return reprojected(found, start) if np.linalg.det(start[:3, :3]) > 0 else None
+
+
+def reprojected(found: Sequence[Located], start: Matrix) -> Matrix:
+    """The similarity whose reprojection errors are smallest; outliers hardly count.
+
+    The seven unknowns change the splat's points, seen from the photographs' frame: the logarithm
+    of the scale, a rotation vector, and a shift in units of the points' spread.
+    """
+    back = np.linalg.inv(start)
+    points = [place.points @ back[:3, :3].T + back[:3, 3] for place in found]
+    center = np.median(np.concatenate(points), axis=0)
+    unit = float(np.median(np.linalg.norm(np.concatenate(points) - center, axis=1)))
+
+    def change(unknowns: Float[np.ndarray, "7"]) -> Matrix:
+        turn = np.exp(unknowns[0]) * Rotation.from_rotvec(unknowns[1:4]).as_matrix()
+        return similarity(1.0, turn, center + unit * unknowns[4:] - turn @ center)
+
+    def errors(unknowns: Float[np.ndarray, "7"]) -> Float[np.ndarray, "m"]:
+        moved = change(unknowns)
+        pairs = zip(found, points, strict=True)
+        return np.concatenate([_misses(p @ moved[:3, :3].T + moved[:3, 3], f) for f, p in pairs])
+
+    answer = least_squares(errors, np.zeros(7), loss="cauchy", f_scale=0.3 * MAX_ERROR)
+    return np.linalg.inv(change(answer.x) @ back)
+
+
+def _misses(points: Float[np.ndarray, "m 3"], place: Located) -> Float[np.ndarray, "k"]:
+    """How far points miss their pixels, along x and y, in pixels."""
+    pose = pose_of(place.photograph.camera)
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    homogeneous = local @ place.photograph.camera.K.detach().cpu().double().numpy().T
+    ahead = np.maximum(homogeneous[:, 2:], 1e-9 * np.abs(homogeneous).max())
+    return np.clip(homogeneous[:, :2] / ahead - place.pixels, -1e4, 1e4).ravel()

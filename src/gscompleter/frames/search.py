@@ -1,0 +1,66 @@
+"""A splat in an unknown frame: it is looked at from all around until photographs are recognised."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.frames.matching import Photograph, located
+from gscompleter.frames.refinement import similarity_of
+from gscompleter.frames.similarity import Matrix, moved_camera, pose_of, similarity
+from gscompleter.frames.trainers import Points, shortest_turn
+from gscompleter.render import Renderer
+from gscompleter.types import Gaussians
+
+Middle = tuple[Float[np.ndarray, "3"], float]
+"""Centre and radius of points."""
+
+DIRECTIONS = 40
+"""Around the splat, about 30° apart: features bear a turn of half of that, and any roll."""
+ZOOMS = (1.0, 0.6, 1.7)
+"""Times the size of the splat by its points, which far Gaussians and floaters blur."""
+
+
+def searched(
+    scene: Gaussians, photographs: Sequence[Photograph], points: Points, renderer: Renderer
+) -> Iterator[Matrix]:
+    """Similarities from the photographs' frame to the splat's by which some are recognised.
+
+    Args:
+        points: On the surfaces of the scene, in the photographs' frame.
+    """
+    seer = photographs[len(photographs) // 2].camera
+    solid = scene.means[scene.opacities >= 0.5].detach().cpu().double().numpy()
+    if len(solid) == 0:
+        return
+    for transform in starts(pose_of(seer), middle_of(points), middle_of(solid)):
+        found = located(scene, moved_camera(seer, transform), photographs, renderer)
+        answer = similarity_of(found)
+        if answer is not None:
+            yield answer
+
+
+def starts(pose: Matrix, place: Middle, goal: Middle) -> Iterator[Matrix]:
+    """Similarities that bring `place` to `goal` (centre and radius), with the camera all around."""
+    (center, radius), (new_center, new_radius) = place, goal
+    for zoom in ZOOMS:
+        scale = zoom * new_radius / max(radius, 1e-12)
+        for direction in directions(DIRECTIONS):
+            turn = shortest_turn(pose[:3, 2], direction)
+            yield similarity(scale, turn, new_center - scale * turn @ center)
+
+
+def middle_of(points: Points) -> Middle:
+    """Centre and radius of most of the points: medians, which floaters do not move."""
+    center = np.median(points, axis=0)
+    return center, float(np.median(np.linalg.norm(points - center, axis=1)))
+
+
+def directions(count: int) -> Float[np.ndarray, "n 3"]:
+    """Unit vectors spread evenly over the sphere, on a golden spiral."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)

@@ -1,0 +1,89 @@
+"""Similarities `x' = s R x + t` as 4x4 matrices, and cameras that are moved by them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from gscompleter.types import Camera, View
+
+Matrix = Float[np.ndarray, "4 4"]
+"""A similarity or a pose, in float64."""
+
+
+def similarity(
+    scale: float, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]
+) -> Matrix:
+    """`x' = scale * rotation @ x + shift`."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * rotation
+    matrix[:3, 3] = shift
+    return matrix
+
+
+def scale_of(transform: Matrix) -> float:
+    """The factor by which a similarity multiplies lengths."""
+    return float(np.cbrt(np.linalg.det(transform[:3, :3])))
+
+
+def rotation_of(transform: Matrix) -> Float[np.ndarray, "3 3"]:
+    """The turn of a similarity."""
+    return transform[:3, :3] / scale_of(transform)
+
+
+def moved_pose(c2w: Matrix, transform: Matrix) -> Matrix:
+    """A camera's pose in the frame that `transform` leads to."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_of(transform) @ c2w[:3, :3]
+    pose[:3, 3] = transform[:3, :3] @ c2w[:3, 3] + transform[:3, 3]
+    return pose
+
+
+def moved_camera(camera: Camera, transform: Matrix) -> Camera:
+    """The same camera in the frame and unit that `transform` leads to.
+
+    The identity gives the very same camera, without rounding.
+    """
+    if np.array_equal(transform, np.eye(4)):
+        return camera
+    factor = scale_of(transform)
+    c2w = torch.from_numpy(moved_pose(pose_of(camera), transform)).to(camera.c2w)
+    near = None if camera.near is None else camera.near * factor
+    far = None if camera.far is None else camera.far * factor
+    return replace(camera, c2w=c2w, near=near, far=far)
+
+
+def moved_view(view: View, transform: Matrix) -> View:
+    """A photograph, its camera and its measured depth in the frame that `transform` leads to."""
+    if np.array_equal(transform, np.eye(4)):
+        return view
+    depth = None if view.depth is None else view.depth * scale_of(transform)
+    return replace(view, camera=moved_camera(view.camera, transform), depth=depth)
+
+
+def pose_of(camera: Camera) -> Matrix:
+    """Its camera-to-world transform as an array in float64."""
+    return camera.c2w.detach().cpu().double().numpy()
+
+
+def similarity_between(before: Sequence[Matrix], after: Sequence[Matrix]) -> Matrix:
+    """The similarity that takes poses to others of the same cameras, where most of these are right.
+
+    The rotation is the one closest to most, the scale the median over cameras of their median
+    ratio of distances to others, the shift the median: a minority of wrong poses moves none far.
+    There are at least two poses, and not all of `before` stand in one place.
+    """
+    turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
+    closeness = np.einsum("iab,jab->ij", turns, turns)
+    rotation = turns[np.median(closeness, axis=1).argmax()]
+    old, new = np.stack(before)[:, :3, 3], np.stack(after)[:, :3, 3]
+    apart = np.linalg.norm(old[:, None] - old, axis=-1)
+    # Of two cameras that are farthest apart, one is far enough from any other.
+    apart[apart < 0.3 * apart.max()] = np.nan
+    ratios = np.linalg.norm(new[:, None] - new, axis=-1) / apart
+    scale = float(np.median(np.nanmedian(ratios, axis=1)))
+    return similarity(scale, rotation, np.median(new - scale * old @ rotation.T, axis=0))

@@ -1,0 +1,101 @@
+"""The frames that trainers of splats move a scene into, computed from its cameras and points.
+
+Each function takes poses (OpenCV axes) and gives transforms from their frame to the trainer's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.frames.similarity import Matrix, moved_pose, similarity
+
+Poses = Float[np.ndarray, "n 4 4"]
+Points = Float[np.ndarray, "p 3"]
+
+WORLDS = (
+    np.eye(3),
+    np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
+)
+"""Turns from COLMAP's world that nerfstudio applies before all else: none, today's, the former."""
+
+
+def trainers_frames(poses: Poses, points: Points | None = None) -> Iterator[tuple[str, Matrix]]:
+    """Every frame that a known trainer may have moved the scene into, with the trainer's name.
+
+    Args:
+        poses: Of all photographs, for trainers normalise by all of them.
+        points: The sparse points that the trainer began with, where they are known.
+    """
+    yield "OpenSplat", opensplat(poses)
+    for world in WORLDS:
+        yield "nerfstudio", nerfstudio(poses, world)
+    yield "gsplat", gsplat_cameras(poses)
+    if points is not None and len(points) > 3:
+        for transform in gsplat_points(gsplat_cameras(poses), points):
+            yield "gsplat", transform
+
+
+def opensplat(poses: Poses) -> Matrix:
+    """Centred on the mean camera; the largest coordinate of a camera becomes 1."""
+    centers = poses[:, :3, 3]
+    offsets = centers - centers.mean(axis=0)
+    scale = 1 / max(np.abs(offsets).max(), 1e-12)
+    return similarity(scale, np.eye(3), -scale * centers.mean(axis=0))
+
+
+def nerfstudio(poses: Poses, world: Float[np.ndarray, "3 3"]) -> Matrix:
+    """The mean up direction becomes z, then as `opensplat` does.
+
+    Args:
+        world: The turn that was applied to the cameras before.
+    """
+    up = -(poses[:, :3, 1] @ world.T).mean(axis=0)
+    upright = similarity(1.0, shortest_turn(up, np.array([0.0, 0.0, 1.0])) @ world, np.zeros(3))
+    return opensplat(np.stack([moved_pose(pose, upright) for pose in poses])) @ upright
+
+
+def gsplat_cameras(poses: Poses) -> Matrix:
+    """The first half of gsplat's normalisation: by the cameras.
+
+    Up is turned to the axis -y, the point that the cameras look at becomes the origin, and the
+    median distance of the cameras from it becomes 1.
+    """
+    turn = shortest_turn(-poses[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
+    centers, forward = poses[:, :3, 3] @ turn.T, poses[:, :3, 2] @ turn.T
+    nearest = centers - (forward * centers).sum(axis=1, keepdims=True) * forward
+    shift = -np.median(nearest, axis=0)
+    scale = 1 / max(float(np.median(np.linalg.norm(centers + shift, axis=1))), 1e-12)
+    return similarity(scale, turn, scale * shift)
+
+
+def gsplat_points(cameras: Matrix, points: Points) -> Iterator[Matrix]:
+    """The second half: the principal axes of the points become x, y and z, largest first.
+
+    Which way an eigenvector points is up to the linear algebra at hand, and newer versions turn
+    the scene upside down where it seems so: all four right-handed choices are given.
+    """
+    moved = points @ cameras[:3, :3].T + cameras[:3, 3]
+    center = np.median(moved, axis=0)
+    _, vectors = np.linalg.eigh(np.cov(moved - center, rowvar=False))
+    axes = vectors[:, ::-1].T
+    axes = axes * np.sign(np.linalg.det(axes))
+    for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
+        turn = np.diag(np.array(signs, dtype=np.float64)) @ axes
+        yield similarity(1.0, turn, -turn @ center) @ cameras
+
+
+def shortest_turn(
+    start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation about their common normal that takes one direction to a unit one."""
+    start = start / max(float(np.linalg.norm(start)), 1e-12)
+    x, y, z = np.cross(start, end)
+    cosine = float(start @ end)
+    if cosine < -1 + 1e-8:
+        return np.diag([-1.0, 1.0, -1.0]) if abs(end[1]) < 0.5 else np.diag([-1.0, -1.0, 1.0])
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + cosine)
