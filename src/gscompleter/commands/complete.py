@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
@@ -25,13 +27,13 @@ from gscompleter.frames.placing import frame_of_splat
 from gscompleter.frames.similarity import moved_camera, moved_view
 from gscompleter.generators import load_generator
 from gscompleter.io.files import SUMMARY, check_output, output_folder
-from gscompleter.io.ply import load_ply
 from gscompleter.memory import check_memory
 from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.completion import Target, write_report
-from gscompleter.types import Camera, Completion, View
+from gscompleter.splats.formats import load_splat
+from gscompleter.types import Camera, Completion, Gaussians, View
 
 MIN_SIZE = 16
 """Shorter side of an image, in pixels, under which there is nothing to match and to score."""
@@ -60,38 +62,71 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     check_context(options)
     device = choose_device(options.device)
     given = open_scene(options, console)
-    given = with_depth_range(given, options.context, options.resolution)
-    for note in given.notes:
-        console.print(note, highlight=False, soft_wrap=True)
-    targets = read_targets(given, options)
-    cameras = [given.camera(frame, options.resolution) for frame in options.context]
-    cameras += [target.camera for target in targets]
-    check_sizes(cameras)
-    views = [view.to(device) for view in given.views(options.context, options.resolution)]
-    targets = [with_photograph(target, given, options) for target in targets]
-    scene, frame, method = None, frame_from_photographs(given.origin), "given"
+    task = read_task(options, given, device)
     if options.scene is not None:
-        scene = load_ply(options.scene, drop_nonfinite=options.drop_nonfinite)
-        scene = told_from(given.origin, scene, cameras).to(device)
-        renderer = load_renderer(device)
-        found = frame_of_splat(options.scene, scene, given, options.context, renderer)
-        console.print(found.sentence(), highlight=False, soft_wrap=True)
-        views = [moved_view(view, found.transform) for view in views]
-        targets = [replace(t, camera=moved_camera(t.camera, found.transform)) for t in targets]
-        frame, method = found.transform @ frame, found.method
-    completer = completer_for(options, targets, device)
+        task = in_frame_of_splat(task, options.scene, options, given, console)
+    completer = completer_for(options, task.targets, device)
     said = {
         "settings": settings_of(options),
         "seed": options.seed,
         "device": device,
-        "frame": {"method": method, "transform": frame.tolist()},
+        "frame": {"method": task.method, "transform": task.frame.tolist()},
     }
     overwrite = options.overwrite or holds_poses_only(options.out)
     with output_folder(options.out, overwrite) as folder:
         with shown_on(None if options.quiet else console):
-            completion = completer(views, [t.camera.to(device) for t in targets], scene)
-        summary = write_report(folder, completion, targets, completer.renderer, said)
+            cameras = [target.camera.to(device) for target in task.targets]
+            completion = completer(task.views, cameras, task.scene)
+        summary = write_report(folder, completion, task.targets, completer.renderer, said)
     return summary, completion
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is completed, and in which frame."""
+
+    views: Sequence[View]
+    targets: Sequence[Target]
+    frame: Float[np.ndarray, "4 4"]
+    """From the frame of the photographs to that of the result."""
+    scene: Gaussians | None = None
+    """The splat that was brought; None where the context is reconstructed."""
+    method: str = "given"
+    """How the frame was found."""
+
+
+def read_task(options: CompleteOptions, given: Photographs, device: str) -> Task:
+    """The photographs and targets that the options name, once it is seen that there is room."""
+    targets = read_targets(given, options)
+    cameras = [given.camera(frame, options.resolution) for frame in options.context]
+    check_sizes([*cameras, *(target.camera for target in targets)])
+    views = [view.to(device) for view in given.views(options.context, options.resolution)]
+    targets = [with_photograph(target, given, options) for target in targets]
+    return Task(views, targets, frame_from_photographs(given.origin))
+
+
+def in_frame_of_splat(
+    task: Task, path: Path, options: CompleteOptions, given: Photographs, console: Console
+) -> Task:
+    """`task` with the splat of a file, its cameras brought to where the photographs show it.
+
+    Raises:
+        InputError: where the file is damaged, or the photographs show something else.
+    """
+    device = task.views[0].image.device
+    cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
+    scene = load_splat(path, drop_nonfinite=options.drop_nonfinite)
+    scene = told_from(given.origin, scene, cameras).to(device)
+    renderer = load_renderer(device.type)
+    found = frame_of_splat(path, scene, given, options.context, renderer)
+    console.print(found.sentence(), highlight=False, soft_wrap=True)
+    return Task(
+        [moved_view(view, found.transform) for view in task.views],
+        [replace(t, camera=moved_camera(t.camera, found.transform)) for t in task.targets],
+        found.transform @ task.frame,
+        scene,
+        found.method,
+    )
 
 
 def open_scene(options: CompleteOptions, console: Console) -> Photographs:
@@ -109,7 +144,11 @@ def open_scene(options: CompleteOptions, console: Console) -> Photographs:
         for note in found.notes:
             console.print(note, highlight=False, soft_wrap=True)
         folder = poses
-    return open_photographs(folder, options.format, options.near, options.far)
+    given = open_photographs(folder, options.format, options.near, options.far)
+    given = with_depth_range(given, options.context, options.resolution)
+    for note in given.notes:
+        console.print(note, highlight=False, soft_wrap=True)
+    return given
 
 
 def holds_poses_only(out: Path) -> bool:
