@@ -56,6 +56,7 @@ def test_out_holds_all_that_the_contract_names(completed):
     assert {p.name for p in completed.iterdir()} == {
         "completed.ply",
         "context.ply",
+        "generated.ply",
         "images",
         "summary.json",
     }
@@ -63,6 +64,14 @@ def test_out_holds_all_that_the_contract_names(completed):
     assert {p.name for p in (completed / "images").iterdir()} == {
         f"target1_{name}.png" for name in names
     }
+
+
+def test_what_was_added_lies_beside_the_scene_alone(completed):
+    scene, added = load_ply(completed / "completed.ply"), load_ply(completed / "generated.ply")
+    whole = scene[scene.generated > 0]
+    assert len(added) > 0
+    for name in ("means", "quats", "encoded", "sh", "generated"):
+        assert torch.equal(getattr(added, name), getattr(whole, name)), name
 
 
 def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(completed):

@@ -67,7 +67,7 @@ class CompleteOptions(ModelOptions):
     cameras.json, COLMAP's images.txt, SuperSplat's poses). Several are
     completed one after the other into one scene."""
     out: Path
-    """Folder for completed.ply, context.ply, images/ and summary.json."""
+    """Folder for completed.ply, generated.ply, context.ply, images/ and summary.json."""
     format: str | None = None
     """What SCENE is: colmap, transforms, cameras-json, llff, kitti, dgp, chunks or
     real-estate-10k. Found by what lies there if not given."""

@@ -106,7 +106,7 @@ def write_report(
     renderer: Renderer,
     said: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Write `context.ply`, `completed.ply`, `images/` and `summary.json`; returns the summary.
+    """Write the three scenes, `images/` and `summary.json`; returns the summary.
 
     Args:
         folder: Where to.
@@ -126,6 +126,7 @@ def write_report(
     summary = summarize(completion, targets, context_images, target_images, said)
     save_ply(folder / "context.ply", completion.context)
     save_ply(folder / "completed.ply", completion.scene, provenance=True)
+    save_ply(folder / "generated.ply", completion.added, provenance=True)
     (folder / "images").mkdir()
     for number, (result, images) in enumerate(zip(completion.targets, target_images, strict=True)):
         for name, image in pictures(result, images).items():
