@@ -244,11 +244,10 @@ def test_groups_of_methods():
 
 
 def test_peak_memory_sees_what_was_let_go_of():
-    with peak_memory() as much:
-        # Pages of its own: what earlier tests let go of may still lie about and be used again.
-        with mmap.mmap(-1, 2**28) as pages:
-            for page in range(0, 2**28, mmap.PAGESIZE):
-                pages[page] = 1
+    # Pages of its own: what earlier tests let go of may still lie about and be used again.
+    with peak_memory() as much, mmap.mmap(-1, 2**28) as pages:
+        for page in range(0, 2**28, mmap.PAGESIZE):
+            pages[page] = 1
     with peak_memory() as nothing:
         pass
     if sys.platform == "linux":
