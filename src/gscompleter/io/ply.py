@@ -244,7 +244,7 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
             vertices = read_vertices(file, file_format, ahead, vertex, path)
     except OSError as error:
         raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
-    return _whole(_gaussians(vertices, vertex), path, drop_nonfinite)
+    return whole(_gaussians(vertices, vertex), path, drop_nonfinite)
 
 
 def _gaussian_element(elements: list[Element], path: Path) -> Element:
@@ -315,24 +315,30 @@ def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
     )
 
 
-def _whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
-    """`gaussians` where every value can be drawn."""
-    assert gaussians.encoded is not None
+def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
+    """`gaussians` of the file `path` where every value can be drawn.
+
+    Raises:
+        InputError: where some hold NaN, infinity or a rotation of zeros and `drop_nonfinite` is
+            off, or all do.
+    """
+    opacities = gaussians.opacities if gaussians.encoded is None else gaussians.encoded
     good = (gaussians.quats != 0).any(1)
-    held = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, gaussians.encoded)
-    for values in held:
-        good &= values.isfinite().flatten(1).all(1)
+    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, opacities):
+        good &= values.isfinite().reshape(len(values), -1).all(1)
     bad = int((~good).sum())
     if bad == 0:
         return gaussians
     if not drop_nonfinite:
         raise InputError(
-            f"{path} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a rotation of "
-            "zeros; mend it, or drop what is not finite.",
+            f"{quoted(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a "
+            "rotation of zeros; mend it, or drop what is not finite.",
             "drop_nonfinite",
         )
     if bad == len(good):
-        raise InputError(f"{path} holds no Gaussian without NaN or infinity; write it anew.")
+        raise InputError(
+            f"{quoted(path)} holds no Gaussian without NaN or infinity; write it anew."
+        )
     return gaussians[good]
 
 

@@ -79,31 +79,3 @@ def harmonics(
     """Spherical harmonics that show `rgb`, with those of degree 1 and above behind."""
     constant = (rgb[:, None] - 0.5) / SH_C0
     return constant if rest is None else np.concatenate([constant, rest], axis=1)
-
-
-def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
-    """`gaussians` where every value can be drawn.
-
-    Raises:
-        InputError: where there are none, or some hold NaN, infinity or a rotation of zeros and
-            `drop_nonfinite` is off.
-    """
-    if len(gaussians) == 0:
-        raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
-    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    good = torch.stack([torch.isfinite(f).reshape(len(f), -1).all(1) for f in fields]).all(0)
-    good &= (gaussians.quats != 0).any(1)
-    bad = int((~good).sum())
-    if bad == 0:
-        return gaussians
-    if not drop_nonfinite:
-        raise InputError(
-            f"{quoted(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a "
-            "rotation of zeros; mend it, or drop what is not finite.",
-            "drop_nonfinite",
-        )
-    if bad == len(good):
-        raise InputError(
-            f"{quoted(path)} holds no Gaussian without NaN or infinity; write it anew."
-        )
-    return gaussians[good]

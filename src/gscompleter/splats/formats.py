@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from gscompleter.errors import InputError, quoted
-from gscompleter.io.ply import load_ply, save_ply
+from gscompleter.io.ply import load_ply, save_ply, whole
 from gscompleter.splats.compressed_ply import (
     is_compressed,
     near_together,
     read_compressed_ply,
     write_compressed_ply,
 )
-from gscompleter.splats.decoding import whole
 from gscompleter.splats.glb import is_glb, read_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.labels import load_labels, save_labels
@@ -79,6 +78,8 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         return load_ply(path, drop_nonfinite)
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
         gaussians = format_.read(path)
+    if len(gaussians) == 0:
+        raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
     labelled = replace(gaussians, generated=load_labels(path, len(gaussians)))
     return whole(labelled, path, drop_nonfinite)
 
