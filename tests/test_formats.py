@@ -161,7 +161,7 @@ def complete(monkeypatch, scene: Path, out: Path, *more: object) -> int:
 def test_a_chunk_and_a_camera_file_are_completed_like_a_folder(tmp_path, monkeypatch):
     """Every format gives the same photographs, so that the same command gives the same scene."""
     places = {
-        "transforms": save_scene(tmp_path / "room"),
+        "nerfstudio": save_scene(tmp_path / "room"),
         "chunks": save_chunk(tmp_path / "chunks" / "0.torch", example(form="PNG")),
         "real-estate-10k": save_camera_file(tmp_path / "files" / "room.txt", "room"),
     }
@@ -182,7 +182,7 @@ def test_a_forced_format_and_several_scenes_get_a_sentence(tmp_path, monkeypatch
     assert "There are no chunks in" in capsys.readouterr().err
     assert complete(monkeypatch, scene, out, "--format", "colmapp") == 2
     said = capsys.readouterr().err
-    assert "no format 'colmapp'; choose one of chunks, dgp, transforms, colmap, " in said
+    assert "no format 'colmapp'; choose one of chunks, dgp, nerfstudio, colmap, " in said
     assert complete(monkeypatch, save_dataset(tmp_path / "data"), out) == 2
     assert "holds several scenes, such as a and b" in capsys.readouterr().err
     assert not out.exists()

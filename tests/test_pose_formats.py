@@ -102,8 +102,8 @@ WRITERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "kitti": ("kitti", kitti),
     "kitti-aside": ("kitti", kitti_aside),
     "dgp": ("dgp", dgp),
-    "transforms": ("transforms", transforms),
-    "splits": ("transforms", splits),
+    "transforms": ("nerfstudio", transforms),
+    "splits": ("nerfstudio", splits),
 }
 """How a folder of each kind is written, and the name of its format."""
 

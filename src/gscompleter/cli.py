@@ -68,10 +68,10 @@ def main() -> None:
     except InputError as error:
         print(f"gscompleter: {sentence_of(error)}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         goes_on = words[:1] == ["evaluate"]
         state = "the same command goes on from here" if goes_on else "nothing was written"
-        print(f"gscompleter: interrupted; {state}.", file=sys.stderr)
+        print(f"gscompleter: interrupted; {str(stop) or state}.", file=sys.stderr)
         sys.exit(130)
 
 

@@ -13,9 +13,17 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.options import EvaluateOptions, IndexOptions, TablesOptions
-from gscompleter.data.cases import read_cases
+from gscompleter.commands.options import (
+    LONG_SIDE,
+    EvaluateOptions,
+    IndexOptions,
+    Size,
+    TablesOptions,
+    working_size,
+)
+from gscompleter.data.cases import Case, read_cases
 from gscompleter.data.datasets import Skipped, open_clips, usable
+from gscompleter.data.formats import open_photographs
 from gscompleter.data.framing import check_resolution
 from gscompleter.errors import InputError, quoted
 from gscompleter.progress import shown_on
@@ -37,9 +45,13 @@ def run_evaluation(options: EvaluateOptions) -> None:
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     methods = methods_named(options.methods)
     shard = parse_shard(options.shard)
-    check_resolution(options.resolution)
+    if options.resolution is not None:
+        check_resolution(working_size(options.resolution))
     skipped: list[Skipped] = []
-    tasks = chosen_tasks(options, skipped)
+    notes: list[str] = []
+    tasks = chosen_tasks(options, skipped, notes)
+    for note in dict.fromkeys(notes):
+        console.print(note, markup=False, soft_wrap=True)
     tell_skipped(skipped, console)
     config = RunConfig(
         reconstructor=options.reconstructor,
@@ -60,10 +72,11 @@ def run_evaluation(options: EvaluateOptions) -> None:
 
 def source_of(options: EvaluateOptions) -> dict[str, Any]:
     """Where the cases come from, as a folder of results remembers it."""
+    size = resolution_of(options) if options.protocol else options.resolution
     return {
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
-        "resolution": None if options.resolution is None else list(options.resolution),
+        "resolution": list(size) if isinstance(size, tuple) else size,
     }
 
 
@@ -121,27 +134,46 @@ def run_index(options: IndexOptions) -> None:
     )
 
 
-def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped]) -> list[Task]:
-    """The tasks that the options ask for; clips that are left out go to `skipped`."""
+def resolution_of(options: EvaluateOptions) -> Size:
+    """What scenes are worked at."""
+    return LONG_SIDE if options.resolution is None else options.resolution
+
+
+def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped], notes: list[str]) -> list[Task]:
+    """The tasks that the options ask for; clips that are left out go to `skipped`, and what was
+    said of those that were opened to `notes`."""
     if not options.protocol:
         files = [cases_file(path) for path in options.paths]
         cases = [case for file in files for case in read_cases(file)][: options.limit]
-        return [
-            task_of(replace(case, resolution=options.resolution or case.resolution))
-            for case in cases
-        ]
-    return list(islice(tasks_in_clips(options, skipped), options.limit))
+        notes += notes_of(cases)
+        if options.resolution is not None:
+            size = working_size(options.resolution)
+            cases = [replace(case, resolution=size) for case in cases]
+        return [task_of(case) for case in cases]
+    return list(islice(tasks_in_clips(options, skipped, notes), options.limit))
 
 
-def tasks_in_clips(options: EvaluateOptions, skipped: list[Skipped]) -> Iterator[Task]:
+def notes_of(cases: Sequence[Case]) -> Iterator[str]:
+    """What is to be said of the scenes of cases. One that cannot be opened fails in its rows."""
+    for scene in dict.fromkeys(case.scene for case in cases):
+        try:
+            yield from open_photographs(scene).notes
+        except InputError:
+            continue
+
+
+def tasks_in_clips(
+    options: EvaluateOptions, skipped: list[Skipped], notes: list[str]
+) -> Iterator[Task]:
     """The tasks that the protocols find in the data, clip by clip."""
     protocols = [parse_protocol(text) for text in options.protocol]
     for path in options.paths:
         for clip in usable(open_clips(path), skipped):
+            notes += clip.notes
             for protocol in protocols:
                 if isinstance(protocol, ViewByView) and (reason := protocol.reason_to_skip(clip)):
                     skipped.append(Skipped(clip.name, reason))
-                yield from tasks_of(protocol, clip, options.resolution)
+                yield from tasks_of(protocol, clip, working_size(resolution_of(options)))
 
 
 def cases_file(path: Path) -> Path:

@@ -18,6 +18,10 @@ from gscompleter.config.settings import Seed, Settings
 
 Frame = Annotated[int, Interval(ge=0, lt=10**9)]
 Device = Literal["auto", "cpu", "cuda"]
+Size = tuple[int, int] | int | Literal["full"]
+"""Height and width, the most pixels of the longer side, or the photographs' own size."""
+LONG_SIDE = 640
+"""Most pixels of the longer side of a photograph, where nobody says."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +64,9 @@ class CompleteOptions(ModelOptions):
     cameras.json beside its photographs, a poses_bounds.npy of LLFF, a sequence of KITTI, a scene
     of DGP, a chunk of pixelSplat, or a camera file of RealEstate10K beside its frames. The cameras
     of photographs that have none are found by COLMAP and kept in OUT/colmap."""
-    context: tuple[Frame, ...]
-    """Numbers of the frames to start from, in the order of the sorted file paths."""
+    context: tuple[Frame, ...] | None = None
+    """Numbers of the frames to start from, in the order of the sorted file paths. If not given,
+    those that matter to the targets are chosen; a target's own photograph is none of them."""
     target: tuple[str, ...]
     """Frames to complete the scene for, by number, or a file of cameras (transforms.json,
     cameras.json, COLMAP's images.txt, SuperSplat's poses). Several are
@@ -69,14 +74,15 @@ class CompleteOptions(ModelOptions):
     out: Path
     """Folder for completed.ply, generated.ply, context.ply, images/ and summary.json."""
     format: str | None = None
-    """What SCENE is: colmap, transforms, cameras-json, llff, kitti, dgp, chunks or
+    """What SCENE is: colmap, nerfstudio, cameras-json, llff, kitti, dgp, chunks or
     real-estate-10k. Found by what lies there if not given."""
     scene: Path | None = None
-    """A .ply of Gaussians to complete, in the frame of the photographs. It is kept as it is.
-    Without it the context is reconstructed from the photographs."""
-    resolution: tuple[int, int] | None = None
+    """A file of Gaussians to complete, which is kept as it is. Without it the context is
+    reconstructed from the photographs."""
+    resolution: Size = LONG_SIDE
     """Height and width to work at: photographs are scaled to cover it and cropped around the
-    centre. If not given, they keep their own size."""
+    centre. One number is the most pixels of the longer side, to which larger photographs are
+    shrunk; `full` keeps their own size."""
     near: float | None = None
     """Smallest depth in the scene, in its own unit. Estimated if not given."""
     far: float | None = None
@@ -85,7 +91,7 @@ class CompleteOptions(ModelOptions):
     """Settings of the stages. `--config NAME` says where they start: default, paper, an ablation
     such as no-sa, or a YAML file. Those given here are applied over it."""
     drop_nonfinite: bool = False
-    """Leave out Gaussians of the .ply that hold NaN or infinity."""
+    """Leave out Gaussians of the scene that hold NaN or infinity."""
     overwrite: bool = False
     """Replace what an earlier run left in the output folder."""
 
@@ -132,8 +138,9 @@ class EvaluateOptions(ModelOptions):
     predictions that were saved."""
     shard: str | None = None
     """i/n does every n-th case from the i-th on, i from 0 to n - 1: n processes share the work."""
-    resolution: tuple[int, int] | None = None
-    """Height and width to work at. If not given, that of the cases or of the photographs."""
+    resolution: Size | None = None
+    """What to work at, as `complete` has it. If not given, the resolution of the cases, or for
+    scenes that of `complete`."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to do, in all shards together."""
 
@@ -168,3 +175,8 @@ class ModelsOptions(Settings):
 
     json: bool = False
     """Print everything that is known of them as JSON."""
+
+
+def working_size(given: Size) -> tuple[int, int] | int | None:
+    """What `--resolution` asks for, as posed photographs take it."""
+    return None if given == "full" else given

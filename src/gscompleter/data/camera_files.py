@@ -8,19 +8,20 @@ from pathlib import Path
 from gscompleter.data.camera_list import read_camera_list
 from gscompleter.data.colmap.scene import is_image_file, read_image_file
 from gscompleter.data.frame import Frame
+from gscompleter.data.framing import Resolution
 from gscompleter.data.supersplat import is_supersplat, poses_of
 from gscompleter.data.transforms import NAME, read_frames
 from gscompleter.io.json_file import read_json
 
 
-def read_cameras(path: Path, resolution: tuple[int, int] | None = None) -> list[Frame]:
+def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
     """The cameras of a file in its order.
 
     Args:
         path: A JSON file of the form of nerfstudio's `transforms.json`, of Inria's `cameras.json`
             or of SuperSplat's poses, a folder with a `transforms.json`, or the images.txt or
             images.bin of a COLMAP model.
-        resolution: Height and width in pixels of images of which the file does not tell them.
+        resolution: Of images whose size the file does not tell: their height and width in pixels.
 
     Raises:
         InputError: where the file or one of its cameras is missing or impossible.

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.framing import Resolution
 from gscompleter.data.photographs import Photographs
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.json_file import read_json
@@ -33,8 +34,8 @@ class Case:
     target: int
     neighbours: tuple[int, ...]
     """Frames beside the target, for scoring only."""
-    resolution: tuple[int, int]
-    """Height and width."""
+    resolution: Resolution
+    """Height and width, or what else `PosedPhotographs.views` takes."""
     near: float | None = None
     far: float | None = None
 

@@ -6,10 +6,13 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from gscompleter.data.cases import holds_cases, open_cases
-from gscompleter.data.formats import format_of, recognised
+from gscompleter.data.formats import FORMATS, format_of, recognised
 from gscompleter.data.photographs import Photographs, PosedPhotographs
+
+P = TypeVar("P", bound=PosedPhotographs)
 
 
 @dataclass(frozen=True)
@@ -33,11 +36,11 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
         return open_cases(path)
     inside = [] if recognised(path) or not os.path.isdir(path) else sorted(path.iterdir())
     folders = [child for child in inside if child.is_dir() and recognised(child)]
-    scenes = [(format_of(place), place) for place in folders or [path]]
+    scenes = [(FORMATS[format_of(place)], place) for place in folders or [path]]
     return (clip for format, place in scenes for clip in format.open(place))
 
 
-def usable(clips: Iterable[PosedPhotographs], skipped: list[Skipped]) -> Iterator[PosedPhotographs]:
+def usable(clips: Iterable[P], skipped: list[Skipped]) -> Iterator[P]:
     """The scenes that benchmarks keep, one at a time; the others are appended to `skipped`."""
     for clip in clips:
         reason = clip.reason_to_skip()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import islice
 from pathlib import Path
 
@@ -34,6 +35,8 @@ class Format:
     """Whether a file or folder is of it, by names and first bytes."""
     open: Callable[[Path], Iterable[Photographs]]
     """The scenes in such a file or folder, one at a time. It reads nothing but cameras."""
+    unit: str | None = None
+    """What the coordinates are in, where the format says."""
 
 
 FORMATS = {
@@ -43,8 +46,8 @@ FORMATS = {
         holds_chunks,
         open_chunks,
     ),
-    "dgp": Format("a scene file of DGP or DDAD beside its calibration", holds_dgp, open_dgp),
-    "transforms": Format(
+    "dgp": Format("a scene file of DGP or DDAD beside its calibration", holds_dgp, open_dgp, "m"),
+    "nerfstudio": Format(
         "a folder with nerfstudio's transforms.json", holds_transforms, open_transforms
     ),
     "colmap": Format(
@@ -58,7 +61,7 @@ FORMATS = {
         open_camera_list,
     ),
     "llff": Format("a folder with LLFF's poses_bounds.npy", holds_llff, open_llff),
-    "kitti": Format("a sequence of KITTI odometry", holds_kitti, open_kitti),
+    "kitti": Format("a sequence of KITTI odometry", holds_kitti, open_kitti, "m"),
     "real-estate-10k": Format(
         "RealEstate10K camera files (.txt, with the frames of each in the folder of its name)",
         holds_camera_files,
@@ -83,7 +86,8 @@ def open_photographs(
     """
     check_planes(near, far)
     path = Path(path)
-    scenes = list(islice(format_of(path, format).open(path), 2))
+    found = format_of(path, format)
+    scenes = list(islice(FORMATS[found].open(path), 2))
     if len(scenes) > 1:
         raise InputError(
             f"{quoted(str(path))} holds several scenes, such as {quoted(scenes[0].name)} and "
@@ -92,11 +96,12 @@ def open_photographs(
     (scene,) = scenes
     near, far = scene.near if near is None else near, scene.far if far is None else far
     check_planes(near, far)
-    return replace(scene, near=near, far=far)
+    sparse = None if scene.sparse is None else cache(scene.sparse)
+    return replace(scene, near=near, far=far, format=found, sparse=sparse)
 
 
-def format_of(path: Path, name: str | None = None) -> Format:
-    """The format of that name, or else the one that a file or folder is of.
+def format_of(path: Path, name: str | None = None) -> str:
+    """The name of a format: the one that is given, or else that which a file or folder is of.
 
     Raises:
         InputError: where there is no such format, or the path is of none.
@@ -107,7 +112,7 @@ def format_of(path: Path, name: str | None = None) -> Format:
         )
     if not os.path.exists(path):
         raise InputError(f"There is no {quoted(str(path))}; name {accepted()}.")
-    found = recognised(path) if name is None else FORMATS[name]
+    found = recognised(path) if name is None else name
     if found is None:
         raise InputError(
             f"There are no posed photographs in {quoted(str(path))}; name {accepted()}."
@@ -115,9 +120,9 @@ def format_of(path: Path, name: str | None = None) -> Format:
     return found
 
 
-def recognised(path: Path) -> Format | None:
-    """The first format that a file or folder is of; None where it is of none."""
-    return next((format for format in FORMATS.values() if format.holds(path)), None)
+def recognised(path: Path) -> str | None:
+    """The name of the first format that a file or folder is of; None where it is of none."""
+    return next((name for name, format in FORMATS.items() if format.holds(path)), None)
 
 
 def accepted() -> str:

@@ -1,4 +1,4 @@
-"""How an image is brought to a resolution: resized to cover it, then cropped in its centre."""
+"""How an image is brought to a resolution: shrunk whole, or resized to cover it and cropped."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from PIL import Image
 from gscompleter.data.lens import Pinhole
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.errors import InputError, quoted
+
+Resolution = tuple[int, int] | int | None
+"""Height and width in pixels, which images are resized to cover and cropped to in their centre; or
+the most pixels of their longer side, to which larger ones are shrunk whole; or None for their own
+size."""
 
 
 @dataclass(frozen=True)
@@ -35,15 +40,26 @@ class Framing:
         return np.ascontiguousarray(resized[top : top + height, left : left + width])
 
 
-def covering(width: int, height: int, resolution: tuple[int, int] | None) -> Framing:
-    """How an image is resized to cover `resolution` (height, width) and cropped in its centre.
+def framing(width: int, height: int, resolution: Resolution) -> Framing:
+    """How an image of `width` by `height` pixels is brought to a resolution.
 
     Raises:
         InputError: where the resolution is impossible, or a strip would become too long.
     """
     check_resolution(resolution)
-    if resolution is None:
-        return Framing((width, height), (0, 0), (width, height))
+    if resolution is not None and not isinstance(resolution, int):
+        return covering(width, height, resolution)
+    scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
+    size = max(round(width * scale), 1), max(round(height * scale), 1)
+    return Framing(size, (0, 0), size)
+
+
+def covering(width: int, height: int, resolution: tuple[int, int]) -> Framing:
+    """How an image is resized to cover `resolution` (height, width) and cropped in its centre.
+
+    Raises:
+        InputError: where a strip would become too long.
+    """
     scale = max(resolution[0] / height, resolution[1] / width)
     new_width = max(round(width * scale), resolution[1])
     new_height = max(round(height * scale), resolution[0])
@@ -65,10 +81,13 @@ def resize(
     return np.array(Image.fromarray(image).resize(size, filtering))
 
 
-def check_resolution(resolution: tuple[int, int] | None) -> None:
-    """Raise an InputError where a height or width is not within 1 to `MAX_SIDE`."""
-    if resolution is not None and not all(1 <= side <= MAX_SIDE for side in resolution):
+def check_resolution(resolution: Resolution) -> None:
+    """Raise an InputError where a side is not within 1 to `MAX_SIDE`."""
+    if resolution is None:
+        return
+    sides = (resolution,) if isinstance(resolution, int) else resolution
+    if not all(1 <= side <= MAX_SIDE for side in sides):
         raise InputError(
-            f"The resolution {' × '.join(map(quoted, resolution))} is impossible; height and "
+            f"The resolution {' × '.join(map(quoted, sides))} is impossible; height and "
             f"width have to be positive, and at most {MAX_SIDE}."
         )

@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.frame import Frame
-from gscompleter.data.framing import covering, resize
+from gscompleter.data.framing import Resolution, framing, resize
 from gscompleter.data.intrinsics import opening_angle
 from gscompleter.data.lens import remap, undistortion_map
 from gscompleter.data.origin import local_origin
@@ -60,22 +60,21 @@ class PosedPhotographs(Protocol):
     def has_photograph(self, frame: int) -> bool:
         """Whether the photograph of a frame is there, or its camera only."""
 
-    def camera(self, frame: int, resolution: tuple[int, int] | None = None) -> Camera:
+    def camera(self, frame: int, resolution: Resolution = None) -> Camera:
         """The camera of a frame, as `views` has it."""
 
-    def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
+    def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
         """The photographs of `frames`, with depth where there is some. Only these are read.
 
         Lens distortion is removed: the undistorted image has the size of the photograph and no
         empty pixel, and the intrinsics follow (`lens.undistorted` says how).
 
         Images are resized to cover `resolution` (height and width in pixels), then their centre
-        is cropped. They keep their own size if it is left out.
+        is cropped. Of one number, it is the most pixels that their longer side keeps. They keep
+        their own size if it is left out.
         """
 
-    def mask(
-        self, frame: int, resolution: tuple[int, int] | None = None
-    ) -> Bool[Tensor, "h w"] | None:
+    def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
         """True where the photograph of a frame is to be ignored; None where nothing is."""
 
     def points(self) -> Float[Tensor, "n 3"] | None:
@@ -107,6 +106,8 @@ class Photographs:
     """Largest z-depth of the scene, in scene units, where known."""
     notes: tuple[str, ...] = ()
     """Sentences about what was chosen or left out when they were opened."""
+    format: str | None = None
+    """Name of the format they were opened as, where one was."""
     sparse: Callable[[], Float[np.ndarray, "n 3"]] | None = None
     """Reads points on the scene's surfaces, in the files' own frame, where there are some."""
 
@@ -120,18 +121,16 @@ class Photographs:
     def has_photograph(self, frame: int) -> bool:
         return self.frame(frame).stored() is not None
 
-    def camera(self, frame: int, resolution: tuple[int, int] | None = None) -> Camera:
+    def camera(self, frame: int, resolution: Resolution = None) -> Camera:
         """Its photograph need not exist where the file says how large it is."""
         found = self.frame(frame)
         return self._camera(found, found.size(), resolution)
 
-    def views(self, frames: Sequence[int], resolution: tuple[int, int] | None = None) -> list[View]:
+    def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
         chosen = [self.frame(number) for number in frames]
         return [self._view(frame, n, resolution) for n, frame in zip(frames, chosen, strict=True)]
 
-    def mask(
-        self, frame: int, resolution: tuple[int, int] | None = None
-    ) -> Bool[Tensor, "h w"] | None:
+    def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
         found = self.frame(frame)
         if found.mask is None:
             return None
@@ -159,17 +158,15 @@ class Photographs:
             )
         return self.frames[number]
 
-    def _camera(
-        self, frame: Frame, size: tuple[int, int], resolution: tuple[int, int] | None
-    ) -> Camera:
+    def _camera(self, frame: Frame, size: tuple[int, int], resolution: Resolution) -> Camera:
         _, pinhole = frame.pinholes(*size)
-        final = covering(*size, resolution).camera(pinhole)
+        final = framing(*size, resolution).camera(pinhole)
         c2w = frame.c2w.copy()
         c2w[:3, 3] -= self.origin  # in float64 still
         pose = torch.from_numpy(c2w).float()
         return Camera(pose, final.K, final.width, final.height, self.near, self.far)
 
-    def _view(self, frame: Frame, number: int, resolution: tuple[int, int] | None) -> View:
+    def _view(self, frame: Frame, number: int, resolution: Resolution) -> View:
         pixels = frame.pixels()
         size = pixels.shape[1], pixels.shape[0]
         camera = self._camera(frame, size, resolution)
@@ -189,9 +186,9 @@ def fitted(
     frame: Frame,
     pixels: Shaped[np.ndarray, "h w *c"],
     size: tuple[int, int],
-    resolution: tuple[int, int] | None,
+    resolution: Resolution,
 ) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """The photograph of a frame without lens distortion and at a resolution (height, width).
+    """The photograph of a frame without lens distortion and at a resolution.
 
     Maps [h, w] of depth or of what is ignored are brought to its `size` (width, height) first.
     Colours (uint8, [h, w, 3]) are blended; the values of maps never are.
@@ -207,7 +204,7 @@ def fitted(
         source = undistortion_map(pinhole, frame.intrinsics.distortion, new)
         pixels = remap(pixels, source, cv2.INTER_CUBIC if colours else cv2.INTER_NEAREST)
     filtering = Image.Resampling.LANCZOS if colours else Image.Resampling.NEAREST
-    return covering(*size, resolution).image(pixels, filtering)
+    return framing(*size, resolution).image(pixels, filtering)
 
 
 def _oddity(frame: Frame) -> str | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.framing import Resolution
 from gscompleter.data.limits import check_planes
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
@@ -21,7 +22,7 @@ from gscompleter.types import Camera, View
 def load_views(
     scene: Path | str,
     frames: Sequence[int] | None = None,
-    resolution: tuple[int, int] | None = None,
+    resolution: Resolution = None,
     near: float | None = None,
     far: float | None = None,
 ) -> list[View]:
@@ -36,7 +37,8 @@ def load_views(
             else `open_photographs` opens.
         frames: Numbers of the frames, which are numbered in the order of their sorted
             `file_path`; all frames if left out. Only these are read.
-        resolution: Height and width in pixels, as in `PosedPhotographs.views`.
+        resolution: Height and width in pixels, or the most pixels of the longer side, as in
+            `PosedPhotographs.views`.
         near: Smallest z-depth of the scene, in scene units, where known.
         far: Largest z-depth of the scene, in scene units, where known.
 
@@ -50,7 +52,7 @@ def load_views(
 def load_camera(
     scene: Path | str,
     frame: int | None = None,
-    resolution: tuple[int, int] | None = None,
+    resolution: Resolution = None,
     near: float | None = None,
     far: float | None = None,
 ) -> Camera:
@@ -78,7 +80,7 @@ def load_camera(
 
 def load_cameras(
     path: Path | str,
-    resolution: tuple[int, int] | None = None,
+    resolution: Resolution = None,
     near: float | None = None,
     far: float | None = None,
     origin: Sequence[float] = (0.0, 0.0, 0.0),
@@ -91,7 +93,8 @@ def load_cameras(
         path: A JSON file of the form of nerfstudio's `transforms.json`, of Inria's `cameras.json`
             or of SuperSplat's poses, a folder with a `transforms.json`, or the images.txt or
             images.bin of a COLMAP model.
-        resolution: As in `load_views`, and so `near` and `far`. SuperSplat's poses need it.
+        resolution: As in `load_views`, and so `near` and `far`. SuperSplat's poses need height
+            and width.
         origin: Where the coordinates of the scene are counted from, which is
             `open_photographs(scene).origin`, in scene units.
 

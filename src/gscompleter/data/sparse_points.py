@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.data.framing import Resolution
 from gscompleter.data.limits import DEPTH_RANGE
 from gscompleter.data.photographs import Photographs
 from gscompleter.types import Camera
@@ -23,14 +24,14 @@ NEAR_ROOM, FAR_ROOM = 0.5, 2.0
 
 
 def with_depth_range(
-    photographs: Photographs, frames: Sequence[int], resolution: tuple[int, int] | None = None
+    photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
 ) -> Photographs:
     """The photographs with the planes that their points tell, where they are not known.
 
     Args:
         photographs: With or without points.
         frames: Numbers of the frames whose cameras are to see the points.
-        resolution: Height and width in pixels, to which images are cropped.
+        resolution: To which images are cropped or shrunk.
 
     Raises:
         InputError: where a frame does not exist or is impossible, or the points are damaged.

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.frame import Frame, capital
+from gscompleter.data.framing import Resolution
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.json_numbers import array_of, optional_number
 from gscompleter.errors import InputError, quoted
@@ -36,7 +37,7 @@ def is_supersplat(content: Any) -> bool:
     return isinstance(first, dict) and "target" in first and "rotation" not in first
 
 
-def poses_of(content: Any, path: Path, resolution: tuple[int, int] | None) -> list[Frame]:
+def poses_of(content: Any, path: Path, resolution: Resolution) -> list[Frame]:
     """The cameras of SuperSplat's poses in the frame of the splat, in the order of the file.
 
     Args:
@@ -45,9 +46,9 @@ def poses_of(content: Any, path: Path, resolution: tuple[int, int] | None) -> li
         resolution: Height and width in pixels of the images.
 
     Raises:
-        InputError: where the poses are damaged, or no resolution is given.
+        InputError: where the poses are damaged, or no height and width are given.
     """
-    if resolution is None:
+    if resolution is None or isinstance(resolution, int):
         raise InputError(
             f"The poses of SuperSplat in {quoted(path)} do not say how large the images are; give "
             "a resolution (height and width).",

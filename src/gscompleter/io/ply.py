@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError, quoted
@@ -234,6 +234,20 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         InputError: no such file, not a PLY, truncated, empty, not 3DGS, or with damaged values.
     """
     path = Path(path)
+    return whole(_read(path), path, drop_nonfinite)
+
+
+def drawable_rows(path: Path) -> Bool[Tensor, "n"]:
+    """Which Gaussians of a 3DGS .ply `load_ply` keeps with `drop_nonfinite`.
+
+    Raises:
+        InputError: as `load_ply`, but for values.
+    """
+    return drawable(_read(path))
+
+
+def _read(path: Path) -> Gaussians:
+    """All Gaussians of a file, whether or not they can be drawn."""
     try:
         if os.path.exists(path) and not os.path.isfile(path):
             raise InputError(f"{quoted(path)} is a directory or a device; a 3DGS .ply is needed.")
@@ -244,7 +258,7 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
             vertices = read_vertices(file, file_format, ahead, vertex, path)
     except OSError as error:
         raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
-    return whole(_gaussians(vertices, vertex), path, drop_nonfinite)
+    return _gaussians(vertices, vertex)
 
 
 def _gaussian_element(elements: list[Element], path: Path) -> Element:
@@ -322,10 +336,7 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
         InputError: where some hold NaN, infinity or a rotation of zeros and `drop_nonfinite` is
             off, or all do.
     """
-    opacities = gaussians.opacities if gaussians.encoded is None else gaussians.encoded
-    good = (gaussians.quats != 0).any(1)
-    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, opacities):
-        good &= values.isfinite().reshape(len(values), -1).all(1)
+    good = drawable(gaussians)
     bad = int((~good).sum())
     if bad == 0:
         return gaussians
@@ -340,6 +351,15 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
             f"{quoted(path)} holds no Gaussian without NaN or infinity; write it anew."
         )
     return gaussians[good]
+
+
+def drawable(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    """Which Gaussians hold neither NaN nor infinity nor a rotation of zeros."""
+    opacities = gaussians.opacities if gaussians.encoded is None else gaussians.encoded
+    good = (gaussians.quats != 0).any(1)
+    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, opacities):
+        good &= values.isfinite().reshape(len(values), -1).all(1)
+    return good
 
 
 def _blocks(count: int) -> Iterator[slice]:
@@ -386,7 +406,7 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
     """
     if provenance is None:
         provenance = bool((gaussians.generated > 0).any())
-    vertices = _vertices(gaussians.to("cpu"), provenance)
+    vertices = rows_of(gaussians.to("cpu"), provenance)
     kinds = {"<f4": "float", "|u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     assert vertices.dtype.names is not None
@@ -397,8 +417,8 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
         file.write(vertices.view(np.uint8).data)
 
 
-def _vertices(gaussians: Gaussians, provenance: bool) -> np.ndarray:
-    """One row per Gaussian in the order of the standard layout."""
+def rows_of(gaussians: Gaussians, provenance: bool) -> np.ndarray:
+    """One row per Gaussian in the order of the standard layout, with `generated` or without."""
     num_rest = 3 * (gaussians.sh.shape[1] - 1)
     rest = tuple(f"f_rest_{i}" for i in range(num_rest))
     names = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)

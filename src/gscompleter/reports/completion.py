@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter import __version__
@@ -17,6 +17,7 @@ from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
 from gscompleter.metrics.image import psnr, ssim
 from gscompleter.render import Renderer
+from gscompleter.splats.layout import save_like
 from gscompleter.types import Camera, Completion, TargetCompletion
 
 
@@ -29,6 +30,15 @@ class Target:
     """Its number in the scene; None for a camera from elsewhere."""
     photograph: Float[Tensor, "h w 3"] | None = None
     """What the camera took, where it took anything. No stage sees it but `oracle`."""
+
+
+@dataclass(frozen=True)
+class Brought:
+    """The file that a context was read from."""
+
+    path: Path
+    kept: Bool[Tensor, "n"] | None = None
+    """Which of its Gaussians the context holds, in their order; None for all."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +115,7 @@ def write_report(
     targets: Sequence[Target],
     renderer: Renderer,
     said: Mapping[str, Any],
+    brought: Brought | None = None,
 ) -> dict[str, Any]:
     """Write the three scenes, `images/` and `summary.json`; returns the summary.
 
@@ -114,6 +125,7 @@ def write_report(
         targets: The cameras it was done for, in their order.
         renderer: Draws the scene before and after.
         said: Settings, seed and device, for the summary.
+        brought: Where the context comes from, if not from Ψ: `completed.ply` keeps its layout.
 
     Raises:
         InputError: where a file cannot be written.
@@ -125,7 +137,10 @@ def write_report(
     ]
     summary = summarize(completion, targets, context_images, target_images, said)
     save_ply(folder / "context.ply", completion.context)
-    save_ply(folder / "completed.ply", completion.scene, provenance=True)
+    if brought is None:
+        save_ply(folder / "completed.ply", completion.scene, provenance=True)
+    else:
+        save_like(folder / "completed.ply", completion.scene, brought.path, brought.kept)
     save_ply(folder / "generated.ply", completion.added, provenance=True)
     (folder / "images").mkdir()
     for number, (result, images) in enumerate(zip(completion.targets, target_images, strict=True)):

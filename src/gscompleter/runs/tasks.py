@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from gscompleter.data.cases import Case
+from gscompleter.data.framing import Resolution
 from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.errors import InputError
 from gscompleter.runs.protocols import EvaluationProtocol, Split
@@ -45,14 +46,14 @@ def task_of(case: Case) -> Task:
 
 
 def tasks_of(
-    protocol: EvaluationProtocol, clip: PosedPhotographs, resolution: tuple[int, int] | None = None
+    protocol: EvaluationProtocol, clip: PosedPhotographs, resolution: Resolution = None
 ) -> list[Task]:
     """The tasks of a clip: one for each target, or one for all where they depend on each other.
 
     Args:
         protocol: What chooses the frames.
         clip: Where they are.
-        resolution: Height and width; those of the photographs if left out.
+        resolution: As in `PosedPhotographs.views`.
 
     Raises:
         InputError: where a frame of the protocol is not in the clip.

@@ -7,18 +7,16 @@ stands behind them, rows are appended. Taking these out again leaves the file th
 from __future__ import annotations
 
 import re
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.io.files import replacing
-from gscompleter.io.ply import Element, load_ply, read_header, save_ply
+from gscompleter.io.ply import Element, read_header, rows_of, save_ply
 from gscompleter.types import Gaussians
 
 LABEL = "generated"
@@ -64,7 +62,8 @@ def read_layout(path: Path) -> Layout | None:
         file.seek(0)
         header = file.read(size)
         byte_order = "<" if file_format == "binary_little_endian" else ">"
-        rows = np.fromfile(file, vertex.dtype(byte_order), vertex.count)
+        rows = np.memmap(file, vertex.dtype(byte_order), "r", size, vertex.count)
+        file.seek(size + rows.nbytes)
         return Layout(header, byte_order, vertex, rows, file.read())
 
 
@@ -77,7 +76,7 @@ def write_layout(path: Path, layout: Layout) -> None:
     count = str(len(layout.rows)).encode()
     with replacing(path) as file:
         file.write(_COUNT.sub(rb"\g<1>" + count, layout.header, count=1))
-        file.write(layout.rows.tobytes())
+        file.write(layout.rows.view(np.uint8).data)
         file.write(layout.behind)
 
 
@@ -87,7 +86,9 @@ def unlabelled(layout: Layout) -> Layout:
         return layout
     kept = [p for p in layout.vertex.properties if p.name != LABEL]
     vertex = Element("vertex", 0, kept)
-    rows = _filled(layout.rows[layout.rows[LABEL] == 0], vertex.dtype(layout.byte_order))
+    given = layout.rows[layout.rows[LABEL] == 0]
+    rows = np.zeros(len(given), vertex.dtype(layout.byte_order))
+    _fill(rows, given)
     return replace(layout, header=_LABEL_LINE.sub(b"", layout.header), vertex=vertex, rows=rows)
 
 
@@ -106,58 +107,63 @@ def with_rows(layout: Layout, others: Layout, places: Int[Tensor, "m"]) -> Layou
     return replace(layout, rows=rows)
 
 
-def save_like(path: Path, scene: Gaussians, given: Path) -> None:
+def save_like(
+    path: Path, scene: Gaussians, given: Path, kept: Bool[Tensor, "n"] | None = None
+) -> None:
     """Write a completed scene as the file of its context, labelled and longer.
 
-    Where that file has no rows to keep (it is ASCII, has labels itself, fewer harmonics than the
-    scene, or is not what the scene begins with) the scene is written in our layout.
+    Where that file has no rows to keep (it is ASCII or no .ply, labels by other numbers than
+    bytes, has fewer harmonics than the scene, or is not what the scene begins with) the scene is
+    written in our layout.
 
     Args:
         path: The file.
         scene: The Gaussians of `given` in their order, and others behind them.
         given: The file that the context was read from.
+        kept: Which rows of `given` the scene begins with; all if left out.
 
     Raises:
         InputError: where `given` cannot be read or the file cannot be written.
     """
     scene = scene.to("cpu")
     layout = read_layout(given) if given.name.lower().endswith(".ply") else None
-    if layout is None or layout.is_labelled or not _begins_with(scene, given):
+    if layout is None or not _can_hold(layout, scene):
         save_ply(path, scene, provenance=True)
         return
-    rows = np.zeros(len(scene), [*layout.rows.dtype.descr, (LABEL, "u1")])
-    count = len(layout.rows)
-    rows[:count] = _filled(layout.rows, rows.dtype)
-    rows[count:] = _filled(_plain_rows(scene[count:]), rows.dtype)
+    context = layout.rows if kept is None else layout.rows[kept.numpy()]
+    if not _begins_with(scene, context):
+        save_ply(path, scene, provenance=True)
+        return
+    label = [] if layout.is_labelled else [(LABEL, "u1")]
+    rows = np.zeros(len(scene), [*layout.rows.dtype.descr, *label])
+    _fill(rows[: len(context)], context)
+    _fill(rows[len(context) :], rows_of(scene[len(context) :], provenance=False))
     rows[LABEL] = scene.generated.numpy()
-    write_layout(path, replace(layout, header=_labelled_header(layout), rows=rows))
+    header = layout.header if layout.is_labelled else _labelled_header(layout)
+    write_layout(path, replace(layout, header=header, rows=rows))
 
 
-def _begins_with(scene: Gaussians, given: Path) -> bool:
-    context = load_ply(given, drop_nonfinite=True)
-    count = len(context)
-    same = context.sh.shape[1] == scene.sh.shape[1] and count <= len(scene)
-    return same and torch.equal(context.means, scene.means[:count])
+def _can_hold(layout: Layout, scene: Gaussians) -> bool:
+    """Whether rows of that layout have room for the scene's harmonics and labels."""
+    labels = not layout.is_labelled or layout.rows.dtype[LABEL] == np.uint8
+    return labels and layout.num_rest == 3 * (scene.sh.shape[1] - 1)
 
 
-def _plain_rows(gaussians: Gaussians) -> ndarray:
-    """Gaussians as rows of our own layout."""
-    if len(gaussians) == 0:
-        return np.empty(0, [("x", "<f4")])
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder) / "rows.ply"
-        save_ply(place, gaussians, provenance=False)
-        layout = read_layout(place)
-    assert layout is not None
-    return layout.rows
+def _begins_with(scene: Gaussians, context: ndarray) -> bool:
+    """Whether the first Gaussians of a scene stand where the rows of its context say."""
+    if len(context) > len(scene):
+        return False
+    means = scene.means[: len(context)].numpy()
+    return all(
+        np.array_equal(context[axis].astype(np.float32), means[:, column])
+        for column, axis in enumerate("xyz")
+    )
 
 
-def _filled(rows: ndarray, dtype: np.dtype) -> ndarray:
-    """The columns that `rows` and `dtype` share, zeros in the others."""
-    out = np.zeros(len(rows), dtype)
-    for name in set(rows.dtype.names or ()) & set(dtype.names or ()):
-        out[name] = rows[name]
-    return out
+def _fill(rows: ndarray, values: ndarray) -> None:
+    """Set those columns of `rows` that `values` has, too."""
+    for name in set(rows.dtype.names or ()) & set(values.dtype.names or ()):
+        rows[name] = values[name]
 
 
 def _labelled_header(layout: Layout) -> bytes:

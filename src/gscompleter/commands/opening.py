@@ -1,0 +1,300 @@
+"""From what a user named to what is completed: a scene opened, its cameras and photographs read."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from rich.console import Console
+from torch import Tensor
+
+from gscompleter.commands.options import CompleteOptions, working_size
+from gscompleter.data.formats import open_photographs, recognised
+from gscompleter.data.framing import Resolution
+from gscompleter.data.origin import frame_from_photographs, told_from
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.scene import load_cameras
+from gscompleter.data.sparse_points import with_depth_range
+from gscompleter.data.structure_from_motion import find_poses, holds_photographs
+from gscompleter.errors import InputError, quoted
+from gscompleter.frames.placing import frame_of_splat
+from gscompleter.frames.similarity import moved_camera, moved_view
+from gscompleter.io.files import SUMMARY
+from gscompleter.io.ply import drawable_rows
+from gscompleter.matching.depth_range import estimate_depth_range
+from gscompleter.memory import check_memory
+from gscompleter.progress import shown_on
+from gscompleter.render import load_renderer
+from gscompleter.reports.completion import Brought, Target
+from gscompleter.splats.formats import format_of, load_splat
+from gscompleter.stages.selection import points_before, select_context
+from gscompleter.types import Camera, Gaussians, View
+
+MIN_SIZE = 16
+"""Shorter side of an image, in pixels, under which there is nothing to match and to score."""
+POSES = "colmap"
+"""The folder of the output with the cameras that were found."""
+MAX_DIGITS = 9
+"""Characters of the longest number of a frame."""
+CHOSEN, CHOSEN_WITH_SCENE = 3, 8
+"""Photographs that are chosen where none are named: to reconstruct the context, whose cost grows
+with the square of their number, and to keep an eye on a scene that was brought."""
+WITNESSES, WITNESS_SIDE = 6, 320
+"""Photographs that tell how far away things are where nobody says, and their longer side."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Posed photographs, and where they come from."""
+
+    photographs: Photographs
+    format: str
+    """Name of the format, or `photographs` where the cameras had to be found."""
+    number: int
+    """How many photographs there are, those included whose camera was not found."""
+
+
+@dataclass(frozen=True)
+class DepthSource:
+    """Who told the depth range of a scene: given, scene, points, splat or features."""
+
+    near: str
+    far: str
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is completed, and in which frame."""
+
+    views: Sequence[View]
+    targets: Sequence[Target]
+    frame: Float[np.ndarray, "4 4"]
+    """From the frame of the photographs to that of the result."""
+    depths: DepthSource
+    scene: Gaussians | None = None
+    """The splat that was brought; None where the context is reconstructed."""
+    brought: Brought | None = None
+    """The file it came from."""
+    method: str = "given"
+    """How the frame was found."""
+    said: str = "the frame of the photographs"
+    """The same, for the user."""
+
+
+def open_scene(options: CompleteOptions, console: Console) -> Opened:
+    """The posed photographs of `options.folder`. Where it has no cameras, they are found first, and
+    kept in the output folder, whatever becomes of the completion.
+
+    Raises:
+        InputError: as `open_photographs` and `find_poses`.
+    """
+    folder, poses, number = options.folder, options.out / POSES, None
+    if options.format is None and holds_photographs(folder) and recognised(folder) is None:
+        ours = options.overwrite or os.path.isfile(poses / SUMMARY)
+        with shown_on(None if options.quiet else console):
+            found = find_poses(folder, poses, overwrite=ours)
+        say(console, *found.notes)
+        folder, number = poses, found.photographs
+    given = open_photographs(folder, options.format, options.near, options.far)
+    say(console, *given.notes)
+    assert given.format is not None
+    if number is None:
+        return Opened(given, given.format, len(given))
+    return Opened(given, "photographs", number)
+
+
+def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
+    """The photographs and targets that the options name, once it is seen that there is room.
+
+    Raises:
+        InputError: where one does not exist, is impossible or cannot be read.
+    """
+    given, resolution = opened.photographs, working_size(options.resolution)
+    targets = read_targets(given, options)
+    frames = options.context or chosen_context(options, given, targets)
+    ranged = with_depth_range(given, frames, resolution)
+    depths = depth_source(options, given, ranged)
+    targets = [replace(t, camera=with_planes(t.camera, ranged)) for t in targets]
+    cameras = [ranged.camera(frame, resolution) for frame in frames]
+    check_sizes([*cameras, *(target.camera for target in targets)])
+    views = [view.to(device) for view in ranged.views(frames, resolution)]
+    targets = [with_photograph(target, ranged, resolution) for target in targets]
+    return Task(views, targets, frame_from_photographs(given.origin), depths)
+
+
+def in_frame_of_splat(task: Task, path: Path, options: CompleteOptions, opened: Opened) -> Task:
+    """`task` with the splat of a file, its cameras brought to where the photographs show it.
+
+    Raises:
+        InputError: where the file is damaged, or the photographs show something else.
+    """
+    given, device = opened.photographs, task.views[0].image.device
+    cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
+    scene = load_splat(path, drop_nonfinite=options.drop_nonfinite)
+    scene = told_from(given.origin, scene, cameras).to(device)
+    frames = [view.frame for view in task.views if view.frame is not None]
+    found = frame_of_splat(path, scene, given, frames, load_renderer(device.type))
+    return replace(
+        task,
+        views=[moved_view(view, found.transform) for view in task.views],
+        targets=[replace(t, camera=moved_camera(t.camera, found.transform)) for t in task.targets],
+        frame=found.transform @ task.frame,
+        scene=scene,
+        brought=Brought(path, rows_kept(path) if options.drop_nonfinite else None),
+        method=found.method,
+        said=found.sentence(),
+    )
+
+
+def rows_kept(path: Path) -> Bool[Tensor, "n"] | None:
+    """Which rows of a .ply are left once those that cannot be drawn are dropped; None of others."""
+    return drawable_rows(path) if format_of(path) == "ply" else None
+
+
+def check_context(options: CompleteOptions) -> None:
+    """Refuse too few context frames, and the same one twice."""
+    context, needed = options.context, needed_views(options)
+    if context is not None and len(context) < needed:
+        raise InputError(
+            f"--context names {len(context)} frame(s), and stereo needs at least {needed}; "
+            "name more, as in --context 0 4, or leave it out."
+        )
+    if context is not None and len(set(context)) < len(context):
+        raise InputError(
+            f"--context names a frame twice ({' '.join(map(str, context))}), which gives "
+            "identical cameras and no baseline; name different frames."
+        )
+    if not options.target:
+        raise InputError("--target names no frame; name at least one, as in --target 8.")
+
+
+def needed_views(options: CompleteOptions) -> int:
+    """The fewest photographs that a completion starts from."""
+    return 2 if options.scene is None else 1
+
+
+def chosen_context(
+    options: CompleteOptions, given: Photographs, targets: Sequence[Target]
+) -> tuple[int, ...]:
+    """Frames that matter to the targets; never a target itself, whose photograph is for scoring.
+
+    Raises:
+        InputError: where too few photographs are left, or nothing tells how far away things are.
+    """
+    asked = {target.frame for target in targets}
+    resolution = working_size(options.resolution)
+    cameras = usable_cameras(given, [f for f in range(len(given)) if f not in asked], resolution)
+    if len(cameras) < needed_views(options):
+        raise InputError(
+            f"Besides the targets there are {len(cameras)} photographs that can be used, and at "
+            f"least {needed_views(options)} are needed; name fewer targets, or add photographs."
+        )
+    points = given.points()
+    if points is None or len(points) == 0:
+        points = points_told(given, [target.camera for target in targets], cameras)
+    count = CHOSEN if options.scene is None else CHOSEN_WITH_SCENE
+    frames = list(cameras)
+    chosen = select_context([t.camera for t in targets], list(cameras.values()), points, count)
+    return tuple(frames[index] for index in chosen)
+
+
+def usable_cameras(
+    given: Photographs, frames: Sequence[int], resolution: Resolution
+) -> dict[int, Camera]:
+    """The cameras of those frames that have a photograph and are possible."""
+    cameras = {}
+    for frame in frames:
+        try:
+            if given.has_photograph(frame):
+                cameras[frame] = given.camera(frame, resolution)
+        except InputError:
+            continue
+    return cameras
+
+
+def points_told(
+    given: Photographs, targets: Sequence[Camera], cameras: dict[int, Camera]
+) -> Float[Tensor, "n 3"]:
+    """About where the targets see the scene, by the depth range, as known or told by features."""
+    near, far = given.near, given.far
+    if near is None or far is None:
+        centers = torch.stack([target.center for target in targets])
+        distance = {f: (centers - c.center).norm(dim=-1).min().item() for f, c in cameras.items()}
+        closest = sorted(sorted(cameras, key=distance.__getitem__)[:WITNESSES])
+        low, high = estimate_depth_range(given.views(closest, WITNESS_SIDE))
+        near, far = low if near is None else near, high if far is None else far
+    return torch.cat([points_before(target, near, far) for target in targets])
+
+
+def depth_source(options: CompleteOptions, given: Photographs, ranged: Photographs) -> DepthSource:
+    """Who told each end of the depth range: who comes first."""
+
+    def teller(name: str) -> str:
+        if getattr(options, name) is not None:
+            return "given"
+        if getattr(given, name) is not None:
+            return "scene"
+        if getattr(ranged, name) is not None:
+            return "points"
+        return "features" if options.scene is None else "splat"
+
+    return DepthSource(teller("near"), teller("far"))
+
+
+def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
+    """The target cameras in the order of the command line."""
+    resolution = working_size(options.resolution)
+    targets = []
+    for word in options.target:
+        frame = frame_number(word)
+        if frame is None:
+            cameras = load_cameras(word, resolution, origin=given.origin.tolist())
+            targets += [Target(camera) for camera in cameras]
+        else:
+            targets.append(Target(given.camera(frame, resolution), frame))
+    return targets
+
+
+def with_planes(camera: Camera, photographs: Photographs) -> Camera:
+    """`camera` with the depth range of the photographs."""
+    return replace(camera, near=photographs.near, far=photographs.far)
+
+
+def with_photograph(target: Target, given: Photographs, resolution: Resolution) -> Target:
+    """`target` and what its camera took, if it is a frame that has a photograph."""
+    if target.frame is None or not given.has_photograph(target.frame):
+        return target
+    (view,) = given.views([target.frame], resolution)
+    return replace(target, photograph=view.image)
+
+
+def check_sizes(cameras: Sequence[Camera]) -> None:
+    """Refuse images with nothing in them to match and to score, and those beyond all memory."""
+    for camera in cameras:
+        if min(camera.width, camera.height) < MIN_SIZE:
+            raise InputError(
+                f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
+                f"least {MIN_SIZE}; choose a larger --resolution, or another camera."
+            )
+    check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
+
+
+def frame_number(word: str) -> int | None:
+    """The number that `word` writes, or None where it names a file."""
+    if re.fullmatch("-?[0-9]+", word) is None:
+        return None
+    if len(word) > MAX_DIGITS:
+        raise InputError(f"There is no frame {quoted(word)}; name one by its number.", "target")
+    return int(word)
+
+
+def say(console: Console, *lines: str) -> None:
+    """Print lines as they are."""
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

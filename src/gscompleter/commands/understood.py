@@ -1,0 +1,109 @@
+"""What was understood, in three lines before the work: opened, found out, to be done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gscompleter.commands.opening import Opened, Task
+from gscompleter.commands.options import CompleteOptions
+from gscompleter.data.formats import FORMATS
+from gscompleter.data.frame import Frame
+from gscompleter.errors import quoted
+from gscompleter.types import Camera, Gaussians
+
+TOLD = {
+    "given": "as given",
+    "scene": "as the scene says",
+    "points": "by the sparse points",
+    "splat": "by the splat",
+    "features": "by matched features",
+}
+"""Who told the depth range, in words."""
+MAX_NAMED = 8
+"""Frames that a line names."""
+
+
+def understood(options: CompleteOptions, opened: Opened, task: Task, device: str) -> list[str]:
+    """The three lines. The cameras of `task` know the depth range that is worked in."""
+    splat = ""
+    if task.scene is not None and options.scene is not None:
+        splat = f"; {splat_line(options.scene, task.scene)}"
+    return [
+        f"Opened {quoted(options.folder)}: {photographs_line(opened)}{splat}.",
+        f"Found {found_line(opened, task)}.",
+        f"To do: {plan_line(options, task, device)}.",
+    ]
+
+
+def photographs_line(opened: Opened) -> str:
+    """The format, the photographs, their cameras and lenses, and the points of a scene."""
+    given = opened.photographs
+    count = f"{opened.number} photographs"
+    if opened.number != len(given):
+        count = f"{len(given)} of {count}"
+    points = given.points()
+    told = "no points" if points is None else f"{len(points):,} points"
+    name = "photographs without cameras" if opened.format == "photographs" else opened.format
+    return f"{name}, {count}, {cameras_line(given.frames)}, {told}"
+
+
+def cameras_line(frames: Sequence[Frame]) -> str:
+    """How many cameras took the photographs, and through which lenses."""
+    cameras = dict.fromkeys(frame.intrinsics for frame in frames)
+    lenses = dict.fromkeys(c.distortion.projection for c in cameras if c.distortion)
+    lens = f"{' and '.join(lenses)} lens taken out" if lenses else "no lens distortion"
+    return f"{len(cameras)} {'camera' if len(cameras) == 1 else 'cameras'} with {lens}"
+
+
+def splat_line(path: Path, scene: Gaussians) -> str:
+    """The splat that was brought."""
+    return f"{quoted(path)}, {len(scene):,} Gaussians of SH degree {scene.sh_degree}"
+
+
+def found_line(opened: Opened, task: Task) -> str:
+    """The frame, the unit where it is known, the depth range and the working size."""
+    format = FORMATS.get(opened.format)
+    unit = f" {format.unit}" if format is not None and format.unit is not None else ""
+    camera, depths = task.views[0].camera, task.depths
+    tellers = dict.fromkeys((TOLD[depths.near], TOLD[depths.far]))
+    depth = f"depths from {camera.near:.3g} to {camera.far:.3g}{unit} ({' and '.join(tellers)})"
+    return f"{task.said.rstrip('.')}; {depth}; {size_line(opened, task)}"
+
+
+def size_line(opened: Opened, task: Task) -> str:
+    """The working size, and that of the photographs where it is another."""
+    view = task.views[0]
+    assert view.frame is not None
+    own = opened.photographs.camera(view.frame)
+    worked = f"worked at {sizes_line([v.camera for v in task.views])}"
+    if (own.width, own.height) == (view.camera.width, view.camera.height):
+        return worked
+    return f"{worked} (the photographs have {sizes_line([own])}; --resolution full keeps that)"
+
+
+def sizes_line(cameras: Sequence[Camera]) -> str:
+    """The sizes of images, each once."""
+    sizes = dict.fromkeys(f"{camera.width} x {camera.height}" for camera in cameras)
+    return ", ".join(sizes)
+
+
+def plan_line(options: CompleteOptions, task: Task, device: str) -> str:
+    """Context, targets, the models, and where the result is written."""
+    chosen = " (chosen)" if options.context is None else ""
+    frames = [target.frame for target in task.targets if target.frame is not None]
+    others = len(task.targets) - len(frames)
+    targets = [frames_line(frames)] if frames else []
+    targets += [f"{others} cameras" if others > 1 else "a camera"] if others else []
+    return (
+        f"context from {frames_line([view.frame for view in task.views])}{chosen}, completed for "
+        f"{' and '.join(targets)} by {options.reconstructor} and {options.synthesis.name} on "
+        f"{device}, written to {quoted(options.out)}"
+    )
+
+
+def frames_line(frames: Sequence[int | None]) -> str:
+    """Numbers of frames, the first of many."""
+    named = ", ".join(map(str, frames[:MAX_NAMED]))
+    more = f" and {len(frames) - MAX_NAMED} more" if len(frames) > MAX_NAMED else ""
+    return f"{'frame' if len(frames) == 1 else 'frames'} {named}{more}"
