@@ -61,13 +61,14 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     clock = Clock()
     with clock("context"):
         task = replace(task, views=ranged(task, completer))
+    before = clock.seconds
     say(console, *understood(options, opened, task, device))
     overwrite = options.overwrite or holds_poses_only(options.out)
     with output_folder(options.out, overwrite) as folder:
         with shown_on(None if options.quiet else console):
             cameras = [target.camera.to(device) for target in task.targets]
             completion = completer(task.views, cameras, task.scene)
-        completion = replace(completion, seconds=total(completion.seconds, clock.seconds))
+        completion = replace(completion, seconds=total(completion.seconds, before))
         said = said_in_advance(options, opened, task, device)
         summary = write_report(
             folder, completion, task.targets, completer.renderer, said, task.brought

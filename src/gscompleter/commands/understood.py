@@ -31,7 +31,7 @@ def understood(options: CompleteOptions, opened: Opened, task: Task, device: str
         splat = f"; {splat_line(options.scene, task.scene)}"
     return [
         f"Opened {quoted(options.folder)}: {photographs_line(opened)}{splat}.",
-        f"Found {found_line(opened, task)}.",
+        f"Found {found_line(options, opened, task)}.",
         f"To do: {plan_line(options, task, device)}.",
     ]
 
@@ -61,25 +61,24 @@ def splat_line(path: Path, scene: Gaussians) -> str:
     return f"{quoted(path)}, {len(scene):,} Gaussians of SH degree {scene.sh_degree}"
 
 
-def found_line(opened: Opened, task: Task) -> str:
+def found_line(options: CompleteOptions, opened: Opened, task: Task) -> str:
     """The frame, the unit where it is known, the depth range and the working size."""
     format = FORMATS.get(opened.format)
     unit = f" {format.unit}" if format is not None and format.unit is not None else ""
     camera, depths = task.views[0].camera, task.depths
     tellers = dict.fromkeys((TOLD[depths.near], TOLD[depths.far]))
     depth = f"depths from {camera.near:.3g} to {camera.far:.3g}{unit} ({' and '.join(tellers)})"
-    return f"{task.said.rstrip('.')}; {depth}; {size_line(opened, task)}"
+    return f"{task.said.rstrip('.')}; {depth}; {size_line(options, opened, task)}"
 
 
-def size_line(opened: Opened, task: Task) -> str:
-    """The working size, and that of the photographs where it is another."""
-    view = task.views[0]
-    assert view.frame is not None
-    own = opened.photographs.camera(view.frame)
-    worked = f"worked at {sizes_line([v.camera for v in task.views])}"
-    if (own.width, own.height) == (view.camera.width, view.camera.height):
-        return worked
-    return f"{worked} (the photographs have {sizes_line([own])}; --resolution full keeps that)"
+def size_line(options: CompleteOptions, opened: Opened, task: Task) -> str:
+    """The working size, and that of the photographs where they were shrunk."""
+    frames = [view.frame for view in task.views if view.frame is not None]
+    own = sizes_line([opened.photographs.camera(frame) for frame in frames])
+    size = sizes_line([view.camera for view in task.views])
+    if own == size or not isinstance(options.resolution, int):
+        return f"worked at {size}"
+    return f"worked at {size} (the photographs have {own}; --resolution full keeps that)"
 
 
 def sizes_line(cameras: Sequence[Camera]) -> str:

@@ -5,7 +5,8 @@ takes a time that grows with the square of their number. A photograph matters by
 what the targets see, from a direction like theirs; and depth comes of pairs, whose rays have to
 meet at an angle: of two that stand in one place no depth can be told, and two that look from far
 apart show different surfaces. So a set is worth, at each point that a target sees, what its best
-pair is worth there. The best pair comes first, then always the one that adds most.
+pair is worth there. The best pair comes first, then always the one that adds most; where two
+are needed to show what no pair shows yet, as for another target, each is worth half of that.
 """
 
 from __future__ import annotations
@@ -32,10 +33,12 @@ PLANES = (0.1, 0.3, 0.5, 0.7, 0.9)
 ASIDE = 5.0
 """Degrees between the directions of a photograph and of a target at a point, at which the worth
 of the photograph has fallen to a half."""
-ANGLE = 1.0
+ANGLE = 0.5
 """Degrees at which the rays of the best pair meet: some pixels of parallax."""
-NARROWER, WIDER = 0.5, 10.0
+NARROWER, WIDER = 0.3, 20.0
 """Degrees less and more than that, at which the worth of a pair has fallen to a third."""
+LEFT_OUT = 0.1
+"""A point at which the best pair is worth less is shown by none."""
 UNSEEN = 1e-3
 """What a photograph is worth at a point beyond its border: where nothing else is left, the one that
 stands closest is the best."""
@@ -65,14 +68,17 @@ def select_context(
 
 
 def greedy(worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"], count: int) -> list[int]:
-    """The best pair, then always the candidate that adds most to the best pairs at the points."""
+    """The best pair, then always the candidate that adds most to the best pairs at the points, now
+    or with another one."""
     if min(count, len(worth)) < 2:
         return list(range(min(count, len(worth))))
     pairs = torch.stack([pair_worths(i, worth, rays) for i in range(len(worth))])
     first, second = divmod(int(pairs.sum(-1).argmax()), len(worth))
     chosen, best = [first, second], pairs[first, second]
     while len(chosen) < min(count, len(worth)):
-        gains = (pairs[chosen].amax(0) - best).clamp_min(0).sum(-1) + UNSEEN * worth.sum(-1)
+        now = (pairs[chosen].amax(0) - best).clamp_min(0).sum(-1)
+        later = (pairs.amax(0) * (best < LEFT_OUT)).sum(-1) / 2
+        gains = torch.maximum(now, later) + UNSEEN * worth.sum(-1)
         gains[chosen] = -1.0
         added = int(gains.argmax())
         best = torch.maximum(best, pairs[chosen, added].amax(0))
