@@ -30,8 +30,8 @@ def understood(options: CompleteOptions, opened: Opened, task: Task, device: str
     if task.scene is not None and options.scene is not None:
         splat = f"; {splat_line(options.scene, task.scene)}"
     return [
-        f"Opened {quoted(options.folder)}: {photographs_line(opened)}{splat}.",
-        f"Found {found_line(options, opened, task)}.",
+        f"Opened: {quoted(options.folder)}, {photographs_line(opened)}{splat}.",
+        f"Found: {found_line(options, opened, task)}.",
         f"To do: {plan_line(options, task, device)}.",
     ]
 
