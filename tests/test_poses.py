@@ -121,8 +121,9 @@ def test_photographs_without_a_camera_are_named(tmp_path, monkeypatch, capsys):
 
 
 def test_parts_that_do_not_connect_are_told():
-    (note,) = FoundPoses(9, (), (5, 4), 100, 0.5).notes
-    assert "2 parts that do not connect, of 5 and 4 cameras" in note
+    parts, missing = FoundPoses(9, ("a.png",), (5, 4), 100, 0.5).notes
+    assert "2 parts that do not connect, of 5 and 4 cameras; the largest is kept." in parts
+    assert missing == "No camera was found in it for a.png; they are left out."
 
 
 def test_photographs_of_nothing_have_no_cameras(tmp_path, monkeypatch, capsys):
@@ -155,6 +156,11 @@ def test_a_folder_of_other_files_has_no_photographs(tmp_path):
     (tmp_path / "notes.txt").write_text("no photograph")
     with pytest.raises(InputError, match="There are 0 photographs"):
         photographs_in(tmp_path)
+
+
+def test_neighbours_are_those_of_the_numbers_however_they_are_written(tmp_path):
+    folder = blank(tmp_path / "p", 12)
+    assert photographs_in(folder) == [f"{number}.png" for number in range(12)]
 
 
 def test_a_file_that_is_no_image_is_named(tmp_path):

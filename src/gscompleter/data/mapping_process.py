@@ -43,6 +43,8 @@ LENS = "SIMPLE_RADIAL"
 """COLMAP's camera model: one focal length, one coefficient of distortion."""
 GUESSED_FOCAL = 1.2
 """Focal length as a multiple of the longer side, where EXIF does not tell it."""
+MIN_MODEL = 3
+"""Photographs of a part that does not connect to the others for it to be told of."""
 MIN_FOR_CENTRE = 10
 """Photographs by one camera that its principal point can be told from."""
 MAX_OFF_CENTRE = 0.1
@@ -233,7 +235,9 @@ def _models(job: Job, teller: Teller) -> list[Any]:
             job.database,
             job.images,
             job.work,
-            pycolmap.IncrementalPipelineOptions(num_threads=job.threads, random_seed=SEED),
+            pycolmap.IncrementalPipelineOptions(
+                num_threads=job.threads, random_seed=SEED, min_model_size=MIN_MODEL
+            ),
             initial_image_pair_callback=first_pair,
             next_image_callback=teller.step,
         )
