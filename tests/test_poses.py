@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import string
 from pathlib import Path
 
 import numpy as np
@@ -281,3 +282,23 @@ def test_forty_real_photographs_are_all_placed(shared, tmp_path):
     found = find_poses(shared / "data" / "fox" / "images", tmp_path / "fox")
     assert found.registered == 40
     assert found.error < 0.5
+
+
+@pytest.mark.slow
+def test_of_two_scenes_in_a_folder_the_larger_is_kept_and_the_other_told(shared, tmp_path):
+    pytest.importorskip("pycolmap")
+    sources = [*list_photographs(shared, "fox", 12), *list_photographs(shared, "hololens_room", 8)]
+    names = [f"{letter}.jpg" for letter in string.ascii_lowercase[: len(sources)]]
+    (tmp_path / "both").mkdir()
+    for name, source in zip(names, sources, strict=True):
+        with Image.open(source) as image:
+            image.thumbnail((320, 320))
+            image.save(tmp_path / "both" / name, quality=92)
+    found = find_poses(tmp_path / "both", tmp_path / "out")
+    assert found.missing == tuple(names[12:])
+    assert found.models[0] == 12
+    assert len(found.models) > 1
+
+
+def list_photographs(shared: Path, scene: str, count: int) -> list[Path]:
+    return sorted((shared / "data" / scene / "images").iterdir())[:count]

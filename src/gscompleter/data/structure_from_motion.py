@@ -66,9 +66,10 @@ class FoundPoses:
         """What the user should know, in sentences."""
         notes, place = [], ""
         if len(self.models) > 1:
+            *others, last = map(str, self.models)
             notes.append(
                 f"The photographs fall into {len(self.models)} parts that do not connect, of "
-                f"{' and '.join(map(str, self.models))} cameras; the largest is kept."
+                f"{', '.join(others)} and {last} cameras; the largest is kept."
             )
             place = " in it"
         if self.missing:
