@@ -127,6 +127,13 @@ def test_parts_that_do_not_connect_are_told():
     assert missing == "No camera was found in it for a.png; they are left out."
 
 
+def test_a_model_among_placed_photographs_is_no_part():
+    parts = pytest.importorskip("gscompleter.data.mapping_process").parts
+    large, other, inside = set(range(12)), {20, 21, 22}, {3, 4, 5, 20}
+    assert parts([large, inside, other, {7, 23}]) == [12, 3]
+    assert parts([{1, 2}]) == [2]
+
+
 def test_photographs_of_nothing_have_no_cameras(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pycolmap")
     out = tmp_path / "out"

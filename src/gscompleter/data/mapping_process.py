@@ -194,10 +194,24 @@ def map_all(job: Job, teller: Teller) -> dict[str, Any]:
     largest_one.write(job.model)
     return {
         "registered": sorted(largest_one.images[i].name for i in largest_one.reg_image_ids()),
-        "models": [model.num_reg_images() for model in models],
+        "models": parts([set(model.reg_image_ids()) for model in models]),
         "points": largest_one.num_points3D(),
         "error": largest_one.compute_mean_reprojection_error(),
     }
+
+
+def parts(models: list[set[int]]) -> list[int]:
+    """How many photographs each of the models has, given by the numbers of their photographs, the
+    largest first.
+
+    The mapper may begin another model among photographs that it has placed; that is no part.
+    """
+    sizes, placed = [], set[int]()
+    for model in models:
+        if not sizes or len(model - placed) >= MIN_MODEL:
+            sizes.append(len(model))
+            placed |= model
+    return sizes
 
 
 def with_principal_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
