@@ -206,7 +206,7 @@ def parts(models: list[set[int]]) -> list[int]:
 
     The mapper may begin another model among photographs that it has placed; that is no part.
     """
-    sizes, placed = [], set[int]()
+    sizes, placed = list[int](), set[int]()
     for model in models:
         if not sizes or len(model - placed) >= MIN_MODEL:
             sizes.append(len(model))
