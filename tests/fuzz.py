@@ -4,7 +4,8 @@
 
 Each mutation runs in a fork of one interpreter that has imported everything, under a time limit
 and an address-space limit. A traceback, a signal, an exit code other than 0 and 2, an error of more
-than a few lines, or a run that outlives its limit is a finding; `--only KIND:NUMBER` repeats one.
+than a sentence, a refused run that leaves files behind, one that outlives its limit, or one that
+takes more than 2 GB is a finding; `--only KIND:NUMBER` repeats one.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ from typing import Any
 
 os.environ |= {"OMP_WAIT_POLICY": "PASSIVE", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 ADDRESS_SPACE = 8 << 30
+MAX_MEMORY = 2 << 20
+"""Of a run, in kilobytes."""
 LONGEST_ERROR = 2500
+"""In characters."""
 SIZE = 32
 
 NUMBERS: list[Any] = [
@@ -52,16 +56,26 @@ YAML = [
     "&a [*a]",
     "{a: {b: 1}}",
 ]
+PARTS = [
+    *(b"\xff" * 8, b"\0" * 8, b"\x7f" * 8, b"\xff\xff\xff\x7f", b"\0\0\0\0\0\0\xf0\x7f"),
+    *(b"\0\0\xc0\x7f", b"\0\0\x80\x7f", b"\xff\xff\x7f\x7f", b"\x7f\xff\xff\xff", b"\xff" * 4),
+    *(b"nan", b"1e999", b"-1", b"99999999999999999999", b"null", b"[", b"{}", b'"', b"\n", b"\r"),
+    *(b"# ", b"../../x", b"\xc3\x28", b" " * 64, b"1 " * 64, b"PANORAMA", b"0.png"),
+]
+FILES = [b"", b"\0" * 100, b"PK\x03\x04", b"\x93NUMPY", b"ply\n", b"{", b"<html>", b"glTF", b"NGSP"]
+COUNTS = [b"0", b"-1", b"1" + b"0" * 12, b"9" * 4000, b"nan"]
 YAML += ["!!python/object:os.system x", "~", "'²'", "0", "1", "-1", "1000000000000", "yes", "''"]
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What a mutation brought to light."""
+class Outcome:
+    """How a run on mutated files ended."""
 
     name: str
     command: list[str]
-    what: str
+    refused: bool
+    finding: str | None
+    """What is wrong about that, in a line; None where nothing is."""
 
 
 Mutation = Callable[[Path, random.Random], list[str]]
@@ -79,7 +93,9 @@ def build(folder: Path) -> None:
     from chunk_files import example, save_chunk
     from gscompleter import save_ply
     from gscompleter.data.scene import write_cameras
+    from pose_files import WRITERS, write_camera_list
     from scenes import Room, camera_at, gaussians_of, photographed, view_of
+    from splat_files import FORMATS_BUT_PLY, made, plausible
 
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
     views = [view_of(Room(), camera) for camera in cameras]
@@ -113,6 +129,26 @@ def build(folder: Path) -> None:
         "holes:\n  dilation: 1\n"
     )
     torch.save({"state_dict": {"encoder.a": torch.ones(3)}}, folder / "weights.ckpt")
+    for kind, (_, write) in WRITERS.items():
+        write(folder / kind)
+    write_camera_list(folder / "target-list.json")
+    (folder / "splats").mkdir()
+    for name in (*FORMATS_BUT_PLY, "plain.spz", "folder"):
+        made(folder / "splats", name, plausible(40, 1))
+    in_every_format(WRITERS["colmap-text"][1](folder / "photographs") / "images")
+
+
+KINDS_OF_IMAGE = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+
+
+def in_every_format(images: Path) -> None:
+    """The photographs of a folder, which are .png, under the same names in other formats."""
+    from PIL import Image
+
+    for path, kind in zip(sorted(images.iterdir()), KINDS_OF_IMAGE, strict=True):
+        with Image.open(path) as image:
+            pixels = image.convert("RGB")
+        pixels.save(path, format=kind)
 
 
 def as_ascii(data: bytes) -> bytes:
@@ -163,41 +199,66 @@ def replaced(content: Any, chance: random.Random) -> Any:
 
 
 def in_bytes(path: str, command: Sequence[str]) -> Mutation:
-    """Bytes of a file are cut, changed, doubled or replaced."""
+    """Bytes of a file are cut, changed, doubled or replaced; of those that a pattern names, one."""
 
     def mutate(folder: Path, chance: random.Random) -> list[str]:
-        damage(folder / path, chance)
+        damage(chance.choice(sorted(folder.glob(path))), chance)
         return list(command)
 
     return mutate
 
 
 def damage(file: Path, chance: random.Random) -> None:
-    """Cut, change, double or replace some bytes of a file, or all of it."""
+    """Change some parts of a file, most often near its beginning, or put another one there."""
     data = bytearray(file.read_bytes())
-    kind = chance.randrange(7)
-    at = chance.randrange(len(data))
-    if kind == 0:
-        del data[at:]
-    elif kind == 1:
-        for _ in range(chance.choice([1, 4, 64])):
-            data[chance.randrange(len(data))] = chance.randrange(256)
-    elif kind == 2:
-        data[at:at] = data[at // 2 : at]
-    elif kind == 3:
-        early = chance.randrange(min(len(data), 200))
-        data[early : early + 4] = chance.choice([b"\xff" * 4, b"\0" * 4, b"\x7f\xff\xff\xff"])
-    elif kind == 4:
-        digits = [match.span() for match in re.finditer(rb"\d+", bytes(data[:2000]))]
-        start, stop = chance.choice(digits or [(0, 0)])
-        data[start:stop] = chance.choice([b"0", b"-1", b"1" + b"0" * 12, b"9" * 4000, b"nan"])
-    elif kind == 5:
-        data[:] = chance.choice(
-            [b"", b"\0" * 100, b"PK\x03\x04", b"\x93NUMPY", b"ply\n", b"{", b"<html>"]
-        )
+    if chance.random() < 0.05:
+        data[:] = chance.choice(FILES)
     else:
-        data[at : at + 4] = chance.choice([b"\0\0\xc0\x7f", b"\0\0\x80\x7f", b"\xff\xff\x7f\x7f"])
+        for _ in range(chance.choice([1, 1, 1, 2, 4, 30])):
+            chance.choice(EDITS)(data, chance)
     file.write_bytes(bytes(data))
+
+
+def place_in(data: bytearray, chance: random.Random) -> int:
+    return chance.randrange(max(1, min(len(data), chance.choice([64, 512, len(data)]))))
+
+
+def length_of(chance: random.Random) -> int:
+    return chance.choice([1, 1, 4, 8, 100])
+
+
+def overwrite(data: bytearray, chance: random.Random) -> None:
+    at, part = place_in(data, chance), chance.choice([*PARTS, chance.randbytes(length_of(chance))])
+    data[at : at + len(part)] = part
+
+
+def insert(data: bytearray, chance: random.Random) -> None:
+    at = place_in(data, chance)
+    data[at:at] = chance.choice([*PARTS, chance.randbytes(length_of(chance))])
+
+
+def lose(data: bytearray, chance: random.Random) -> None:
+    at = place_in(data, chance)
+    del data[at : at + length_of(chance)]
+
+
+def cut(data: bytearray, chance: random.Random) -> None:
+    if chance.random() < 0.3:
+        del data[chance.randrange(len(data) + 1) :]
+
+
+def double(data: bytearray, chance: random.Random) -> None:
+    at = place_in(data, chance)
+    data[at:at] = data[at // 2 : at] if chance.random() < 0.3 else data[at : at + length_of(chance)]
+
+
+def count_otherwise(data: bytearray, chance: random.Random) -> None:
+    digits = [match.span() for match in re.finditer(rb"\d+", bytes(data[:2000]))]
+    start, stop = chance.choice(digits or [(0, 0)])
+    data[start:stop] = chance.choice(COUNTS)
+
+
+EDITS = [overwrite, overwrite, insert, lose, cut, double, count_otherwise]
 
 
 def in_yaml(folder: Path, chance: random.Random) -> list[str]:
@@ -265,8 +326,21 @@ def in_weights(folder: Path, chance: random.Random) -> list[str]:
     return [*COMPLETE, "2", "--near", "0.5", "--far", "20", *model]
 
 
+def posed(kind: str, pattern: str) -> Mutation:
+    """A file of a scene of a format of posed photographs, by the table of `pose_files`."""
+    words = ["complete", kind, "--context", "0", "1", "--target", "2", "--out", "out", "--quiet"]
+    return in_bytes(f"{kind}/{pattern}", [*words, "--resolution", str(SIZE), str(SIZE)])
+
+
+def splat(name: str, pattern: str = "") -> Mutation:
+    """A file of Gaussians, or one of the files in its folder."""
+    words = ["convert", f"splats/{name}", "out.ply", "--quiet"]
+    return in_bytes(f"splats/{name}{pattern}", words)
+
+
 RANGE = ["--near", "0.5", "--far", "20"]
 SCORES = ["--methods", "context", "--out", "run", "--quiet"]
+ALONE = ["poses", "photographs/images", "--out", "out", "--quiet"]
 KINDS: dict[str, Mutation] = {
     "transforms": in_json("scene/transforms.json", [*COMPLETE, "2", *RANGE]),
     "transforms-wide": in_json("scene/transforms.json", [*COMPLETE, "2"]),
@@ -274,8 +348,8 @@ KINDS: dict[str, Mutation] = {
     "image": in_bytes("scene/1.png", [*COMPLETE, "2", *RANGE]),
     "depth": in_bytes("scene/1.npy", [*COMPLETE, "2", *RANGE]),
     "ply": in_bytes("scene.ply", [*COMPLETE, "2", *RANGE, "--scene", "scene.ply"]),
-    "small-ply": in_bytes("small.ply", [*COMPLETE, "2", "--scene", "small.ply"]),
-    "ascii-ply": in_bytes("ascii.ply", [*COMPLETE, "2", "--scene", "ascii.ply"]),
+    "small-ply": in_bytes("small.ply", ["convert", "small.ply", "out.ply", "--quiet"]),
+    "ascii-ply": in_bytes("ascii.ply", ["convert", "ascii.ply", "out.ply", "--quiet"]),
     "cases": in_json("cases.json", ["evaluate", "cases.json", *SCORES]),
     "index": in_json("index.json", ["evaluate", "chunks", "--protocol", "index.json", *SCORES]),
     "chunk": in_bytes(
@@ -285,6 +359,28 @@ KINDS: dict[str, Mutation] = {
         "chunks/000000.torch", ["evaluate", "chunks", "--protocol", "n-1", "--limit", "1", *SCORES]
     ),
     "txt": in_bytes("clips/room.txt", ["index", "clips", "--protocol", "n-1", "--out", "i"]),
+    "colmap-binary": posed("colmap-binary", "sparse/0/*.bin"),
+    "colmap-text": posed("colmap-text", "sparse/*.txt"),
+    "cameras-json": posed("cameras-json", "cameras.json"),
+    "llff": posed("llff", "poses_bounds.npy"),
+    "kitti": posed("kitti", "*.txt"),
+    "dgp": posed("dgp", "**/*.json"),
+    "splits": posed("splits", "*.json"),
+    "photograph": posed("photographs", "images/*"),
+    "photographs-alone": in_bytes("photographs/images/*", ALONE),
+    "targets-list": in_bytes("target-list.json", [*COMPLETE, "target-list.json", *RANGE]),
+    "targets-colmap": in_bytes(
+        "colmap-text/sparse/images.txt", [*COMPLETE, "colmap-text/sparse/images.txt", *RANGE]
+    ),
+    "compressed-ply": splat("scene.compressed.ply"),
+    "spz": splat("scene.spz"),
+    "spz-4": splat("four.spz"),
+    "spz-unpacked": splat("plain.spz"),
+    "splat": splat("scene.splat"),
+    "ksplat": splat("scene.ksplat"),
+    "sog": splat("scene.sog"),
+    "sog-folder": splat("folder", "/*"),
+    "glb": splat("scene.glb"),
     "yaml": in_yaml,
     "words": in_words,
     "weights": in_weights,
@@ -332,8 +428,9 @@ def run_command(base: Path, folder: Path, kind: str, number: int, seed: int) -> 
     main()
 
 
-def finding_of(status: int, outlived: bool, log: str, folder: Path) -> str | None:
-    """What is wrong about the end of a run, in a line; None where nothing is."""
+def finding_of(status: int, outlived: bool, memory: int, log: str, left: set[str]) -> str | None:
+    """What is wrong about the end of a run that took `memory` kilobytes and `left` these files
+    behind, in a line; None where nothing is."""
     if outlived:
         return "outlives its limit"
     if os.WIFSIGNALED(status):
@@ -345,10 +442,12 @@ def finding_of(status: int, outlived: bool, log: str, folder: Path) -> str | Non
         return f"traceback at {':'.join(places[-1]) if places else '?'}: {last}"
     if code not in (0, 2):
         return f"exit {code}: {log.strip()[-150:]}"
-    if code == 2 and len(log) > LONGEST_ERROR and "╭" not in log:
+    if memory > MAX_MEMORY:
+        return f"takes {memory // 1024:,} MB"
+    if code == 2 and (len(log) > LONGEST_ERROR or log.count("\n") != 1):
         return f"an error of {len(log):,} characters: {log[:80]!r}"
-    if code == 2 and (folder / "in" / "out").exists():
-        return "exit 2, and something was written"
+    if code == 2 and left:
+        return f"exit 2, and {', '.join(sorted(left)[:3])} was written"
     return None
 
 
@@ -363,10 +462,10 @@ class Running:
 
 def fuzz(
     chosen: Sequence[tuple[str, int]], seed: int, limit_s: float, workers: int
-) -> list[Finding]:
-    """Run the mutations; what was found, in the order of their ends."""
+) -> list[Outcome]:
+    """Run the mutations; how they ended, in that order."""
     import_everything()
-    findings: list[Finding] = []
+    outcomes: list[Outcome] = []
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         base = root / "base"
@@ -374,6 +473,7 @@ def fuzz(
         _, status = os.waitpid(in_child(lambda: build(base), root / "log"), 0)
         if status:
             raise RuntimeError((root / "log").read_text())
+        given = files_below(base)
         waiting, running = list(reversed(chosen)), dict[int, Running]()
         while waiting or running:
             while waiting and len(running) < workers:
@@ -383,30 +483,36 @@ def fuzz(
                 work = lambda: run_command(base, folder, kind, number, seed)  # noqa: B023, E731
                 child = in_child(work, folder / "log")
                 running[child] = Running(f"{kind}:{number}", folder, time.monotonic() + limit_s)
-            findings += finished(running)
+            outcomes += finished(running, given)
             time.sleep(0.01)
-    return findings
+    return outcomes
 
 
-def finished(running: dict[int, Running]) -> list[Finding]:
-    """Take the forks that have ended, or must, out of `running`; what they found."""
-    findings = []
+def files_below(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def finished(running: dict[int, Running], given: set[str]) -> list[Outcome]:
+    """Take the forks that have ended, or must, out of `running`; how they ended. The files that
+    were `given` to them are no results."""
+    outcomes = []
     for child, run in list(running.items()):
         outlived = time.monotonic() > run.deadline
         if outlived:
             os.killpg(child, signal.SIGKILL)
-        ended, status = os.waitpid(child, 0 if outlived else os.WNOHANG)
+        ended, status, used = os.wait4(child, 0 if outlived else os.WNOHANG)
         if not ended:
             continue
         del running[child]
         log = (run.folder / "log").read_text(errors="replace")
-        what = finding_of(status, outlived, log, run.folder)
-        if what is not None:
-            written = run.folder / "words"
-            words = written.read_text(errors="replace").split("\0") if written.exists() else []
-            findings.append(Finding(run.name, [word[:60] for word in words], what))
+        left = files_below(run.folder / "in") - given
+        finding = finding_of(status, outlived, used.ru_maxrss, log, left)
+        written = run.folder / "words"
+        words = written.read_text(errors="replace").split("\0") if written.exists() else []
+        refused = os.WIFEXITED(status) and os.WEXITSTATUS(status) == 2
+        outcomes.append(Outcome(run.name, [word[:60] for word in words], refused, finding))
         shutil.rmtree(run.folder, ignore_errors=True)
-    return findings
+    return outcomes
 
 
 def import_everything() -> None:
@@ -418,13 +524,14 @@ def import_everything() -> None:
     import gscompleter.commands.evaluate
     import gscompleter.generators.warp_inpaint
     import gscompleter.reconstructors.plane_sweep  # noqa: F401
+    import pose_files  # noqa: F401  (likewise)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--limit", type=float, default=60, help="seconds of one run")
+    parser.add_argument("--limit", type=float, default=20, help="seconds of one run")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--only", help="KIND:NUMBER, as a finding names it")
@@ -434,12 +541,14 @@ def main() -> None:
         kind, number = given.only.split(":")
         chosen = [(kind, int(number))]
     start = time.monotonic()
-    findings = fuzz(chosen, given.seed, given.limit, given.workers)
-    for what, count in Counter(finding.what for finding in findings).most_common():
-        first = next(finding for finding in findings if finding.what == what)
+    outcomes = fuzz(chosen, given.seed, given.limit, given.workers)
+    findings = [outcome for outcome in outcomes if outcome.finding is not None]
+    for what, count in Counter(finding.finding for finding in findings).most_common():
+        first = next(finding for finding in findings if finding.finding == what)
         print(f"{count:4d}  {first.name}  {what}\n      {' '.join(first.command)[:300]!r}")
+    refused = sum(outcome.refused for outcome in outcomes)
     seconds = time.monotonic() - start
-    print(f"{len(chosen)} mutations, {len(findings)} findings, {seconds:.0f} s")
+    print(f"{len(chosen)} mutations, {len(findings)} findings, {refused} refused, {seconds:.0f} s")
     sys.exit(1 if findings else 0)
 
 

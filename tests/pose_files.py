@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from gscompleter.data.colmap.lenses import MODELS
+from gscompleter.data.scene import write_cameras
 from gscompleter.io.image import write_image
 from gscompleter.types import Camera, View
 from scenes import Room, camera_at, view_of
@@ -175,3 +176,77 @@ def write_dgp(folder: Path) -> Path:
     content = {"names": ["LIDAR", "CAMERA_01"], "intrinsics": lenses, "extrinsics": []}
     (folder / "calibration" / "abc.json").write_text(json.dumps(content))
     return folder
+
+
+def binary(folder: Path) -> Path:
+    write_photographs(folder / "images")
+    write_colmap_binary(folder / "sparse" / "0")
+    return folder
+
+
+def text(folder: Path) -> Path:
+    write_photographs(folder / "images")
+    write_colmap_text(folder / "sparse")
+    return folder
+
+
+def camera_list(folder: Path) -> Path:
+    write_photographs(folder / "images")
+    write_camera_list(folder / "cameras.json")
+    return folder
+
+
+def llff(folder: Path) -> Path:
+    write_photographs(folder / "images")
+    write_llff(folder / "poses_bounds.npy")
+    return folder
+
+
+def kitti(folder: Path, aside: float = 0.0, labels: bool = True) -> Path:
+    names = [f"{number:06d}.png" for number in range(len(VIEWS))]
+    write_photographs(folder / "image_2", names)
+    return write_kitti(folder, labels, aside)
+
+
+def kitti_aside(folder: Path) -> Path:
+    return kitti(folder, aside=0.54, labels=False)
+
+
+def dgp(folder: Path) -> Path:
+    write_photographs(folder / "rgb" / "CAMERA_01")
+    return write_dgp(folder)
+
+
+def transforms(folder: Path) -> Path:
+    write_photographs(folder)
+    write_cameras(folder / "transforms.json", CAMERAS, NAMES)
+    return folder
+
+
+def splits(folder: Path) -> Path:
+    """As the synthetic scenes of NeRF: three files, names without endings, one opening angle."""
+    write_photographs(folder)
+    parts = {"train": (0, 3), "val": (1, 4), "test": (2,)}
+    for part, numbers in parts.items():
+        path = folder / f"transforms_{part}.json"
+        chosen = [CAMERAS[number] for number in numbers]
+        write_cameras(path, chosen, [f"./{number}" for number in numbers])
+        content = json.loads(path.read_text())
+        frames = [{k: f[k] for k in ("file_path", "transform_matrix")} for f in content["frames"]]
+        angle = 2 * np.arctan(0.5 / 0.9)
+        path.write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    return folder
+
+
+WRITERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "colmap-binary": ("colmap", binary),
+    "colmap-text": ("colmap", text),
+    "cameras-json": ("cameras-json", camera_list),
+    "llff": ("llff", llff),
+    "kitti": ("kitti", kitti),
+    "kitti-aside": ("kitti", kitti_aside),
+    "dgp": ("dgp", dgp),
+    "transforms": ("nerfstudio", transforms),
+    "splits": ("nerfstudio", splits),
+}
+"""How a folder of each kind is written, and the name of its format."""

@@ -1,4 +1,4 @@
-"""Files in the formats that are only read, made of given Gaussians, to test the readers with."""
+"""Files in every format of splats, made of given Gaussians, to test the readers with."""
 
 from __future__ import annotations
 
@@ -7,14 +7,28 @@ import io
 import json
 import struct
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import zstandard
 from PIL import Image
 
+from gscompleter import save_splat
+from gscompleter.splats.frames import ABOUT_Z, half_turned
 from gscompleter.types import SH_C0, Gaussians
+from scenes import random_gaussians
 
+WRITTEN = ("scene.ply", "scene.compressed.ply", "scene.spz", "scene.splat")
+FORMATS_BUT_PLY = (
+    "scene.compressed.ply",
+    "scene.spz",
+    "four.spz",
+    "scene.splat",
+    "scene.ksplat",
+    "scene.sog",
+    "scene.glb",
+)
 SH_NAME = "KHR_gaussian_splatting:SH_DEGREE_{}_COEF_{}"
 
 
@@ -244,4 +258,30 @@ def write_glb(path: Path, table: dict, binary: bytes) -> Path:
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+def plausible(n: int = 200, degree: int = 3) -> Gaussians:
+    """Gaussians whose colours and harmonics every format has room for."""
+    gaussians = random_gaussians(n, seed=3, sh_degree=degree)
+    sh = gaussians.sh * 0.5
+    sh[:, 0] = sh[:, 0].clamp(-1.7, 1.7)
+    return replace(gaussians, sh=sh.clamp(-0.98, 0.98))
+
+
+def made(folder: Path, name: str, gaussians: Gaussians) -> Path:
+    """A file of the Gaussians in the format that `name` asks for."""
+    path = folder / name
+    if name in WRITTEN:
+        save_splat(path, gaussians)
+    elif path.suffix == ".ksplat":
+        write_ksplat(path, gaussians, level=1)
+    elif path.suffix == ".glb":
+        write_glb(path, *glb_table(half_turned(gaussians, ABOUT_Z)))
+    elif name == "plain.spz":
+        path.write_bytes(gzip.decompress(made(folder, "scene.spz", gaussians).read_bytes()))
+    elif path.suffix == ".spz":
+        write_spz_4(path, made(folder, "scene.spz", gaussians))
+    else:
+        write_sog(path, sog_files(gaussians))
     return path

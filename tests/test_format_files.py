@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gscompleter import InputError
+from gscompleter import InputError, load_splat
 from gscompleter.data.formats import open_photographs
 
 OPENED = {
@@ -70,6 +70,43 @@ REFUSED = {
     "waymo_mmdet3d/waymo_infos_val.pkl": NOTHING,
 }
 
+SPLATS = {
+    "gaussians/arkit_scene.splat": (116_906, 0, (1.44, 0.88, -5.86)),
+    "gaussians/biker.compressed.ply": (152_746, 0, (-0.06, -1.64, 0.03)),
+    "gaussians/biker.spz": (152_746, 0, (-0.06, -1.64, 0.03)),
+    "gaussians/guitar.compressed.ply": (90_854, 0, (0.29, -1.13, 0.18)),
+    "gaussians/minimal/minimal-raw.spz": (4, 0, (-1.0, 0.0, 0.0)),
+    "gaussians/minimal/minimal-v2.spz": (4, 0, (-1.0, 0.0, 0.0)),
+    "gaussians/minimal/minimal-v3.spz": (4, 0, (-1.0, 0.0, -1.0)),
+    "gaussians/minimal/minimal-v4.spz": (4, 0, (-1.0, 0.0, -1.0)),
+    "gaussians/minimal/minimal.ksplat": (4, 0, (-1.0, 0.0, -1.0)),
+    "gaussians/minimal/minimal.splat": (4, 0, (-1.0, 0.0, -1.0)),
+    "gaussians/playbot_lod4.from-sog.ply": (8_406, 2, (-0.01, -0.02, -0.02)),
+    "gaussians/playbot_sog": (8_406, 2, (-0.01, -0.02, -0.02)),
+    "gaussians/playbot_sog/meta.json": (8_406, 2, (-0.01, -0.02, -0.02)),
+}
+"""As files of Gaussians: how many, the degree of their harmonics, the medians of their means."""
+
+UNKNOWN = "holds no Gaussians in a format that is known"
+OTHER_JSON = r"is no \.sog: its .* describes something else"
+OTHER_ZIP = r"is no \.sog: this archive has no meta.json in it"
+POINTER = "is a git-lfs pointer, not the file itself; run `git lfs pull`"
+NO_SPLATS = {
+    "dgp_ddad/calibration.json": OTHER_JSON,
+    "dgp_ddad/scene.json": OTHER_JSON,
+    "evaluation_index/dl3dv_start_0_distance_10_ctx_2v_tgt_4v.json": OTHER_JSON,
+    "evaluation_index/evaluation_index_acid.json": OTHER_JSON,
+    "evaluation_index/evaluation_index_re10k.json": OTHER_JSON,
+    "gaussians/guitar.from-compressed.ply": "has 667 of 90,854 Gaussians with NaN, infinity",
+    "gsplat_garden/test_garden.npz": OTHER_ZIP,
+    "idr_dtu/cameras_sphere.npz": OTHER_ZIP,
+    "lfs_pointers/point_cloud.ply": POINTER,
+    "lfs_pointers/splat.ply": POINTER,
+    "nerfstudio_fox/transforms.json": OTHER_JSON,
+    "re10k/000000.torch": OTHER_ZIP,
+}
+"""As files of Gaussians; what is in neither table is `UNKNOWN`."""
+
 
 def place(shared: Path, name: str) -> Path:
     path = shared / "formats" / name
@@ -98,3 +135,20 @@ def test_every_file_has_a_row(shared):
     folder = shared / "formats"
     files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assert files <= set(OPENED) | set(REFUSED)
+
+
+@pytest.mark.parametrize("name", SPLATS)
+def test_a_file_of_gaussians_is_opened(shared, name):
+    count, degree, medians = SPLATS[name]
+    gaussians = load_splat(place(shared, name))
+    assert (len(gaussians), gaussians.sh_degree) == (count, degree)
+    assert gaussians.means.median(0).values.tolist() == pytest.approx(medians, abs=0.006)
+
+
+@pytest.mark.parametrize("name", sorted({*OPENED, *REFUSED} - {*SPLATS}))
+def test_any_other_file_is_refused_as_gaussians_with_its_sentence(shared, name):
+    path = place(shared, name)
+    sentence = "is a folder without meta.json" if path.is_dir() else NO_SPLATS.get(name, UNKNOWN)
+    with pytest.raises(InputError, match=sentence) as error:
+        load_splat(path)
+    assert "\n" not in str(error.value)

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import string
 from pathlib import Path
 
 import numpy as np
@@ -121,8 +122,16 @@ def test_photographs_without_a_camera_are_named(tmp_path, monkeypatch, capsys):
 
 
 def test_parts_that_do_not_connect_are_told():
-    (note,) = FoundPoses(9, (), (5, 4), 100, 0.5).notes
-    assert "2 parts that do not connect, of 5 and 4 cameras" in note
+    parts, missing = FoundPoses(9, ("a.png",), (5, 4), 100, 0.5).notes
+    assert "2 parts that do not connect, of 5 and 4 cameras; the largest is kept." in parts
+    assert missing == "No camera was found in it for a.png; they are left out."
+
+
+def test_a_model_among_placed_photographs_is_no_part():
+    parts = pytest.importorskip("gscompleter.data.mapping_process").parts
+    large, other, inside = set(range(12)), {20, 21, 22}, {3, 4, 5, 20}
+    assert parts([large, inside, other, {7, 23}]) == [12, 3]
+    assert parts([{1, 2}]) == [2]
 
 
 def test_photographs_of_nothing_have_no_cameras(tmp_path, monkeypatch, capsys):
@@ -155,6 +164,11 @@ def test_a_folder_of_other_files_has_no_photographs(tmp_path):
     (tmp_path / "notes.txt").write_text("no photograph")
     with pytest.raises(InputError, match="There are 0 photographs"):
         photographs_in(tmp_path)
+
+
+def test_neighbours_are_those_of_the_numbers_however_they_are_written(tmp_path):
+    folder = blank(tmp_path / "p", 12)
+    assert photographs_in(folder) == [f"{number}.png" for number in range(12)]
 
 
 def test_a_file_that_is_no_image_is_named(tmp_path):
@@ -275,3 +289,23 @@ def test_forty_real_photographs_are_all_placed(shared, tmp_path):
     found = find_poses(shared / "data" / "fox" / "images", tmp_path / "fox")
     assert found.registered == 40
     assert found.error < 0.5
+
+
+@pytest.mark.slow
+def test_of_two_scenes_in_a_folder_the_larger_is_kept_and_the_other_told(shared, tmp_path):
+    pytest.importorskip("pycolmap")
+    sources = [*list_photographs(shared, "fox", 12), *list_photographs(shared, "hololens_room", 8)]
+    names = [f"{letter}.jpg" for letter in string.ascii_lowercase[: len(sources)]]
+    (tmp_path / "both").mkdir()
+    for name, source in zip(names, sources, strict=True):
+        with Image.open(source) as image:
+            image.thumbnail((320, 320))
+            image.save(tmp_path / "both" / name, quality=92)
+    found = find_poses(tmp_path / "both", tmp_path / "out")
+    assert found.missing == tuple(names[12:])
+    assert found.models[0] == 12
+    assert len(found.models) > 1
+
+
+def list_photographs(shared: Path, scene: str, count: int) -> list[Path]:
+    return sorted((shared / "data" / scene / "images").iterdir())[:count]

@@ -29,7 +29,11 @@ from gscompleter.splats.frames import ABOUT_X, ABOUT_Z, half_turned, moved
 from gscompleter.splats.labels import place_of_labels
 from scenes import camera_at, random_gaussians, scaled
 from splat_files import (
+    FORMATS_BUT_PLY,
+    WRITTEN,
     glb_table,
+    made,
+    plausible,
     sog_files,
     write_glb,
     write_ksplat,
@@ -39,24 +43,6 @@ from splat_files import (
 )
 
 CPU = load_renderer("cpu")
-WRITTEN = ("scene.ply", "scene.compressed.ply", "scene.spz", "scene.splat")
-FORMATS_BUT_PLY = (
-    "scene.compressed.ply",
-    "scene.spz",
-    "four.spz",
-    "scene.splat",
-    "scene.ksplat",
-    "scene.sog",
-    "scene.glb",
-)
-
-
-def plausible(n: int = 200, degree: int = 3) -> Gaussians:
-    """Gaussians whose colours and harmonics every format has room for."""
-    gaussians = random_gaussians(n, seed=3, sh_degree=degree)
-    sh = gaussians.sh * 0.5
-    sh[:, 0] = sh[:, 0].clamp(-1.7, 1.7)
-    return replace(gaussians, sh=sh.clamp(-0.98, 0.98))
 
 
 def psnr(a: Gaussians, b: Gaussians) -> float:
@@ -85,24 +71,6 @@ def covariances(gaussians: Gaussians) -> torch.Tensor:
     rotation = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
     axes = rotation * gaussians.scales.double()[:, None]
     return axes @ axes.transpose(1, 2)
-
-
-def made(folder: Path, name: str, gaussians: Gaussians) -> Path:
-    """A file of the Gaussians in the format that `name` asks for."""
-    path = folder / name
-    if name in WRITTEN:
-        save_splat(path, gaussians)
-    elif path.suffix == ".ksplat":
-        write_ksplat(path, gaussians, level=1)
-    elif path.suffix == ".glb":
-        write_glb(path, *glb_table(half_turned(gaussians, ABOUT_Z)))
-    elif name == "plain.spz":
-        path.write_bytes(gzip.decompress(made(folder, "scene.spz", gaussians).read_bytes()))
-    elif path.suffix == ".spz":
-        write_spz_4(path, made(folder, "scene.spz", gaussians))
-    else:
-        write_sog(path, sog_files(gaussians))
-    return path
 
 
 def refused(path: Path, sentence: str) -> None:
@@ -388,16 +356,6 @@ def test_what_cannot_be_written_is_refused(tmp_path):
     with pytest.raises(InputError, match="no Gaussian"):
         save_splat(tmp_path / "scene.splat", gaussians[:0])
     assert os.listdir(tmp_path) == []
-
-
-@pytest.mark.parametrize("name", [*FORMATS_BUT_PLY, "plain.spz", "folder"])
-def test_mutated_files_are_read_or_refused(tmp_path, name):
-    from mutate_splats import refusals
-
-    path = made(tmp_path, name, plausible(40, 1))
-    if path.is_dir():
-        path = path / "meta.json"
-    assert 0 < refusals(path, count=40, seed=0) <= 40
 
 
 # ---------------------------------------------------------------------------------- commands

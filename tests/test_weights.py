@@ -438,7 +438,6 @@ def test_another_published_file_is_named(tmp_path: Path, monkeypatch: pytest.Mon
     ("content", "sentence"),
     [
         (b"", "is empty"),
-        (b"version https://git-lfs.github.com/spec/v1\noid sha256:cf\nsize 1\n", "git-lfs"),
         (b"\n<!DOCTYPE html><html>Too many users have viewed this file", "web page"),
     ],
 )

@@ -1,11 +1,16 @@
 """What the user is told when the input is wrong."""
 
 import os
+from contextlib import suppress
+from pathlib import Path
 
 LONGEST_QUOTE = 100
 """Characters of the input that a sentence quotes at most."""
 LONGEST_PATH = 250
 """The same of a path, which one may want to copy."""
+
+POINTER = b"version https://git-lfs"
+"""How a pointer of git-lfs begins."""
 
 
 class InputError(ValueError):
@@ -41,6 +46,22 @@ def quoted(value: object, length: int | None = None) -> str:
         return line
     half = (length - 1) // 2
     return f"{line[:half]}…{line[-half:]}"
+
+
+def refuse_pointer(path: Path) -> None:
+    """Refuse what git-lfs leaves in place of a file until it is fetched.
+
+    Whatever else may be wrong with the file is left to those who read it.
+
+    Raises:
+        InputError: where the file is such a pointer.
+    """
+    with suppress(OSError), path.open("rb") as file:
+        if file.read(len(POINTER)) == POINTER:
+            raise InputError(
+                f"{quoted(path)} is a git-lfs pointer, not the file itself; run `git lfs pull` in "
+                "its repository to fetch it."
+            )
 
 
 def _written(value: object) -> str:

@@ -18,6 +18,7 @@ from gscompleter.commands.options import CompleteOptions, working_size
 from gscompleter.data.formats import open_photographs, recognised
 from gscompleter.data.framing import Resolution
 from gscompleter.data.origin import frame_from_photographs, told_from
+from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sparse_points import with_depth_range
@@ -92,10 +93,12 @@ def open_scene(options: CompleteOptions, console: Console) -> Opened:
     kept in the output folder, whatever becomes of the completion.
 
     Raises:
-        InputError: as `open_photographs` and `find_poses`.
+        InputError: as `open_photographs` and `find_poses`, and where another program's cameras
+            lie beside the photographs.
     """
     folder, poses, number = options.folder, options.out / POSES, None
     if options.format is None and holds_photographs(folder) and recognised(folder) is None:
+        refuse_other_exports(folder)
         ours = options.overwrite or os.path.isfile(poses / SUMMARY)
         with shown_on(None if options.quiet else console):
             found = find_poses(folder, poses, overwrite=ours)

@@ -9,6 +9,7 @@ from gscompleter.data.camera_list import read_camera_list
 from gscompleter.data.colmap.scene import is_image_file, read_image_file
 from gscompleter.data.frame import Frame
 from gscompleter.data.framing import Resolution
+from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.supersplat import is_supersplat, poses_of
 from gscompleter.data.transforms import NAME, read_frames
 from gscompleter.io.json_file import read_json
@@ -30,6 +31,7 @@ def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
         return read_image_file(path)
     if os.path.isdir(path):
         return read_frames(path / NAME)
+    refuse_other_exports(path)
     content = read_json(path, "name a file of cameras")
     if is_supersplat(content):
         return poses_of(content, path, resolution)

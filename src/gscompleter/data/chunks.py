@@ -21,7 +21,7 @@ from torch import Tensor
 from gscompleter.data.frame import Frame
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.real_estate import intrinsics_and_pose
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.json_file import read_json
 
 TEST = "test"
@@ -124,6 +124,7 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
     """The last one stays in memory, for the frames that are asked for one after the other."""
     if not os.path.isfile(path):
         raise InputError(f"There is no chunk {path}; download it, or take it out of the index.")
+    refuse_pointer(path)
     try:
         with warnings.catch_warnings():
             # About pickle protocols, in the moment before the file is refused.
@@ -150,12 +151,6 @@ def _cannot_load(path: Path, error: Exception) -> str:
             f"{path} holds pickled Python objects, which are refused because loading them can "
             "run any code; save it again with tensors, strings, lists and dicts only."
         )
-    with path.open("rb") as file:
-        if file.read(40).startswith(b"version https://git-lfs"):
-            return (
-                f"{path} is a git-lfs pointer, not the chunk itself; run `git lfs pull` in its "
-                "repository."
-            )
     return f"{path} is truncated or no file of torch.save; download it again."
 
 

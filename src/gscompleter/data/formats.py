@@ -19,6 +19,7 @@ from gscompleter.data.dgp import holds_dgp, open_dgp
 from gscompleter.data.kitti import holds_kitti, open_kitti
 from gscompleter.data.limits import check_planes
 from gscompleter.data.llff import holds_llff, open_llff
+from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import holds_camera_files, open_camera_files
 from gscompleter.data.transforms import holds_transforms, open_transforms
@@ -114,6 +115,7 @@ def format_of(path: Path, name: str | None = None) -> str:
         raise InputError(f"There is no {quoted(str(path))}; name {accepted()}.")
     found = recognised(path) if name is None else name
     if found is None:
+        refuse_other_exports(path)
         raise InputError(
             f"There are no posed photographs in {quoted(str(path))}; name {accepted()}."
         )

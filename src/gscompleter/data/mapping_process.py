@@ -43,6 +43,8 @@ LENS = "SIMPLE_RADIAL"
 """COLMAP's camera model: one focal length, one coefficient of distortion."""
 GUESSED_FOCAL = 1.2
 """Focal length as a multiple of the longer side, where EXIF does not tell it."""
+MIN_MODEL = 3
+"""Photographs of a part that does not connect to the others for it to be told of."""
 MIN_FOR_CENTRE = 10
 """Photographs by one camera that its principal point can be told from."""
 MAX_OFF_CENTRE = 0.1
@@ -192,10 +194,24 @@ def map_all(job: Job, teller: Teller) -> dict[str, Any]:
     largest_one.write(job.model)
     return {
         "registered": sorted(largest_one.images[i].name for i in largest_one.reg_image_ids()),
-        "models": [model.num_reg_images() for model in models],
+        "models": parts([set(model.reg_image_ids()) for model in models]),
         "points": largest_one.num_points3D(),
         "error": largest_one.compute_mean_reprojection_error(),
     }
+
+
+def parts(models: list[set[int]]) -> list[int]:
+    """How many photographs each of the models has, given by the numbers of their photographs, the
+    largest first.
+
+    The mapper may begin another model among photographs that it has placed; that is no part.
+    """
+    sizes, placed = list[int](), set[int]()
+    for model in models:
+        if not sizes or len(model - placed) >= MIN_MODEL:
+            sizes.append(len(model))
+            placed |= model
+    return sizes
 
 
 def with_principal_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -233,7 +249,9 @@ def _models(job: Job, teller: Teller) -> list[Any]:
             job.database,
             job.images,
             job.work,
-            pycolmap.IncrementalPipelineOptions(num_threads=job.threads, random_seed=SEED),
+            pycolmap.IncrementalPipelineOptions(
+                num_threads=job.threads, random_seed=SEED, min_model_size=MIN_MODEL
+            ),
             initial_image_pair_callback=first_pair,
             next_image_callback=teller.step,
         )

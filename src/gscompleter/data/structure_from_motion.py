@@ -64,18 +64,20 @@ class FoundPoses:
     @property
     def notes(self) -> list[str]:
         """What the user should know, in sentences."""
-        notes = []
+        notes, place = [], ""
+        if len(self.models) > 1:
+            *others, last = map(str, self.models)
+            notes.append(
+                f"The photographs fall into {len(self.models)} parts that do not connect, of "
+                f"{', '.join(others)} and {last} cameras; the largest is kept."
+            )
+            place = " in it"
         if self.missing:
             names = ", ".join(quoted(name) for name in self.missing[:MAX_NAMED])
             more = len(self.missing) - MAX_NAMED
             notes.append(
-                f"No camera was found for {names}{f' and {more} more' if more > 0 else ''}; they "
-                "are left out."
-            )
-        if len(self.models) > 1:
-            notes.append(
-                f"The photographs fall into {len(self.models)} parts that do not connect, of "
-                f"{' and '.join(map(str, self.models))} cameras; the largest is kept."
+                f"No camera was found{place} for {names}{f' and {more} more' if more > 0 else ''}; "
+                "they are left out."
             )
         return notes
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from PIL import Image, ImageOps
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.image import FORMATS
 
 MAX_SIDE = 1600
@@ -52,6 +52,7 @@ def write_upright(root: Path, source: str, folder: Path) -> Upright:
     Raises:
         InputError: where it is damaged or no image, or another copy has its name.
     """
+    refuse_pointer(root / source)
     try:
         with Image.open(root / source, formats=FORMATS) as image:
             exif = image.getexif()

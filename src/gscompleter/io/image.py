@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.files import replacing
 
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
@@ -150,6 +150,7 @@ def _opened(path: Path | str) -> Image.Image:
     path = Path(path)
     if not os.path.isfile(path):
         raise InputError(f"There is no image {quoted(path)}; restore it or correct its path.")
+    refuse_pointer(path)
     return _open(path, quoted(path), "a PNG or JPEG file is")
 
 

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.files import replacing
 from gscompleter.types import Gaussians
 
@@ -87,12 +87,8 @@ class Element:
 
 def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
     """The format and the elements of a file, which is left at the first byte of the data."""
+    refuse_pointer(path)
     first = file.readline(512)
-    if first.startswith(b"version https://git-lfs"):
-        raise InputError(
-            f"{path} is a git-lfs pointer, not the scene itself; run `git lfs pull` in its "
-            "repository to fetch it."
-        )
     if not first:
         raise InputError(f"{path} is empty; a 3DGS .ply is needed.")
     if first.strip() != b"ply":

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.ply import load_ply, save_ply, whole
 from gscompleter.splats.compressed_ply import (
     is_compressed,
@@ -126,11 +126,7 @@ def format_of(path: Path) -> str:
             head = file.read(HEAD)
     except OSError as error:
         raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
-    if head.startswith(b"version https://git-lfs"):
-        raise InputError(
-            f"{quoted(path)} is a git-lfs pointer, not the scene itself; run `git lfs pull` in its "
-            "repository to fetch it."
-        )
+    refuse_pointer(path)
     if not head:
         raise InputError(f"{quoted(path)} is empty; a file of Gaussians is needed.")
     for name, format_ in FORMATS.items():

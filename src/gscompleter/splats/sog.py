@@ -98,6 +98,8 @@ def read_sog(path: Path) -> Gaussians:
         return _read(Parts(path, lambda name: content(path.parent / name)), path.name)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as bundle:
+            if META not in bundle.namelist():
+                raise InputError(f"{quoted(path)} is no .sog: this archive has no {META} in it.")
             return _read(Parts(path, lambda name: _entry(path, bundle, name)))
     except InputError:
         raise

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
 NOT_THE_ENCODERS = ("decoder.", "losses.")
@@ -53,11 +53,10 @@ def check_kind(path: Path, name: str) -> None:
         raise InputError(
             f"{path} cannot be opened ({error.strerror}); make it readable."
         ) from error
+    refuse_pointer(path)
     wrong = ""
     if not head:
         wrong = "is empty"
-    elif head.startswith(b"version https://git-lfs"):
-        wrong = "is a pointer of git-lfs and not the file itself"
     elif head.lstrip().lower().startswith((b"<!doctype", b"<html")):
         wrong = "is a web page that was saved under this name"
     elif head.startswith(b"PK\x03\x04") and not is_archive(path):

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from gscompleter.data.colmap.lenses import intrinsics_of, model_called
 from gscompleter.data.colmap.records import PosedImage, portable
 from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quoted, refuse_pointer
 
 MAX_NAME = 1024
 """Of bytes in the name of an image."""
@@ -86,6 +86,7 @@ def _image(records: _Records) -> PosedImage:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Records]:
+    refuse_pointer(path)
     try:
         with path.open("rb") as file:
             if os.fstat(file.fileno()).st_size == 0:

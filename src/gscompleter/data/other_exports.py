@@ -1,0 +1,71 @@
+"""Exports of other programs that hold cameras in no format of ours, and which to choose instead."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from gscompleter.errors import InputError, quoted
+
+HEAD = 4096
+"""Bytes of a file that tell which program wrote it."""
+INSTEAD = {
+    "Metashape": "export its cameras as COLMAP, which Metashape does since 2.2",
+    "RealityScan": "export its registration as COLMAP",
+    "Polycam": "turn it into nerfstudio's transforms.json by ns-process-data polycam",
+}
+"""What to do with the cameras of each program."""
+PROJECTS = {
+    ".psx": "Metashape",
+    ".psz": "Metashape",
+    ".rspj": "RealityScan",
+    ".rcproj": "RealityScan",
+}
+"""Programs by the endings of their projects."""
+
+POLYCAM_CAMERAS = ("cameras", "corrected_cameras")
+"""Folders with a JSON file for each keyframe."""
+
+
+def refuse_other_exports(path: Path) -> None:
+    """Refuse a file or folder with the cameras of a program that are not read.
+
+    Raises:
+        InputError: where it is one; it says which export to choose.
+    """
+    files = sorted(path.iterdir()) if os.path.isdir(path) else [path]
+    found = "Polycam" if _is_polycam(path) else None
+    for file in files:
+        if found is None and os.path.isfile(file):
+            found, path = _program_of(file), file
+    if found is not None:
+        raise InputError(
+            f"{quoted(path)} holds cameras as {found} keeps them, which are not read; "
+            f"{INSTEAD[found]}, or name a folder of the photographs alone."
+        )
+
+
+def _program_of(file: Path) -> str | None:
+    """The program that a file of cameras is of; None where it is of none that is known."""
+    ending = file.suffix.lower()
+    if ending in (".xml", ".csv"):
+        head = _head(file)
+        if ending == ".xml" and b"<document" in head and b"<chunk" in head:
+            return "Metashape"
+        if ending == ".csv" and head.startswith((b"#name,", b"#cameras")):
+            return "RealityScan"
+    return PROJECTS.get(ending)
+
+
+def _head(file: Path) -> bytes:
+    with suppress(OSError), file.open("rb") as opened:
+        return opened.read(HEAD).removeprefix(b"\xef\xbb\xbf")
+    return b""
+
+
+def _is_polycam(path: Path) -> bool:
+    """Whether it is a folder of Polycam's raw data, or that of the keyframes in it."""
+    homes = (path / home / kind for home in ("", "keyframes") for kind in POLYCAM_CAMERAS)
+    cameras = (file for home in homes for file in sorted(home.glob("*.json"))[:1])
+    return any(b'"t_00"' in _head(file) for file in cameras)
