@@ -17,12 +17,13 @@ from rich.table import Table
 from gscompleter.commands.options import CompleteOptions
 from gscompleter.completer import GSCompleter
 from gscompleter.data.formats import open_photographs, recognised
-from gscompleter.data.origin import frame_from_photographs, told_from
+from gscompleter.data.origin import frame_from_photographs, origin_of, told_from
 from gscompleter.data.photographs import Photographs, PosedPhotographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sparse_points import with_depth_range
 from gscompleter.data.structure_from_motion import find_poses, holds_photographs
 from gscompleter.errors import InputError, quoted
+from gscompleter.frames.beside import GivenSplat
 from gscompleter.frames.placing import frame_of_splat
 from gscompleter.frames.similarity import moved_camera, moved_view
 from gscompleter.generators import load_generator
@@ -116,9 +117,10 @@ def in_frame_of_splat(
     device = task.views[0].image.device
     cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
     scene = load_splat(path, drop_nonfinite=options.drop_nonfinite)
-    scene = told_from(given.origin, scene, cameras).to(device)
-    renderer = load_renderer(device.type)
-    found = frame_of_splat(path, scene, given, options.context, renderer)
+    origin = origin_of(scene, given.origin)
+    scene = told_from(origin, scene, cameras).to(device)
+    splat = GivenSplat(path, scene, origin, options.folder)
+    found = frame_of_splat(splat, given, options.context, load_renderer(device.type))
     console.print(found.sentence(), highlight=False, soft_wrap=True)
     return Task(
         [moved_view(view, found.transform) for view in task.views],
