@@ -84,8 +84,8 @@ def find_frame(
 ) -> SplatFrame:
     """Where the splat lies, by how well it fits its photographs.
 
-    A frame gives way to one that is less simple only where that fits better by `CLEARLY`, and the
-    first in which all is in place ends the search.
+    Frames are tried from the simplest on until one fits, and the first in which all is in place
+    ends the search. One that fits gives way only to one that fits better by `CLEARLY`.
 
     Args:
         poses: Of all photographs [n, 4, 4], camera-to-world.
@@ -95,11 +95,14 @@ def find_frame(
     Raises:
         InputError: where no frame was found that fits.
     """
-    best = known_frame(evidence, candidates(poses, points, left))
-    if best.fit.in_place:
+    given = evidence.at(np.eye(4))
+    best = SplatFrame("given", np.eye(4), given, given)
+    if given.in_place:
         return best
+    if not given.fits:
+        best = known_frame(evidence, best, candidates(poses, points, left))
     if best.fit.fits:
-        return polished(evidence, best)
+        return best if best.fit.in_place else polished(evidence, best)
     found = similarity_frame(evidence, points, best.given)
     if found is None:
         raise InputError(
@@ -120,16 +123,12 @@ def candidates(
         yield "normalised", transform
 
 
-def known_frame(evidence: Evidence, others: Iterable[Candidate]) -> SplatFrame:
-    """The given frame, or a clearly better one of `others`; the first in which all is in place."""
-    given = evidence.at(np.eye(4))
-    best = SplatFrame("given", np.eye(4), given, given)
-    if given.in_place:
-        return best
+def known_frame(evidence: Evidence, best: SplatFrame, others: Iterable[Candidate]) -> SplatFrame:
+    """`best`, or a clearly better one of `others`; the first in which all is in place."""
     for method, transform in others:
         fit = evidence.at(transform)
         if better(fit, best.fit):
-            best = SplatFrame(method, transform, fit, given)
+            best = SplatFrame(method, transform, fit, best.given)
         if best.fit.in_place:
             break
     return best
