@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.errors import InputError
+from gscompleter.frames.beside import GivenSplat
 from gscompleter.frames.finding import Evidence, find_frame
 from gscompleter.frames.fit import frame_fit
 from gscompleter.frames.placing import frame_of_splat
@@ -93,7 +94,7 @@ def test_principal_axes_of_the_points_are_found_whatever_their_signs(views, spla
 
 
 def test_the_file_that_nerfstudio_leaves_is_taken(views, splat):
-    found = find(views, splat, ARBITRARY, dataparser=ARBITRARY)
+    found = find(views, splat, ARBITRARY, left=[("dataparser", ARBITRARY)])
     assert found.method == "dataparser"
     assert np.array_equal(found.transform, ARBITRARY)
 
@@ -164,12 +165,11 @@ def test_a_real_splat_is_found_in_both_of_its_frames(shared, name):
     fox = shared / "splats" / "fox"
     if not fox.is_dir():
         pytest.skip(f"needs the splat of another trainer, and there is no folder {fox}")
-    found = frame_of_splat(
-        fox / name, load_ply(fox / name), open_photographs(fox), (0, 3), RENDERER
-    )
+    splat = GivenSplat(fox / name, load_ply(fox / name), np.zeros(3), fox)
+    found = frame_of_splat(splat, open_photographs(fox), (0, 3), RENDERER)
     truth = np.eye(4)
     if name != "splat.ply":
         truth = np.array(json.loads((fox / "colmap_to_normalised.json").read_text())["matrix"])
     assert found.fit.psnr > 35
-    assert np.abs(found.transform - truth).max() < 1e-3
-    assert found.method == ("given" if name == "splat.ply" else "similarity")
+    assert np.abs(found.transform - truth).max() < 1e-5
+    assert found.method == ("given" if name == "splat.ply" else "cameras")

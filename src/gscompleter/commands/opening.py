@@ -17,13 +17,14 @@ from torch import Tensor
 from gscompleter.commands.options import CompleteOptions, working_size
 from gscompleter.data.formats import open_photographs, recognised
 from gscompleter.data.framing import Resolution
-from gscompleter.data.origin import frame_from_photographs, told_from
+from gscompleter.data.origin import frame_from_photographs, origin_of, told_from
 from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sparse_points import with_depth_range
 from gscompleter.data.structure_from_motion import find_poses, holds_photographs
 from gscompleter.errors import InputError, quoted
+from gscompleter.frames.beside import GivenSplat
 from gscompleter.frames.placing import frame_of_splat
 from gscompleter.frames.similarity import moved_camera, moved_view
 from gscompleter.io.files import SUMMARY
@@ -140,9 +141,11 @@ def in_frame_of_splat(task: Task, path: Path, options: CompleteOptions, opened: 
     given, device = opened.photographs, task.views[0].image.device
     cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
     scene = load_splat(path, drop_nonfinite=options.drop_nonfinite)
-    scene = told_from(given.origin, scene, cameras).to(device)
+    origin = origin_of(scene, given.origin)
+    scene = told_from(origin, scene, cameras).to(device)
+    splat = GivenSplat(path, scene, origin, options.folder)
     frames = [view.frame for view in task.views if view.frame is not None]
-    found = frame_of_splat(path, scene, given, frames, load_renderer(device.type))
+    found = frame_of_splat(splat, given, frames, load_renderer(device.type))
     return replace(
         task,
         views=[moved_view(view, found.transform) for view in task.views],

@@ -16,7 +16,7 @@ SCALE_RANGE = (1e-9, 1e9)
 
 
 def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
-    """The similarity from the frame of `transforms.json` to that of the trained scene.
+    """The similarity from the world of the reconstruction to that of the trained scene.
 
     The file holds a rotation and a translation (`transform`, 3×4), and a `scale` that multiplies
     what they give.

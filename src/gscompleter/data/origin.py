@@ -40,6 +40,18 @@ def frame_from_photographs(origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, 
     return transform
 
 
+def origin_of(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Where a scene's coordinates are to be told from beside photographs told from `origin`.
+
+    From there too, if the scene lies there; from zero, if it is in a frame of its own.
+    """
+    if len(scene) == 0 or not origin.any():
+        return origin
+    middle = scene.means.median(dim=0).values.double().cpu().numpy()
+    there = np.abs(middle - origin).max() < 0.5 * np.abs(origin).max()
+    return origin if there else np.zeros(3)
+
+
 def told_from(
     origin: Float[np.ndarray, "3"], scene: Gaussians, cameras: Sequence[Camera]
 ) -> Gaussians:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from gscompleter.errors import InputError
-from gscompleter.frames.fit import NO_FIT, FrameFit, frame_fit
+from gscompleter.frames.fit import FrameFit, frame_fit
 from gscompleter.frames.matching import photographs_of
 from gscompleter.frames.refinement import refined
 from gscompleter.frames.search import searched
-from gscompleter.frames.similarity import Matrix, moved_view
+from gscompleter.frames.similarity import Matrix, moved_view, pose_of, stand_apart
 from gscompleter.frames.trainers import Points, Poses, trainers_frames
-from gscompleter.frames.witnesses import have_baseline, rough_points
+from gscompleter.frames.witnesses import LONG_SIDE, rough_points
 from gscompleter.render import Renderer
 from gscompleter.types import Gaussians, View
 
@@ -23,7 +24,12 @@ CLEARLY = 2.0
 """dB by which a frame must fit better than a simpler one to take its place. A blurred splat in the
 right frame gains one from being a little smaller."""
 
-Method = Literal["given", "dataparser", "normalised", "similarity"]
+FAR_OFF = 2.0
+"""Pixels of drift in small photographs from which a user should know of it."""
+
+Method = Literal["given", "cameras", "dataparser", "normalised", "similarity"]
+Candidate = tuple[Method, Matrix]
+"""A transform from the photographs' frame to the splat's, and where it comes from."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,8 @@ class SplatFrame:
     """Where a splat lies relative to its photographs."""
 
     method: Method
-    """As given, by the trainer's own file, as a known trainer normalises, or by the images."""
+    """As given, by cameras or the transform that a trainer left, as a known trainer normalises,
+    or by the images."""
     transform: Matrix
     """From the frame of the photographs to that of the splat."""
     fit: FrameFit
@@ -42,12 +49,16 @@ class SplatFrame:
     def sentence(self) -> str:
         """What was found, for the user."""
         found = f"the photographs at {self.fit.psnr:.1f} dB ({self.given.psnr:.1f} dB as given)"
-        return {
-            "given": f"The splat fits the photographs as it is, at {self.fit.psnr:.1f} dB.",
-            "dataparser": f"The splat lies in the frame of dataparser_transforms.json: {found}.",
-            "normalised": f"The splat lies in the frame that its trainer normalised to: {found}.",
-            "similarity": f"The splat lies in another frame, which the images told: {found}.",
+        where = {
+            "given": f"The splat fits the photographs as it is, at {self.fit.psnr:.1f} dB",
+            "cameras": f"The splat lies in the frame of its trainer's list of cameras: {found}",
+            "dataparser": f"The splat lies in the frame of dataparser_transforms.json: {found}",
+            "normalised": f"The splat lies in the frame that its trainer normalised to: {found}",
+            "similarity": f"The splat lies in another frame, which the images told: {found}",
         }[self.method]
+        if not FAR_OFF < self.fit.drift < math.inf:
+            return f"{where}."
+        return f"{where}; but details are {self.fit.drift:.1f} px (of {LONG_SIDE}) off."
 
 
 @dataclass(frozen=True)
@@ -69,23 +80,29 @@ def find_frame(
     evidence: Evidence,
     poses: Poses,
     points: Points | None = None,
-    dataparser: Matrix | None = None,
+    left: Iterable[Candidate] = (),
 ) -> SplatFrame:
     """Where the splat lies, by how well it fits its photographs.
 
-    A frame gives way to one that is less simple only where that fits better by `CLEARLY`.
+    Frames are tried from the simplest on until one fits, and the first in which all is in place
+    ends the search. One that fits gives way only to one that fits better by `CLEARLY`.
 
     Args:
         poses: Of all photographs [n, 4, 4], camera-to-world.
         points: Sparse points in their frame, where there are some.
-        dataparser: What nerfstudio wrote beside the splat, where it did.
+        left: What the splat's trainer left word of.
 
     Raises:
         InputError: where no frame was found that fits.
     """
-    best = known_frame(evidence, poses, points, dataparser)
+    given = evidence.at(np.eye(4))
+    best = SplatFrame("given", np.eye(4), given, given)
+    if given.in_place:
+        return best
+    if not given.fits:
+        best = known_frame(evidence, best, candidates(poses, points, left))
     if best.fit.fits:
-        return polished(evidence, best)
+        return best if best.fit.in_place else polished(evidence, best)
     found = similarity_frame(evidence, points, best.given)
     if found is None:
         raise InputError(
@@ -97,28 +114,31 @@ def find_frame(
     return found
 
 
-def known_frame(
-    evidence: Evidence, poses: Poses, points: Points | None, dataparser: Matrix | None
-) -> SplatFrame:
-    """The best of the given frame and those of the trainers."""
-    given = evidence.at(np.eye(4))
-    best = SplatFrame("given", np.eye(4), given, given)
-    candidates: list[tuple[Method, Matrix]] = []
-    if dataparser is not None:
-        candidates.append(("dataparser", dataparser))
-    candidates += [("normalised", matrix) for _, matrix in trainers_frames(poses, points)]
-    for method, transform in candidates:
+def candidates(
+    poses: Poses, points: Points | None, left: Iterable[Candidate]
+) -> Iterator[Candidate]:
+    """Frames other than the given one that can be known without the images, simplest first."""
+    yield from left
+    for _, transform in trainers_frames(poses, points):
+        yield "normalised", transform
+
+
+def known_frame(evidence: Evidence, best: SplatFrame, others: Iterable[Candidate]) -> SplatFrame:
+    """`best`, or a clearly better one of `others`; the first in which all is in place."""
+    for method, transform in others:
         fit = evidence.at(transform)
         if better(fit, best.fit):
-            best = SplatFrame(method, transform, fit, given)
+            best = SplatFrame(method, transform, fit, best.given)
+        if best.fit.in_place:
+            break
     return best
 
 
 def better(fit: FrameFit, than: FrameFit) -> bool:
-    """Whether a fit is clearly the better one; one that shows nothing is none."""
-    if fit is NO_FIT or fit.covered < 0.5 * than.covered:
+    """Whether a fit is clearly the better one, and of not much less of the photographs."""
+    if not fit.fits or fit.covered < 0.5 * than.covered:
         return False
-    return fit.margin > than.margin + CLEARLY
+    return not than.fits or fit.margin > than.margin + CLEARLY
 
 
 def polished(evidence: Evidence, found: SplatFrame) -> SplatFrame:
@@ -138,13 +158,15 @@ def similarity_frame(
 ) -> SplatFrame | None:
     """The first similarity by which the splat shows what the photographs show; None without one."""
     scene, renderer = evidence.scene, evidence.renderer
-    if len(evidence.views) < 2 or not have_baseline(evidence.views):
+    if not stand_apart([pose_of(view.camera) for view in evidence.views]):
         return None
     photographs = photographs_of(evidence.views)
     place = rough_points(evidence.views) if points is None else points
     for start in searched(scene, photographs, place, renderer):
         transform = refined(scene, photographs, start, renderer)
-        fit = NO_FIT if transform is None else evidence.at(transform)
-        if transform is not None and fit.fits:
+        if transform is None:
+            continue
+        fit = evidence.at(transform)
+        if fit.fits:
             return SplatFrame("similarity", transform, fit, given)
     return None

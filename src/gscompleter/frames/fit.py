@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.coverage import COVERED
+from gscompleter.frames.drift import drift
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, Render, View
 
@@ -22,39 +23,86 @@ MIN_MARGIN = 3.0
 """dB above a flat image from which a render shows what the photograph shows: half of its
 variance is explained."""
 MIN_PSNR = 30.0
-"""dB from which even a flat photograph is shown as it is."""
+"""dB from which even a flat photograph, most of it covered, is shown as it is."""
+MAX_DRIFT = 0.25
+"""Pixels, of small photographs, up to which things are where they belong. A good splat in its
+frame has 0.1; one that is 0.5 % too large 0.5."""
+
+
+@dataclass(frozen=True)
+class ImageFit:
+    """How well the splat shows one photograph."""
+
+    psnr: float
+    """In dB over the covered pixels, after the exposures were evened out."""
+    margin: float
+    """How far that is above the best flat image, in dB."""
+    covered: float
+    """Share of the pixels that the splat covers."""
+    drift: float
+    """Pixels from where the splat shows corners to where the photograph does; infinity where
+    too few are recognised."""
+
+    @property
+    def shows(self) -> bool:
+        """Whether the splat shows what the photograph shows."""
+        flat = self.psnr >= MIN_PSNR and self.covered >= 0.5
+        return self.covered >= MIN_COVERED and (self.margin >= MIN_MARGIN or flat)
 
 
 @dataclass(frozen=True)
 class FrameFit:
-    """Of the better half of the photographs; a splat need not have been trained on all."""
+    """How well the splat shows photographs.
 
-    psnr: float
-    """Median in dB over the covered pixels, after the exposures were evened out."""
-    margin: float
-    """Median of how far that is above the best flat image, in dB."""
-    covered: float
-    """Median share of the pixels that the splat covers."""
+    Its figures are medians over the better half of those that see it, for a splat need not have
+    been trained on all.
+    """
+
+    images: tuple[ImageFit, ...]
 
     @property
     def fits(self) -> bool:
-        """Whether the splat shows what the photographs show."""
-        shown = self.margin >= MIN_MARGIN or self.psnr >= MIN_PSNR
-        return shown and self.covered >= MIN_COVERED
+        """Whether the splat shows what two of the photographs show, or the only one."""
+        shown = sum(image.shows for image in self.images)
+        return shown >= max(1, min(2, len(self.images)))
 
+    @property
+    def in_place(self) -> bool:
+        """Whether it fits, and shows things where the photographs do."""
+        return self.fits and self.drift <= MAX_DRIFT
 
-NO_FIT = FrameFit(0.0, 0.0, 0.0)
-"""Of a splat that no photograph shows."""
+    @property
+    def psnr(self) -> float:
+        """In dB; 0 where no photograph sees the splat."""
+        return self._middle("psnr", 0.0)
+
+    @property
+    def margin(self) -> float:
+        """In dB above the best flat image."""
+        return self._middle("margin", 0.0)
+
+    @property
+    def drift(self) -> float:
+        """In pixels; infinity where it is not known."""
+        return self._middle("drift", math.inf)
+
+    @property
+    def covered(self) -> float:
+        """Mean share of the pixels that the splat covers, over all photographs."""
+        return sum(image.covered for image in self.images) / max(len(self.images), 1)
+
+    def _middle(self, name: str, otherwise: float) -> float:
+        seen = [image for image in self.images if image.covered >= MIN_COVERED]
+        seen.sort(key=lambda image: image.margin, reverse=True)
+        values = sorted(getattr(image, name) for image in seen[: math.ceil(len(seen) / 2)])
+        return values[len(values) // 2] if values else otherwise
 
 
 def frame_fit(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> FrameFit:
     """How well `scene` fits the photographs at their cameras, which are in its frame."""
-    found = [compared(seen_from(scene, view.camera, renderer), view.image) for view in views]
-    found = sorted(found, key=lambda fit: fit.margin, reverse=True)[: math.ceil(len(views) / 2)]
-    middle = found[len(found) // 2] if found else NO_FIT
-    psnr = sorted(fit.psnr for fit in found)[len(found) // 2] if found else 0.0
-    covered = sorted(fit.covered for fit in found)[len(found) // 2] if found else 0.0
-    return FrameFit(psnr, middle.margin, covered)
+    return FrameFit(
+        tuple(compared(seen_from(scene, view.camera, renderer), view.image) for view in views)
+    )
 
 
 def seen_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
@@ -65,15 +113,19 @@ def seen_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
         return renderer.render(scene, replace(camera, near=0.1 * unit))
 
 
-def compared(render: Render, photograph: Float[Tensor, "h w 3"]) -> FrameFit:
+def compared(render: Render, photograph: Float[Tensor, "h w 3"]) -> ImageFit:
     """The fit of one image."""
     where = render.alpha >= COVERED
     covered = where.float().mean().item()
     if covered < MIN_COVERED:
-        return NO_FIT
-    drawn, truth = render.image[where].double(), photograph[where].double()
-    psnr = decibels((evened_out(drawn, truth) - truth).square().mean())
-    return FrameFit(psnr, psnr - decibels((truth - truth.mean()).square().mean()), covered)
+        return ImageFit(0.0, 0.0, covered, math.inf)
+    truth = photograph[where].double()
+    drawn = evened_out(render.image[where].double(), truth)
+    psnr = decibels((drawn - truth).square().mean())
+    margin = psnr - decibels((truth - truth.mean()).square().mean())
+    shown = photograph.double().index_put((where,), drawn)
+    before, after = (i.mean(dim=-1).cpu().numpy() for i in (shown, photograph.double()))
+    return ImageFit(psnr, margin, covered, drift(before, after, where.cpu().numpy()))
 
 
 def evened_out(drawn: Float[Tensor, "n 3"], truth: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

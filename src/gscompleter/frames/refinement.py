@@ -16,6 +16,7 @@ from gscompleter.frames.similarity import (
     pose_of,
     similarity,
     similarity_between,
+    stand_apart,
 )
 from gscompleter.render import Renderer
 from gscompleter.types import Gaussians
@@ -50,8 +51,7 @@ def refined(
 def similarity_of(found: Sequence[Located]) -> Matrix | None:
     """Photographs' frame to the splat's, by located photographs; None where they are too few."""
     before = [pose_of(place.photograph.camera) for place in found]
-    centers = np.array([pose[:3, 3] for pose in before]).reshape(-1, 3)
-    if len(found) < 2 or np.ptp(centers, axis=0).max() <= 1e-6 * np.abs(centers).max():
+    if not stand_apart(before):
         return None
     start = similarity_between(before, [place.pose for place in found])
     return reprojected(found, start) if np.linalg.det(start[:3, :3]) > 0 else None

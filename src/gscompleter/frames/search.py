@@ -32,9 +32,9 @@ def searched(
         points: On the surfaces of the scene, in the photographs' frame.
     """
     seer = photographs[len(photographs) // 2].camera
-    solid = scene.means[scene.opacities >= 0.5].detach().cpu().double().numpy()
-    if len(solid) == 0:
+    if len(scene) == 0:
         return
+    solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
     for transform in starts(pose_of(seer), middle_of(points), middle_of(solid)):
         found = located(scene, moved_camera(seer, transform), photographs, renderer)
         answer = similarity_of(found)

@@ -70,12 +70,18 @@ def pose_of(camera: Camera) -> Matrix:
     return camera.c2w.detach().cpu().double().numpy()
 
 
+def stand_apart(poses: Sequence[Matrix]) -> bool:
+    """Whether there are two cameras or more, not all in one place, so that they tell a scale."""
+    centers = np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
+    return len(poses) >= 2 and bool(np.ptp(centers, axis=0).max() > 1e-6 * np.abs(centers).max())
+
+
 def similarity_between(before: Sequence[Matrix], after: Sequence[Matrix]) -> Matrix:
     """The similarity that takes poses to others of the same cameras, where most of these are right.
 
     The rotation is the one closest to most, the scale the median over cameras of their median
     ratio of distances to others, the shift the median: a minority of wrong poses moves none far.
-    There are at least two poses, and not all of `before` stand in one place.
+    The poses of both stand apart (`stand_apart`).
     """
     turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
     closeness = np.einsum("iab,jab->ij", turns, turns)

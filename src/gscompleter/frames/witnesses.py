@@ -56,12 +56,6 @@ def usable_poses(photographs: Photographs) -> Poses:
     return told
 
 
-def have_baseline(views: Sequence[View]) -> bool:
-    """Whether the cameras stand apart, so that distances between them tell a scale."""
-    centers = torch.stack([view.camera.center for view in views])
-    return (centers - centers[0]).abs().max().item() > 1e-6 * centers.abs().max().item()
-
-
 def rough_points(views: Sequence[View]) -> Points:
     """About where the scene lies, for photographs without sparse points: a grid before each.
 
