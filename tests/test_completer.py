@@ -107,7 +107,7 @@ def test_the_hole_closes_and_the_picture_gets_better(config):
     (result,) = completion.targets
     truth = view_of(Room(), target).image
     assert result.hole_fraction > 0.1
-    assert hole_mask(result.after).float().mean() < 0.2 * result.hole_fraction
+    assert hole_mask(result.after.alpha).float().mean() < 0.2 * result.hole_fraction
     assert psnr(result.after.image, truth) > psnr(result.before.image, truth) + 3
 
 

@@ -29,8 +29,10 @@ CAMERA = camera_at(size=SIZE)
 def test_a_hole_is_where_the_scene_covers_less_than_half_of_the_pixel():
     alpha = torch.tensor([[0.0, 0.49, 0.5, 1.0]])
     render = Render(torch.zeros(1, 4, 3), torch.zeros(1, 4), alpha)
-    assert hole_mask(render).tolist() == [[True, True, False, False]]
-    assert hole_mask(render, HoleConfig(max_alpha=0.3)).tolist() == [[True, False, False, False]]
+    assert hole_mask(render.alpha).tolist() == [[True, True, False, False]]
+    assert hole_mask(render.alpha, HoleConfig(max_alpha=0.3)).tolist() == [
+        [True, False, False, False]
+    ]
 
 
 def test_dilation_grows_the_mask_by_its_radius_on_every_side():

@@ -194,13 +194,13 @@ def room_context(unit: float = 1.0) -> Gaussians:
 def completed(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> TargetCompletion:
     """A result that added `added` to `context`."""
     before = RENDERER.render(context, target)
-    mask = hole_mask(before)
+    mask = hole_mask(before.alpha)
     return TargetCompletion(target, before, before, mask, None, 0, False, DepthAffine(), added)
 
 
 def filling(context: Gaussians, factor: float = 1.0, dilation: int = 3) -> Gaussians:
     """The truth at the target in the dilated hole, its depths multiplied by `factor`."""
-    hole = dilate(hole_mask(RENDERER.render(context, TARGET)), dilation)
+    hole = dilate(hole_mask(RENDERER.render(context, TARGET).alpha), dilation)
     assert 0.05 < hole.double().mean() < 0.7
     view = view_of(Room(), TARGET)
     assert view.depth is not None

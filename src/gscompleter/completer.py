@@ -9,14 +9,14 @@ from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
-from gscompleter.geometry import same_camera, widened
+from gscompleter.geometry import project, same_camera, sample, widened
 from gscompleter.masks import dilate
 from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
@@ -38,12 +38,16 @@ from gscompleter.stages.integration import (
     keep_near_holes,
     refine_opacities,
     squared_error,
+    worth_their_harm,
 )
-from gscompleter.stages.registration import Registration, register
+from gscompleter.stages.registration import Registration, register, slide
+from gscompleter.stages.setting_aside import not_needed
+from gscompleter.stages.support import believed_alpha, front, gather_evidence, pixel_sums, support
 from gscompleter.types import (
     Camera,
     Completion,
     DepthAffine,
+    Evidence,
     Gaussians,
     Lift,
     Render,
@@ -56,6 +60,9 @@ from gscompleter.types import (
 
 MAX_TARGETS = 255
 """Provenance is a byte per Gaussian: 0 for observed, 1 to 255 for the targets."""
+
+MIN_COVER = 0.5
+"""Pixels of a hole that a Gaussian has to cover to stand in the way."""
 
 STAGES = ("context", "generate", "lift", "register", "integrate")
 """What a completion spends its time on."""
@@ -72,6 +79,14 @@ class Sight:
     frozen: FrozenView
     """The scene frozen at the wider camera."""
     anchor: AnchorChoice
+    believed: Float[Tensor, "h w"] | None = None
+    """Alpha at the wider camera as far as photographs support it; None where nothing is
+    doubted."""
+
+    @property
+    def alpha(self) -> Float[Tensor, "h w"]:
+        """What counts against holes, at the wider camera."""
+        return self.frozen.context.alpha if self.believed is None else self.believed
 
     @property
     def before(self) -> Render:
@@ -113,6 +128,7 @@ class GSCompleter:
         views: Sequence[View],
         target: Camera | Sequence[Camera],
         scene: Gaussians | None = None,
+        witnesses: Sequence[View] | None = None,
     ) -> Completion:
         """Complete what `views` never saw, as seen from `target`.
 
@@ -122,6 +138,9 @@ class GSCompleter:
                 generator that takes several at once is asked for their images before that).
             scene: Gaussians that are the context already, in the frame and unit of the cameras;
                 they are kept as they are. Without it Ψ reconstructs the context from `views`.
+            witnesses: The other photographs of `scene`, which may be small. Given them, it is
+                doubted where no photograph supports it, what nothing supports and nothing needs is
+                set aside, and none of them may get worse. Without them it is taken as it is.
 
         Raises:
             InputError: too few views, no baseline, too many targets, a scene nobody sees.
@@ -130,13 +149,18 @@ class GSCompleter:
         if not targets:
             raise InputError("No target camera was given; name at least one view to complete.")
         check_numbers(scene, len(targets))
-        completion = self.begin(views, scene)
+        completion = self.begin(views, scene, witnesses)
         at_once = as_generator(self.generator).at_once
         for start in range(0, len(targets), at_once):
             completion = self.advance_together(completion, targets[start : start + at_once])
         return completion
 
-    def begin(self, views: Sequence[View], scene: Gaussians | None = None) -> Completion:
+    def begin(
+        self,
+        views: Sequence[View],
+        scene: Gaussians | None = None,
+        witnesses: Sequence[View] | None = None,
+    ) -> Completion:
         """Stage 1: the scene and its photographs before any target, the arguments as in a call.
 
         Raises:
@@ -150,10 +174,16 @@ class GSCompleter:
         clock = Clock()
         with clock("context"):
             near, far = self.depth_range(views, scene)
-            views = tuple(replace(v, camera=replace(v.camera, near=near, far=far)) for v in views)
+            views = tuple(ranged(view, near, far) for view in views)
+            others = tuple(ranged(view, near, far) for view in witnesses or ())
             context = init_context(self.reconstructor, views) if scene is None else scene
-            allowed = self.allowed_errors(context, views)
-        return Completion(context, context, views, allowed, (), clock.seconds)
+            allowed = self.allowed_errors(context, (*views, *others))
+            evidence = None
+            if scene is not None and witnesses is not None:
+                evidence = self.evidence(scene, (*views, *others))
+        return Completion(
+            context, context, views, allowed, (), clock.seconds, others, evidence=evidence
+        )
 
     def advance(
         self, completion: Completion, target: Camera, reference: Synthesized | None = None
@@ -173,21 +203,25 @@ class GSCompleter:
         clock = Clock()
         with clock("context"):
             sight = self.sight(completion, target)
-        result = nothing_added(sight, self.hole_mask(sight.before))
+        result = nothing_added(sight, sight.window.crop(self.holes(sight)))
         reason = nothing_to_do(result, completion.views)
-        if reason is None:
-            result = self.completed(sight, result, reference, clock)
-        else:
-            result = replace(result, notes=(reason,))
-        return followed_by(completion, result, clock.seconds)
+        if reason is not None:
+            return followed_by(completion, replace(result, notes=(reason,)), clock.seconds)
+        with clock("context"):
+            sight = self.without_unsupported(sight)
+        result = self.completed(sight, result, reference, clock)
+        reached = sight.completion if len(result.added) else completion
+        return followed_by(reached, result, clock.seconds)
 
     def completed(
         self, sight: Sight, result: TargetCompletion, reference: Synthesized | None, clock: Clock
     ) -> TargetCompletion:
         """`result` once the four stages have done their work."""
-        scene, views, target = sight.completion.scene, sight.completion.views, sight.window.target
+        completion, target = sight.completion, sight.window.target
         with clock("generate"):
-            frozen_views = [self.renderer.freeze(scene, view.camera) for view in views]
+            frozen_views = [
+                self.renderer.freeze(completion.scene, view.camera) for view in completion.views
+            ]
             if reference is None:
                 (reference,) = self.synthesize([sight], contexts_of(frozen_views))
         with clock("lift"):
@@ -197,7 +231,7 @@ class GSCompleter:
         with clock("integrate"):
             kept = self.keep(sight, lifted, registration, frozen_views)
             added, losses = self.refine(sight, kept, reference, frozen_views)
-            after = self.renderer.render(merge([scene, added]), target)
+            after = self.renderer.render(merge([completion.scene, added]), target)
         return replace(
             result,
             after=after,
@@ -235,7 +269,9 @@ class GSCompleter:
         clock = Clock()
         with clock("context"):
             sights = [self.sight(completion, target) for target in targets]
-            results = [nothing_added(sight, self.hole_mask(sight.before)) for sight in sights]
+            results = [
+                nothing_added(sight, sight.window.crop(self.holes(sight))) for sight in sights
+            ]
             asked = [nothing_to_do(result, completion.views) is None for result in results]
             at_views = [self.renderer.render(completion.scene, v.camera) for v in completion.views]
         with clock("generate"):
@@ -250,7 +286,11 @@ class GSCompleter:
             (
                 sight.window.wide,
                 SceneContext(
-                    sight.completion.views, tuple(at_views), sight.frozen.context, max_alpha
+                    sight.completion.views,
+                    tuple(at_views),
+                    sight.frozen.context,
+                    max_alpha,
+                    sight.believed,
                 ),
             )
             for sight in sights
@@ -263,7 +303,7 @@ class GSCompleter:
         radius = self.config.holes.neighbourhood
         if radius is None:
             return lifted
-        return keep_near_holes(lifted, dilate(self.hole_mask(sight.frozen.context), radius))
+        return keep_near_holes(lifted, dilate(self.holes(sight), radius))
 
     def register(
         self,
@@ -293,19 +333,39 @@ class GSCompleter:
         frozen_views: Sequence[FrozenView],
     ) -> Gaussians:
         """Stage 4: what lies in the holes, where no photograph saw through it."""
-        mask = dilate(self.hole_mask(sight.frozen.context), self.config.holes.dilation)
-        wide = sight.window.wide
+        mask = dilate(self.holes(sight), self.config.holes.dilation)
+        wide, views = sight.window.wide, sight.completion.views
         kept, placed = respect_free_space(
-            keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide),
+            self.before_doubted(
+                keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide), sight
+            ),
             wide,
-            [view.camera for view in sight.completion.views],
-            contexts_of(frozen_views),
+            [view.camera for view in views],
+            [self.as_believed(sight, f, v) for f, v in zip(frozen_views, views, strict=True)],
             self.config.registration.footprint,
             self.config.free_space,
         )
         kept = kept[placed]
         number = torch.full_like(kept.generated, sight.completion.next_number)
         return replace(kept, generated=number)
+
+    def as_believed(self, sight: Sight, frozen: FrozenView, view: View) -> Render:
+        """The scene at a photograph, with alpha as far as photographs support it."""
+        drawn = frozen.context
+        believed = self.believed(sight.completion, drawn, view.camera)
+        return drawn if believed is None else replace(drawn, alpha=believed)
+
+    def before_doubted(self, kept: Gaussians, sight: Sight) -> Gaussians:
+        """`kept` before what is doubted at the target and stays, since photographs need it."""
+        if sight.believed is None or len(kept) == 0:
+            return kept
+        camera, scene = sight.window.wide, sight.completion.scene
+        nearest = front(scene, sight.frozen.context, camera, self.renderer)
+        pixels, z = project(kept.means, camera)
+        limit = sample(nearest[..., None], pixels, "nearest")[:, 0]
+        drawn = sample(sight.frozen.context.alpha[..., None], pixels, "nearest")[:, 0] > 0.1
+        ratio = torch.where(drawn & (limit > 0), (limit / z).clamp_max(1.0), 1.0)
+        return slide(kept, camera, ratio, self.config.registration.footprint)
 
     def refine(
         self,
@@ -316,6 +376,11 @@ class GSCompleter:
     ) -> tuple[Gaussians, tuple[float, ...]]:
         """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
+        watching = (*completion.views, *completion.witnesses)
+        others = [self.renderer.freeze(completion.scene, v.camera) for v in completion.witnesses]
+        frozen, allowed = (*frozen_views, *others), completion.allowed_errors
+        if completion.evidence is not None:
+            kept = worth_their_harm(kept, sight.frozen, reference, frozen, watching, allowed)
         nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
         refined, losses = refine_opacities(
             kept,
@@ -325,27 +390,71 @@ class GSCompleter:
             [completion.views[i] for i in nearest],
             config.refine,
         )
-        allowed = completion.allowed_errors
-        return do_no_harm(refined, frozen_views, completion.views, allowed, config.harm), losses
+        return do_no_harm(refined, frozen, watching, allowed, config.harm), losses
 
     def sight(self, completion: Completion, target: Camera) -> Sight:
         """The scene as it stands, frozen at the target's wider camera, and the target's anchor."""
         window = self.window(completion, target)
+        frozen = self.renderer.freeze(completion.scene, window.wide)
         return Sight(
             completion,
             window,
-            self.renderer.freeze(completion.scene, window.wide),
+            frozen,
             select_anchor(window.target, completion.views, self.config.anchor),
+            self.believed(completion, frozen.context, window.wide),
         )
+
+    def believed(self, completion: Completion, drawn: Render, camera: Camera) -> Tensor | None:
+        """The alpha [h, w] of the scene as it stands, as far as photographs support what `camera`
+        sees; None where nothing is doubted."""
+        if completion.evidence is None:
+            return None
+        values = self.support(completion, completion.evidence, camera)
+        return believed_alpha(drawn, completion.scene, values, camera, self.renderer)
+
+    def support(
+        self, completion: Completion, evidence: Evidence, camera: Camera
+    ) -> Float[Tensor, "n"]:
+        """Support of the scene as it stands, as `camera` sees it; what was added has it all."""
+        config = self.config.support
+        values = support(evidence, completion.context, camera, self.renderer, config)
+        if completion.set_aside is not None:
+            values = values[~completion.set_aside]
+        return torch.cat([values, values.new_ones(len(completion.added))])
+
+    def evidence(self, scene: Gaussians, views: Sequence[View]) -> Evidence | None:
+        """What the photographs show of a scene that was brought; None where nothing is doubted."""
+        if self.config.support.min_support is None:
+            return None
+        return gather_evidence(scene, views, self.renderer, self.config.support)
+
+    def without_unsupported(self, sight: Sight) -> Sight:
+        """`sight` once what covers its holes, and neither has support nor is needed, is set aside.
+
+        What is set aside leaves the scene, and is none of what the target is completed with.
+        """
+        completion, config = sight.completion, self.config.support
+        if completion.evidence is None or config.min_support is None or config.keep_unsupported:
+            return sight
+        camera, scene = sight.window.wide, completion.scene
+        in_holes = self.holes(sight)[..., None].float()
+        covering = pixel_sums(scene, camera, self.renderer, in_holes)[:, 0] > MIN_COVER
+        values = self.support(completion, completion.evidence, camera)
+        views = (*completion.views, *completion.witnesses)
+        doubtful = covering & (values < config.min_support)
+        if not doubtful.any():
+            return sight
+        taken = not_needed(scene, doubtful, views, self.renderer)
+        return self.sight(without(completion, taken), sight.window.target)
 
     def window(self, completion: Completion, target: Camera) -> Window:
         """The target and its wider camera, as wide as the generator can draw."""
         takes_margin = as_generator(self.generator).takes_margin
         return widened(completion.ranged(target), self.config.margin if takes_margin else 0.0)
 
-    def hole_mask(self, render: Render) -> Bool[Tensor, "h w"]:
-        """Where the scene has a hole, by the settings of this completer."""
-        return hole_mask(render, self.config.holes)
+    def holes(self, sight: Sight) -> Bool[Tensor, "h w"]:
+        """Where the scene has a hole at the wider camera, by the settings of this completer."""
+        return hole_mask(sight.alpha, self.config.holes)
 
     def depth_range(self, views: Sequence[View], scene: Gaussians | None) -> tuple[float, float]:
         """Near and far plane in scene units: as given, else estimated from what there is."""
@@ -362,6 +471,22 @@ class GSCompleter:
             error_with_loss(squared_error(image, view.image).item(), tolerance)
             for image, view in zip(renders, views, strict=True)
         )
+
+
+def ranged(view: View, near: float, far: float) -> View:
+    """`view` with a depth range."""
+    return replace(view, camera=replace(view.camera, near=near, far=far))
+
+
+def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:
+    """`completion` with more of its context set aside: `taken` of the Gaussians of its scene."""
+    num_kept = completion.num_kept
+    aside = torch.zeros(len(completion.context), dtype=torch.bool, device=taken.device)
+    if completion.set_aside is not None:
+        aside = completion.set_aside
+    rows = torch.nonzero(~aside)[:, 0][taken[:num_kept]]
+    aside = aside.index_fill(0, rows, True)
+    return replace(completion, scene=completion.scene[~taken], set_aside=aside)
 
 
 def check_numbers(scene: Gaussians | None, num_targets: int) -> None:

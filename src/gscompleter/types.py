@@ -255,11 +255,15 @@ class SceneContext:
     """The context scene rendered at the target camera."""
     max_alpha: float = COVERED
     """A pixel of the target that the scene covers by less is a hole."""
+    believed: Float[Tensor, "h w"] | None = None
+    """The alpha of the scene at the target as far as photographs support it; None where it is not
+    doubted."""
 
     @property
     def holes(self) -> Bool[Tensor, "h w"]:
         """Where the scene has a hole at the target, which is for Φ to fill."""
-        return self.at_target.alpha < self.max_alpha
+        alpha = self.at_target.alpha if self.believed is None else self.believed
+        return alpha < self.max_alpha
 
 
 @dataclass(frozen=True)
@@ -317,6 +321,18 @@ class TargetCompletion:
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """What k photographs show of each of the n Gaussians of a scene that was brought."""
+
+    centers: Float[Tensor, "k 3"]
+    """Where the photographs were taken, in world coordinates."""
+    areas: Float[Tensor, "n k"]
+    """How much of each Gaussian each photograph shows, in squared scene units."""
+    agreement: Float[Tensor, "n k"]
+    """How far the scene looks there as the photograph does, in [0, 1]; 0 where it shows nothing."""
+
+
+@dataclass(frozen=True)
 class Completion:
     """A scene on its way to completion: what `GSCompleter` begins with and what a step leads to.
 
@@ -324,22 +340,36 @@ class Completion:
     """
 
     scene: Gaussians
-    """The context, bit for bit as it was, followed by everything that was added."""
+    """The context, bit for bit as it was, without what was set aside, followed by everything that
+    was added."""
     context: Gaussians
     """The scene before its first target."""
     views: tuple[View, ...]
     """The photographs, with the depth range that the completion works in."""
     allowed_errors: tuple[float, ...]
-    """Largest mean squared error that each photograph may have, whatever is added."""
+    """Largest mean squared error that each photograph may have, whatever is added: of `views`, then
+    of `witnesses`."""
     targets: tuple[TargetCompletion, ...]
     """What happened so far, in the order of the targets."""
     seconds: Mapping[str, float]
     """Wall time of context, generate, lift, register, integrate and total."""
+    witnesses: tuple[View, ...] = ()
+    """Other photographs of the scene: none of them may get worse either."""
+    evidence: Evidence | None = None
+    """What `views` and `witnesses` show of the context; None where a context is not doubted."""
+    set_aside: Bool[Tensor, "n"] | None = None
+    """Which Gaussians of the context nothing supports and nothing needs, so that the scene is
+    without them; None for none."""
+
+    @property
+    def num_kept(self) -> int:
+        """How many Gaussians of the context the scene begins with."""
+        return len(self.context) - (0 if self.set_aside is None else int(self.set_aside.sum()))
 
     @property
     def added(self) -> Gaussians:
         """The generated Gaussians of all targets."""
-        return self.scene[len(self.context) :]
+        return self.scene[self.num_kept :]
 
     @property
     def next_number(self) -> int:

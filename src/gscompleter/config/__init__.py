@@ -98,6 +98,24 @@ class HoleConfig(Settings):
 
 
 @dataclass(frozen=True)
+class SupportConfig(Settings):
+    """What is doubted of a scene that was brought. Of one that Ψ made of the photographs nothing
+    is."""
+
+    min_support: Share | None = 0.5
+    """Support by the photographs under which a Gaussian counts as none when holes are looked for.
+    None doubts nothing, as in the paper."""
+    max_difference: Annotated[float, Interval(gt=0, le=1)] = 0.08
+    """Difference of colour, in [0, 1], from a photograph at which the scene's agreement with it has
+    fallen to 1/e. Where the whole scene is less exact, it grows in proportion."""
+    max_turn: Annotated[float, Interval(gt=0, le=180)] = 20.0
+    """Degrees between the rays of a photograph and of a camera at which what the photograph says
+    has fallen to 1/e. What it saw of a surface says less of how it looks from the side."""
+    keep_unsupported: bool = False
+    """Leave Gaussians that nothing supports where they are, and only add to them."""
+
+
+@dataclass(frozen=True)
 class RefineConfig(Settings):
     iterations: Count = 10
     """Steps of Adam; 0 leaves the opacities as they were lifted (the paper's ablation w/o MV)."""
@@ -135,6 +153,8 @@ class CompleterConfig(Settings):
     """How candidates keep out of space that photographs saw through."""
     holes: HoleConfig = HoleConfig()
     """What counts as a hole."""
+    support: SupportConfig = SupportConfig()
+    """What counts as no hole only as far as photographs support it."""
     refine: RefineConfig = RefineConfig()
     """How the opacities of the added Gaussians are refined."""
     harm: HarmConfig = HarmConfig()
@@ -164,6 +184,7 @@ class CompleterConfig(Settings):
             refine=RefineConfig(iterations=30, learning_rate=0.08),
             holes=HoleConfig(neighbourhood=None),
             harm=HarmConfig(tolerance=None),
+            support=SupportConfig(min_support=None),
         )
 
 

@@ -19,6 +19,9 @@ DEPTH_TOLERANCE = 0.03
 relative to the depth, at which the weight of the photograph has fallen to 1/e."""
 SHARPNESS = 4.0
 """Power of the weights: larger ones prefer the nearest photograph to the average."""
+SHOWN = 1.0
+"""Weight of a photograph, before that power, from which it shows a surface whose colour in the scene
+is not believed: as much as one that looks at it from a right angle aside, at its depth."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,8 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
     """Colours of all photographs at the surfaces that the target sees.
 
     A photograph counts where the scene, seen from its camera, lies at the depth of the surface:
-    elsewhere something stands before it. What no photograph shows keeps the colour of the render.
+    elsewhere something stands before it. What no photograph shows keeps the colour of the render,
+    where this is believed; where it is not, a hole remains unless a photograph shows the surface.
     All are brought to the exposure of `nearest`.
     """
     scene = context.at_target
@@ -70,6 +74,8 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
     rendered = scene.image / scene.alpha.clamp_min(context.max_alpha)[..., None]
     trust = (total / (total + 1e-4))[..., None]
     image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
+    if context.believed is not None:
+        known = known | ((scene.alpha >= context.max_alpha) & (total > SHOWN**SHARPNESS))
     return Warped(image.clamp(0, 1), known, scene.depth, tuple(factors))
 
 

@@ -115,7 +115,7 @@ def score(
     target = truth.target
     was = renderer.render(before, target.camera)
     now = renderer.render(after, target.camera)
-    holes, covered = hole_mask(was), now.depth_map().valid
+    holes, covered = hole_mask(was.alpha), now.depth_map().valid
     context = _drawn(before, after, truth.views, renderer)
     beside = _drawn(before, after, truth.neighbours, renderer)
     scores = Scores(
