@@ -67,5 +67,6 @@ def _head(file: Path) -> bytes:
 def _is_polycam(path: Path) -> bool:
     """Whether it is a folder of Polycam's raw data, or that of the keyframes in it."""
     homes = (path / home / kind for home in ("", "keyframes") for kind in POLYCAM_CAMERAS)
-    cameras = (file for home in homes for file in sorted(home.glob("*.json"))[:1])
+    found = (sorted(home.glob("*.json"))[:1] for home in homes if os.path.isdir(home))
+    cameras = (file for files in found for file in files)
     return any(b'"t_00"' in _head(file) for file in cameras)

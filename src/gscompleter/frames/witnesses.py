@@ -31,21 +31,13 @@ def witnesses(photographs: Photographs, frames: Sequence[int]) -> list[View]:
     named = list(frames)[: COUNT // 2]
     spread = np.linspace(0, len(photographs) - 1, COUNT).round().astype(int).tolist()
     others = [frame for frame in dict.fromkeys(spread) if frame not in named]
-    views = [small_view(photographs, frame) for frame in named]
+    views = photographs.views(named, LONG_SIDE)
     for frame in others[: COUNT - len(views)]:
         try:
-            views.append(small_view(photographs, frame))
+            views += photographs.views([frame], LONG_SIDE)
         except InputError:
             continue
     return views
-
-
-def small_view(photographs: Photographs, frame: int) -> View:
-    """A photograph whose long side is at most `LONG_SIDE`."""
-    camera = photographs.camera(frame)
-    shrink = min(1.0, LONG_SIDE / max(camera.width, camera.height))
-    size = round(camera.height * shrink), round(camera.width * shrink)
-    return photographs.views([frame], (max(size[0], 1), max(size[1], 1)))[0]
 
 
 def usable_poses(photographs: Photographs) -> Poses:
