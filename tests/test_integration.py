@@ -18,7 +18,7 @@ from gscompleter.stages.integration import (
     refine_opacities,
     squared_error,
 )
-from gscompleter.types import Render, View
+from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 48
@@ -28,11 +28,8 @@ CAMERA = camera_at(size=SIZE)
 
 def test_a_hole_is_where_the_scene_covers_less_than_half_of_the_pixel():
     alpha = torch.tensor([[0.0, 0.49, 0.5, 1.0]])
-    render = Render(torch.zeros(1, 4, 3), torch.zeros(1, 4), alpha)
-    assert hole_mask(render.alpha).tolist() == [[True, True, False, False]]
-    assert hole_mask(render.alpha, HoleConfig(max_alpha=0.3)).tolist() == [
-        [True, False, False, False]
-    ]
+    assert hole_mask(alpha).tolist() == [[True, True, False, False]]
+    assert hole_mask(alpha, HoleConfig(max_alpha=0.3)).tolist() == [[True, False, False, False]]
 
 
 def test_dilation_grows_the_mask_by_its_radius_on_every_side():

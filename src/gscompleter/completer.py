@@ -441,7 +441,7 @@ class GSCompleter:
         covering = pixel_sums(scene, camera, self.renderer, in_holes)[:, 0] > MIN_COVER
         values = self.support(completion, completion.evidence, camera)
         views = (*completion.views, *completion.witnesses)
-        doubtful = covering & (values < config.min_support)
+        doubtful = covering & (values < config.min_support) & (scene.generated == 0)
         if not doubtful.any():
             return sight
         taken = not_needed(scene, doubtful, views, self.renderer)
@@ -515,6 +515,7 @@ def nothing_added(sight: Sight, holes: Bool[Tensor, "h w"]) -> TargetCompletion:
         anchor_fallback=sight.anchor.fallback,
         affine=DepthAffine(),
         added=sight.completion.scene[:0],
+        support=None if sight.believed is None else sight.window.crop(sight.believed),
     )
 
 

@@ -314,6 +314,9 @@ class TargetCompletion:
     """Loss per iteration of the two optimisations, `register` and `refine`."""
     notes: tuple[str, ...] = ()
     """Fallbacks that were taken, a sentence each."""
+    support: Float[Tensor, "h w"] | None = None
+    """How far photographs supported what the target saw of a scene that was brought, in [0, 1];
+    None where it was not doubted."""
 
     @property
     def hole_fraction(self) -> float:

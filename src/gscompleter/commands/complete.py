@@ -25,6 +25,7 @@ from gscompleter.commands.opening import (
 from gscompleter.commands.options import CompleteOptions
 from gscompleter.commands.understood import understood
 from gscompleter.completer import Clock, GSCompleter, total
+from gscompleter.config import CompleterConfig
 from gscompleter.generators import load_generator
 from gscompleter.io.files import SUMMARY, check_output, output_folder
 from gscompleter.progress import shown_on
@@ -67,7 +68,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     with output_folder(options.out, overwrite) as folder:
         with shown_on(None if options.quiet else console):
             cameras = [target.camera.to(device) for target in task.targets]
-            completion = completer(task.views, cameras, task.scene)
+            completion = completer(task.views, cameras, task.scene, task.witnesses)
         completion = replace(completion, seconds=total(completion.seconds, before))
         said = said_in_advance(options, opened, task, device)
         summary = write_report(
@@ -146,9 +147,17 @@ def completer_for(options: CompleteOptions, targets: Sequence[Target], device: s
         load_reconstructor(options.reconstructor, options.weights, device),
         load_generator(generator.name, options.seed, photographs, device, generator.settings()),
         load_renderer(device),
-        options.config,
+        stages_of(options),
         options.seed,
     )
+
+
+def stages_of(options: CompleteOptions) -> CompleterConfig:
+    """The settings of the stages, with what has an option of its own."""
+    if not options.keep_unsupported:
+        return options.config
+    support = replace(options.config.support, keep_unsupported=True)
+    return replace(options.config, support=support)
 
 
 def settings_of(options: CompleteOptions) -> dict[str, Any]:
@@ -166,7 +175,7 @@ def settings_of(options: CompleteOptions) -> dict[str, Any]:
         "resolution": options.resolution,
         "near": options.near,
         "far": options.far,
-        "config": asdict(options.config),
+        "config": asdict(stages_of(options)),
     }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -49,6 +50,8 @@ CHOSEN, CHOSEN_WITH_SCENE = 3, 8
 with the square of their number, and to keep an eye on a scene that was brought."""
 WITNESSES, WITNESS_SIDE = 6, 320
 """Photographs that tell how far away things are where nobody says, and their longer side."""
+MAX_WITNESSES = 40
+"""Photographs, besides the context, that tell what of a scene is supported."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,8 @@ class Task:
     """How the frame was found."""
     said: str = "the frame of the photographs"
     """The same, for the user."""
+    witnesses: Sequence[View] | None = None
+    """The other photographs of `scene`, small: they tell what of it is supported."""
 
 
 def open_scene(options: CompleteOptions, console: Console) -> Opened:
@@ -155,7 +160,23 @@ def in_frame_of_splat(task: Task, path: Path, options: CompleteOptions, opened: 
         brought=Brought(path, rows_kept(path) if options.drop_nonfinite else None),
         method=found.method,
         said=found.sentence(),
+        witnesses=[moved_view(v, found.transform) for v in witnesses_of(task, given)],
     )
+
+
+def witnesses_of(task: Task, given: Photographs) -> list[View]:
+    """The photographs that are neither context nor target, those closest to the targets; none of
+    them that cannot be read."""
+    taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
+    others = [frame for frame in range(len(given)) if frame not in taken]
+    cameras = usable_cameras(given, others, WITNESS_SIDE)
+    centers = torch.stack([target.camera.center for target in task.targets])
+    remoteness = {f: (centers - c.center).norm(dim=-1).min().item() for f, c in cameras.items()}
+    views = []
+    for frame in sorted(sorted(cameras, key=remoteness.__getitem__)[:MAX_WITNESSES]):
+        with suppress(InputError):
+            views += given.views([frame], WITNESS_SIDE)
+    return [view.to(task.views[0].image.device) for view in views]
 
 
 def rows_kept(path: Path) -> Bool[Tensor, "n"] | None:

@@ -79,6 +79,8 @@ class CompleteOptions(ModelOptions):
     scene: Path | None = None
     """A file of Gaussians to complete, which is kept as it is. Without it the context is
     reconstructed from the photographs."""
+    keep_unsupported: bool = False
+    """Never set Gaussians of the scene aside that no photograph supports."""
     resolution: Size = LONG_SIDE
     """Height and width to work at: photographs are scaled to cover it and cropped around the
     centre. One number is the most pixels of the longer side, to which larger photographs are

@@ -20,8 +20,8 @@ relative to the depth, at which the weight of the photograph has fallen to 1/e."
 SHARPNESS = 4.0
 """Power of the weights: larger ones prefer the nearest photograph to the average."""
 SHOWN = 1.0
-"""Weight of a photograph, before that power, from which it shows a surface whose colour in the scene
-is not believed: as much as one that looks at it from a right angle aside, at its depth."""
+"""Weight of a photograph, before that power, from which it shows a surface whose colour in the
+scene is not believed: as much as one at its depth that looks from a radian aside."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ from gscompleter.io.ply import save_ply
 from gscompleter.metrics.image import psnr, ssim
 from gscompleter.render import Renderer
 from gscompleter.splats.layout import save_like
+from gscompleter.splats.removed import NAME as REMOVED
+from gscompleter.splats.removed import save_removed
 from gscompleter.types import Camera, Completion, TargetCompletion
 
 
@@ -104,7 +106,11 @@ def summarize(
                 targets, completion.targets, target_images, strict=True
             )
         ],
-        "gaussians": {"context": len(completion.context), "added": len(completion.added)},
+        "gaussians": {
+            "context": len(completion.context),
+            "added": len(completion.added),
+            "removed": len(completion.context) - completion.num_kept,
+        },
         "seconds": dict(completion.seconds),
     }
 
@@ -140,7 +146,7 @@ def write_report(
     if brought is None:
         save_ply(folder / "completed.ply", completion.scene, provenance=True)
     else:
-        save_like(folder / "completed.ply", completion.scene, brought.path, brought.kept)
+        save_brought(folder, completion, brought)
     save_ply(folder / "generated.ply", completion.added, provenance=True)
     (folder / "images").mkdir()
     for number, (result, images) in enumerate(zip(completion.targets, target_images, strict=True)):
@@ -150,9 +156,26 @@ def write_report(
     return summary
 
 
+def save_brought(folder: Path, completion: Completion, brought: Brought) -> None:
+    """Write `completed.ply` in the layout of the file that was brought, and what was set aside."""
+    aside, kept = completion.set_aside, brought.kept
+    if aside is None or not aside.any():
+        save_like(folder / "completed.ply", completion.scene, brought.path, kept)
+        return
+    rows = torch.nonzero(aside.cpu())[:, 0]
+    removed = completion.context[aside].to("cpu")
+    save_removed(folder / REMOVED, removed, rows, brought.path, kept)
+    stays = ~aside.cpu()
+    if kept is not None:
+        stays = torch.zeros_like(kept).masked_scatter(kept, stays)
+    save_like(folder / "completed.ply", completion.scene, brought.path, stays)
+
+
 def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:
     """The pictures of one target by name: colour [h, w, 3], or a mask [h, w]."""
     found = {"before": images.before, "after": images.after, "hole_mask": result.hole_mask.float()}
+    if result.support is not None:
+        found["support"] = result.support
     if result.reference is not None:
         found["reference"] = result.reference.image
     if images.truth is not None:

@@ -67,6 +67,16 @@ def read_layout(path: Path) -> Layout | None:
         return Layout(header, byte_order, vertex, rows, file.read())
 
 
+def given_layout(given: Path | None) -> Layout | None:
+    """The layout of the file that a scene was read from, where it is a .ply that has one.
+
+    Raises:
+        InputError: where its header is broken.
+    """
+    is_ply = given is not None and given.name.lower().endswith(".ply")
+    return read_layout(given) if given is not None and is_ply else None
+
+
 def write_layout(path: Path, layout: Layout) -> None:
     """Write the file, its header with the count of the rows that are there.
 
@@ -126,7 +136,7 @@ def save_like(
         InputError: where `given` cannot be read or the file cannot be written.
     """
     scene = scene.to("cpu")
-    layout = read_layout(given) if given.name.lower().endswith(".ply") else None
+    layout = given_layout(given)
     if layout is None or not _can_hold(layout, scene):
         save_ply(path, scene, provenance=True)
         return

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,26 +18,41 @@ from torch import Tensor
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
 from gscompleter.io.ply import load_ply, read_header, save_ply
+from gscompleter.splats.layout import given_layout, write_layout
 from gscompleter.types import Gaussians, merge
 
 NAME = "removed.ply"
 """How the file is called, beside the completed scene."""
 
 
-def save_removed(path: Path, removed: Gaussians, rows: Int[Tensor, "n"]) -> None:
+def save_removed(
+    path: Path,
+    removed: Gaussians,
+    rows: Int[Tensor, "n"],
+    given: Path | None = None,
+    kept: Bool[Tensor, "m"] | None = None,
+) -> None:
     """Write Gaussians that were set aside.
 
     Args:
         path: The file.
         removed: The Gaussians.
         rows: Their numbers in the scene as it was given, from 0, ascending.
+        given: The file that the scene was read from. Of a binary .ply the rows are taken as they
+            are, with all of their properties.
+        kept: Which rows of `given` the scene has; all if left out.
 
     Raises:
-        InputError: where the file cannot be written.
+        InputError: where `given` cannot be read or the file cannot be written.
     """
+    layout = given_layout(given)
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / NAME
-        save_ply(plain, removed)
+        if layout is None:
+            save_ply(plain, removed)
+        else:
+            all_rows = layout.rows if kept is None else layout.rows[kept.numpy()]
+            write_layout(plain, replace(layout, rows=all_rows[rows.numpy()], behind=b""))
         head, end, vertices = plain.read_bytes().partition(b"end_header\n")
     place = f"element place {len(rows)}\nproperty uint row\n".encode()
     with replacing(path) as file:

@@ -76,4 +76,6 @@ def file_as_given(path: Path, given: Gaussians) -> Layout | None:
     if not place.is_file():
         return layout
     others = read_layout(place)
-    return None if others is None else with_rows(layout, others, load_removed(place)[1])
+    if others is None:
+        return None
+    return with_rows(layout, unlabelled(others), load_removed(place)[1])

@@ -1,0 +1,193 @@
+"""A scene that was brought, opaque everywhere: what no photograph supports is a hole."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from command import run
+from gscompleter.completer import GSCompleter
+from gscompleter.config import CompleterConfig, SupportConfig
+from gscompleter.geometry import inside, project
+from gscompleter.io.ply import load_ply, save_ply
+from gscompleter.metrics.image import psnr
+from gscompleter.render import load_renderer
+from gscompleter.stages.integration import squared_error, worth_their_harm
+from gscompleter.stages.setting_aside import not_needed
+from gscompleter.stages.support import gather_evidence, pixel_sums, support
+from gscompleter.types import merge, sh_from_rgb
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
+
+RENDERER = load_renderer("cpu")
+SIZE = 64
+PHOTOGRAPHS = [camera_at(x, size=SIZE) for x in (-0.3, 0.0, 0.3)]
+TARGET = camera_at(0.5, yaw=25, size=SIZE)
+VIEWS = [view_of(Room(), camera) for camera in PHOTOGRAPHS]
+SURFACES = merge([gaussians_of(view) for view in (VIEWS[0], VIEWS[2])])
+
+
+def shreds():
+    """Gaussians before the target, in colours of nothing, where no photograph looks."""
+    view = view_of(Room(), TARGET)
+    found = gaussians_of(view, 0.8 * view.depth)
+    seen = [inside(*project(found.means, camera), camera) for camera in PHOTOGRAPHS]
+    found = found[~torch.stack(seen).any(0)]
+    colours = torch.rand(len(found), 3, generator=torch.Generator().manual_seed(0))
+    return replace(found, sh=sh_from_rgb(colours))
+
+
+SHREDS = shreds()
+SCENE = merge([SURFACES, SHREDS])
+ARE_SHREDS = torch.arange(len(SCENE)) >= len(SURFACES)
+
+
+class KnowingReconstructor:
+    def __call__(self, views):
+        from gscompleter.types import DepthMap, Reconstruction
+
+        depths = [view_of(Room(), view.camera).depth for view in views]
+        parts = [gaussians_of(v, d) for v, d in zip(views, depths, strict=True)]
+        return Reconstruction(
+            merge(parts),
+            tuple(DepthMap(d, torch.ones_like(d, dtype=torch.bool)) for d in depths),
+            torch.cat([torch.full((d.numel(),), i) for i, d in enumerate(depths)]),
+            torch.cat([torch.arange(d.numel()) for d in depths]),
+        )
+
+
+def error_of(scene, view):
+    return squared_error(RENDERER.render(scene, view.camera).image, view.image).item()
+
+
+def knowing(config=CompleterConfig()):
+    paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
+    return GSCompleter(KnowingReconstructor(), paint, config=config)
+
+
+def test_surfaces_are_supported_and_shreds_are_not():
+    evidence = gather_evidence(SCENE, VIEWS, RENDERER, SupportConfig())
+    found = support(evidence, SCENE, TARGET, RENDERER)
+    drawn = pixel_sums(SCENE, TARGET, RENDERER, torch.ones(SIZE, SIZE, 1))[:, 0] > 0.1
+    assert found[drawn & ~ARE_SHREDS].median() > 0.8
+    # A few reach into the border of a photograph.
+    assert found[drawn & ARE_SHREDS].quantile(0.9) < 0.1
+
+
+@pytest.mark.parametrize("exposure", [0.8, 1.25])
+def test_another_exposure_is_no_contradiction(exposure):
+    views = [replace(VIEWS[0], image=(exposure * VIEWS[0].image).clamp(0, 1)), VIEWS[1], VIEWS[2]]
+    evidence = gather_evidence(SCENE, views, RENDERER, SupportConfig())
+    assert evidence.agreement[evidence.areas[:, 0] > 0, 0].median() > 0.8
+
+
+def test_a_photograph_of_something_else_contradicts():
+    image = VIEWS[1].image.clone()
+    image[:, : SIZE // 2] = 0.0
+    views = [VIEWS[0], replace(VIEWS[1], image=image), VIEWS[2]]
+    evidence = gather_evidence(SCENE, views, RENDERER, SupportConfig())
+    pixels, z = project(SCENE.means, PHOTOGRAPHS[1])
+    shown = (evidence.areas[:, 1] > 0) & inside(pixels, z, PHOTOGRAPHS[1])
+    left = pixels[:, 0] < SIZE // 2 - 4
+    right = pixels[:, 0] > SIZE // 2 + 4
+    assert evidence.agreement[shown & left, 1].mean() < 0.2
+    assert evidence.agreement[shown & right, 1].mean() > 0.6
+
+
+def test_sums_of_weights_make_up_the_alpha():
+    sums = pixel_sums(SCENE, TARGET, RENDERER, torch.ones(SIZE, SIZE, 1))[:, 0]
+    alpha = RENDERER.render(SCENE, TARGET).alpha.sum()
+    assert torch.isclose(sums.sum(), alpha, rtol=1e-3)
+
+
+def test_only_what_no_photograph_needs_is_set_aside():
+    doubtful = ARE_SHREDS.clone()
+    doubtful[1000:1100] = True
+    taken = not_needed(SCENE, doubtful, VIEWS, RENDERER)
+    assert taken[ARE_SHREDS].float().mean() > 0.8
+    assert not (taken & ~doubtful).any()
+    for view in VIEWS:
+        assert error_of(SCENE[~taken], view) <= error_of(SCENE, view) * (1 + 1e-6)
+
+
+def test_shreds_give_way_to_what_belongs_there():
+    completion = knowing()(VIEWS[::2], TARGET, SCENE, witnesses=VIEWS[1:2])
+    (result,) = completion.targets
+    truth = view_of(Room(), TARGET).image
+    assert result.hole_fraction > 0.1
+    assert psnr(result.after.image, truth) > psnr(result.before.image, truth) + 3
+    assert completion.set_aside is not None
+    assert completion.set_aside[ARE_SHREDS].float().mean() > 0.8
+    kept = completion.scene[: completion.num_kept]
+    assert torch.equal(kept.means, SCENE.means[~completion.set_aside])
+    for view in VIEWS:
+        before = psnr(RENDERER.render(SCENE, view.camera).image, view.image)
+        after = psnr(RENDERER.render(completion.scene, view.camera).image, view.image)
+        assert after > before - 0.05
+
+
+def test_without_its_photographs_a_scene_is_taken_as_it_is():
+    completion = knowing()(VIEWS[::2], TARGET, SCENE)
+    assert completion.set_aside is None
+    assert completion.evidence is None
+    assert completion.targets[0].hole_fraction < 0.05
+
+
+def test_unsupported_gaussians_may_be_kept():
+    config = CompleterConfig(support=SupportConfig(keep_unsupported=True))
+    completion = knowing(config)(VIEWS[::2], TARGET, SCENE, witnesses=())
+    assert completion.set_aside is None
+    assert torch.equal(completion.scene.means[: len(SCENE)], SCENE.means)
+
+
+def test_the_paper_doubts_nothing():
+    completion = knowing(CompleterConfig.paper())(VIEWS[::2], TARGET, SCENE, witnesses=())
+    assert completion.evidence is None
+
+
+def test_what_is_worth_its_harm_is_what_photographs_do_not_see():
+    view = view_of(Room(), TARGET)
+    hidden = gaussians_of(view)
+    seen = torch.stack([inside(*project(hidden.means, c), c) for c in PHOTOGRAPHS]).any(0)
+    # Before the photographs stands what is black in them.
+    depth = 0.5 * VIEWS[1].depth
+    before = replace(gaussians_of(VIEWS[1], depth), sh=sh_from_rgb(torch.zeros(SIZE * SIZE, 3)))
+    added = merge([hidden[~seen], before])
+    kept = worth_their_harm(
+        added,
+        RENDERER.freeze(SURFACES, TARGET),
+        view,
+        [RENDERER.freeze(SURFACES, v.camera) for v in VIEWS],
+        VIEWS,
+        [1.01 * error_of(SURFACES, v) for v in VIEWS],
+    )
+    wanted = int((~seen).sum())
+    assert len(kept) > 0.9 * wanted
+    assert torch.isin(kept.means[:, 0], hidden.means[~seen][:, 0]).float().mean() > 0.99
+
+
+def complete(scene, splat, out, *more):
+    asked = ["--context", "0", "2", "--target", "3", "--near", "0.5", "--far", "20"]
+    return ["complete", scene, "--scene", splat, *asked, "--out", out, "--quiet", *more]
+
+
+def test_the_command_sets_aside_and_strip_puts_back(tmp_path, monkeypatch):
+    scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
+    splat, out = tmp_path / "splat.ply", tmp_path / "out"
+    save_ply(splat, SCENE)
+    assert run(monkeypatch, *complete(scene, splat, out)) == 0
+    removed = load_ply(out / "removed.ply")
+    assert len(removed) > 0
+    assert (out / "images" / "target1_support.png").is_file()
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
+    assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()
+
+
+def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
+    scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
+    splat, out = tmp_path / "splat.ply", tmp_path / "out"
+    save_ply(splat, SCENE)
+    assert run(monkeypatch, *complete(scene, splat, out, "--keep-unsupported")) == 0
+    assert not (out / "removed.ply").exists()
+    assert torch.equal(load_ply(out / "completed.ply").means[: len(SCENE)], SCENE.means)
