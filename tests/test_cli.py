@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -230,6 +232,17 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
 def test_wrong_options_are_refused(scene, tmp_path, monkeypatch, capsys, more, sentence):
     out = tmp_path / "out"
     refused(monkeypatch, capsys, out, complete(scene, out, *more), sentence)
+
+
+def test_pillow_warns_of_no_damage_that_a_sentence_tells(
+    scene, tmp_path, monkeypatch, capsys, recwarn
+):
+    damaged = shutil.copytree(scene, tmp_path / "damaged")
+    description = struct.pack("<IHHHII", 8, 1, 270, 2, 10**6, 8)  # longer than the file
+    (damaged / "0.png").write_bytes(b"II*\0" + description + bytes(4))
+    out = tmp_path / "out"
+    refused(monkeypatch, capsys, out, complete(damaged, out), "0.png is not an image")
+    assert [warning.filename for warning in recwarn if "PIL" in warning.filename] == []
 
 
 @pytest.mark.parametrize("words", [(), ("compleat",), ("complete",), ("models", "--all"), ("--x",)])

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from command import run
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.origin import origin_of, told_from
 from gscompleter.errors import InputError
@@ -18,7 +19,7 @@ from gscompleter.frames.similarity import moved_pose, similarity
 from gscompleter.frames.thinning import thinned
 from gscompleter.frames.trainers import WORLDS
 from gscompleter.frames.witnesses import witnesses
-from gscompleter.io.ply import load_ply
+from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.render import load_renderer
 from gscompleter.splats.frames import moved
 from gscompleter.types import merge
@@ -67,6 +68,15 @@ def write_cameras(path, transform, room, count=4):
         entries.append({**name, **shape, "position": position, "rotation": rotation})
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(entries))
+
+
+def put_on_map(room, by):
+    """Add `by` to the places of all cameras."""
+    content = json.loads((room / "transforms.json").read_text())
+    for frame in content["frames"]:
+        for row in range(3):
+            frame["transform_matrix"][row][3] += by[row]
+    (room / "transforms.json").write_text(json.dumps(content))
 
 
 def write_dataparser(path, transform, scale=0.3):
@@ -133,11 +143,7 @@ def test_names_agree_without_ending_and_where_folders_repeat_them_with_folders()
 
 
 def test_a_remote_scene_takes_a_splat_in_a_frame_of_its_own(room, splat, tmp_path):
-    content = json.loads((room / "transforms.json").read_text())
-    for frame in content["frames"]:
-        for row in range(3):
-            frame["transform_matrix"][row][3] += UTM[row]
-    (room / "transforms.json").write_text(json.dumps(content))
+    put_on_map(room, UTM)
     origin = open_photographs(room).origin
     centred = in_frame(splat, similarity(1.0, np.eye(3), np.array([3.0, 0.0, 1.0])))
     assert not origin_of(centred, origin).any()
@@ -162,6 +168,27 @@ def test_a_splat_in_the_map_of_its_photographs_is_told_from_their_origin(splat):
     assert np.array_equal(origin_of(there, origin), origin)
     told = told_from(origin, there, CAMERAS)
     assert torch.allclose(told.means, splat.means, atol=1e-3)
+
+
+@pytest.mark.parametrize("place", [(3000.0, 1000.0, 0.0), (0.0, 0.0, 0.0)])
+def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
+    room, splat, place, tmp_path, monkeypatch, capsys
+):
+    put_on_map(room, (3000.0, 1000.0, 0.0))
+    here = similarity(1.0, np.eye(3), np.array(place)) @ ARBITRARY
+    to_splat = here @ similarity(1.0, np.eye(3), np.array((-3000.0, -1000.0, 0.0)))
+    write_cameras(tmp_path / "cameras.json", to_splat, room)
+    given, out = tmp_path / "splat.ply", tmp_path / "out"
+    save_ply(given, in_frame(splat, here))
+    words = ("--context", 0, 2, "--target", 1, "--resolution", 64, "--out", out)
+    assert run(monkeypatch, "complete", room, "--scene", given, *words) == 0
+    frame = json.loads((out / "summary.json").read_text())["frame"]
+    assert frame["method"] == "cameras"
+    moved_by = load_ply(given).means - load_ply(out / "context.ply").means
+    assert np.allclose(moved_by, frame["origin"], atol=1e-3)
+    assert any(frame["origin"]) == any(place)
+    told = f"the result is relative to {' '.join(map(str, frame['origin']))};"
+    assert (told in capsys.readouterr().out) == any(place)
 
 
 def test_floaters_kilometres_away_change_nothing(splat, room, tmp_path):

@@ -118,6 +118,13 @@ def test_a_splat_of_another_scene_is_refused(views):
         find(views, random_gaussians(300))
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_splat_that_is_one_point_is_refused(views):
+    scene = random_gaussians(300)
+    with pytest.raises(InputError, match="does not show what the photographs show"):
+        find(views, replace(scene, means=torch.zeros_like(scene.means)))
+
+
 def test_a_photograph_in_another_exposure_fits_as_well(views, splat):
     darker = [replace(view, image=0.7 * view.image + 0.1) for view in views]
     plain, even = (frame_fit(splat, some, RENDERER) for some in (views, darker))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass
@@ -61,6 +62,8 @@ def main() -> None:
         print(__version__)
         return
     treat_stops_alike()
+    # Pillow warns of damage in a photograph that is read all the same, or refused in a sentence.
+    warnings.filterwarnings("ignore", module="PIL")
     try:
         options = checked(parsed(words))
         _, module, function = COMMANDS[words[0]]

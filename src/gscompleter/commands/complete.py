@@ -98,7 +98,11 @@ def said_in_advance(
             "used": len(task.views),
             "splat": None if options.scene is None else str(options.scene),
         },
-        "frame": {"method": task.method, "transform": task.frame.tolist()},
+        "frame": {
+            "method": task.method,
+            "transform": task.frame.tolist(),
+            "origin": task.origin.tolist(),
+        },
         "depth_range": {"near": camera.near, "far": camera.far, "from": asdict(task.depths)},
     }
 
@@ -200,11 +204,11 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
     console.print(table)
     for note in notes:
         console.print(note)
-    offset = [-row[3] for row in summary["frame"]["transform"][:3]]
-    if summary["frame"]["method"] == "given" and any(offset):
+    origin = summary["frame"]["origin"]
+    if any(origin):
         console.print(
             f"The coordinates are large against the baselines, so the result is relative to "
-            f"{' '.join(map(str, offset))}; summary.json has the transform.",
+            f"{' '.join(map(str, origin))}; summary.json has the transform.",
             soft_wrap=True,
         )
     counts = summary["gaussians"]

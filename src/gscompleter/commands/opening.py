@@ -81,6 +81,9 @@ class Task:
     targets: Sequence[Target]
     frame: Float[np.ndarray, "4 4"]
     """From the frame of the photographs to that of the result."""
+    origin: Float[np.ndarray, "3"]
+    """Where the result is told from, in the coordinates of the photographs or of the splat's file;
+    zero where those are not remote."""
     depths: DepthSource
     scene: Gaussians | None = None
     """The splat that was brought; None where the context is reconstructed."""
@@ -134,7 +137,7 @@ def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
     check_sizes([*cameras, *(target.camera for target in targets)])
     views = [view.to(device) for view in ranged.views(frames, resolution)]
     targets = [with_photograph(target, ranged, resolution) for target in targets]
-    return Task(views, targets, frame_from_photographs(given.origin), depths)
+    return Task(views, targets, frame_from_photographs(given.origin), given.origin, depths)
 
 
 def in_frame_of_splat(task: Task, path: Path, options: CompleteOptions, opened: Opened) -> Task:
@@ -156,6 +159,7 @@ def in_frame_of_splat(task: Task, path: Path, options: CompleteOptions, opened: 
         views=[moved_view(view, found.transform) for view in task.views],
         targets=[replace(t, camera=moved_camera(t.camera, found.transform)) for t in task.targets],
         frame=found.transform @ task.frame,
+        origin=given.origin if found.method == "given" else origin,
         scene=scene,
         brought=Brought(path, rows_kept(path) if options.drop_nonfinite else None),
         method=found.method,

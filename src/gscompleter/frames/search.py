@@ -35,7 +35,10 @@ def searched(
     if len(scene) == 0:
         return
     solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
-    for transform in starts(pose_of(seer), middle_of(points), middle_of(solid)):
+    goal = middle_of(solid)
+    if goal[1] == 0:  # most of it is one point, which looks the same from everywhere
+        return
+    for transform in starts(pose_of(seer), middle_of(points), goal):
         found = located(scene, moved_camera(seer, transform), photographs, renderer)
         answer = similarity_of(found)
         if answer is not None:
