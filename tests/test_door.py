@@ -136,7 +136,7 @@ def test_a_splat_of_another_program_is_completed_in_its_own_layout(
     given = foreign(chosen[0] / "context.ply", tmp_path / "given.ply")
     for number, splat in enumerate((given, tmp_path / "out0" / "completed.ply")):
         out = tmp_path / f"out{number}"
-        more = ("--resolution", 48, "--quiet", "--scene", splat)
+        more = ("--resolution", 48, "--quiet", "--keep-unsupported", "--scene", splat)
         assert run(monkeypatch, *complete(scene, out, *more)) == 0
         names = plyfile.PlyData.read(str(out / "completed.ply"))["vertex"].data.dtype.names
         assert names == ("label", *plyfile_names(given)[1:], "generated")
@@ -158,7 +158,15 @@ def test_rows_that_were_dropped_stay_out_of_the_users_layout(scene, chosen, tmp_
     damaged.means[[2, 9]] = torch.nan
     save_ply(tmp_path / "ours.ply", damaged)
     given = foreign(tmp_path / "ours.ply", tmp_path / "given.ply")
-    more = ("--resolution", 48, "--quiet", "--scene", given, "--drop-nonfinite")
+    more = (
+        "--resolution",
+        48,
+        "--quiet",
+        "--scene",
+        given,
+        "--drop-nonfinite",
+        "--keep-unsupported",
+    )
     assert run(monkeypatch, *complete(scene, tmp_path / "out", *more)) == 0
     rows = plyfile.PlyData.read(str(tmp_path / "out" / "completed.ply"))["vertex"].data
     labels = rows["label"][rows["generated"] == 0].tolist()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+import plyfile
 import pytest
 import torch
 
@@ -191,3 +193,19 @@ def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
     assert run(monkeypatch, *complete(scene, splat, out, "--keep-unsupported")) == 0
     assert not (out / "removed.ply").exists()
     assert torch.equal(load_ply(out / "completed.ply").means[: len(SCENE)], SCENE.means)
+
+
+def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch):
+    scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
+    ours, splat, out = tmp_path / "ours.ply", tmp_path / "splat.ply", tmp_path / "out"
+    save_ply(ours, SCENE)
+    vertex = plyfile.PlyData.read(str(ours))["vertex"].data
+    rows = np.zeros(len(vertex), [("label", "<i4"), *vertex.dtype.descr])
+    for name in vertex.dtype.names:
+        rows[name] = vertex[name]
+    rows["label"] = np.arange(len(rows))
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(str(splat))
+    assert run(monkeypatch, *complete(scene, splat, out)) == 0
+    assert len(load_ply(out / "removed.ply")) > 0
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
+    assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()

@@ -33,6 +33,7 @@ from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
     do_no_harm,
     error_with_loss,
+    harmless,
     hole_mask,
     keep_in_holes,
     keep_near_holes,
@@ -390,6 +391,8 @@ class GSCompleter:
             [completion.views[i] for i in nearest],
             config.refine,
         )
+        if completion.evidence is not None and not harmless(refined, frozen, watching, allowed):
+            refined = kept
         return do_no_harm(refined, frozen, watching, allowed, config.harm), losses
 
     def sight(self, completion: Completion, target: Camera) -> Sight:

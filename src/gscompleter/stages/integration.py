@@ -129,11 +129,10 @@ def worth_their_harm(
     gain = -strangeness(frozen_target, reference.image, added, wrong)
     cost = torch.stack(costs).amax(dim=0).clamp_min(0.0)
     order = (gain / (cost + FREE)).argsort(descending=True, stable=True)
-    checks = list(zip(frozen_views, views, allowed_errors, strict=True))
     low, high = 0, len(added) + 1
     while high - low > max(len(added) // FINENESS, 1):
         middle = (low + high) // 2
-        if harmless(added[order[:middle]], checks):
+        if harmless(added[order[:middle]], frozen_views, views, allowed_errors):
             low = middle
         else:
             high = middle
@@ -169,11 +168,16 @@ def strangeness(
     return weight * colour.square().sum(-1) - 2 * mixed + square - was
 
 
-def harmless(added: Gaussians, checks: Sequence[tuple[FrozenView, View, float]]) -> bool:
+def harmless(
+    added: Gaussians,
+    frozen_views: Sequence[FrozenView],
+    views: Sequence[View],
+    allowed_errors: Sequence[float],
+) -> bool:
     """Whether no photograph is matched worse than allowed with `added` in the scene."""
     return all(
         squared_error(frozen.plan(added)(added.opacities).image, view.image).item() <= allowed
-        for frozen, view, allowed in checks
+        for frozen, view, allowed in zip(frozen_views, views, allowed_errors, strict=True)
     )
 
 
