@@ -43,7 +43,14 @@ from gscompleter.stages.integration import (
 )
 from gscompleter.stages.registration import Registration, register, slide
 from gscompleter.stages.setting_aside import not_needed
-from gscompleter.stages.support import believed_alpha, front, gather_evidence, pixel_sums, support
+from gscompleter.stages.support import (
+    believed_alpha,
+    front,
+    gather_evidence,
+    pixel_sums,
+    shown,
+    support,
+)
 from gscompleter.types import (
     Camera,
     Completion,
@@ -62,6 +69,8 @@ from gscompleter.types import (
 MAX_TARGETS = 255
 """Provenance is a byte per Gaussian: 0 for observed, 1 to 255 for the targets."""
 
+UNSEEN = 0.1
+"""Share of what the target sees of a Gaussian, below which no photograph shows it."""
 MIN_COVER = 0.5
 """Pixels of a hole that a Gaussian has to cover to stand in the way."""
 
@@ -432,19 +441,23 @@ class GSCompleter:
         return gather_evidence(scene, views, self.renderer, self.config.support)
 
     def without_unsupported(self, sight: Sight) -> Sight:
-        """`sight` once what covers its holes, and neither has support nor is needed, is set aside.
+        """`sight` once what covers its holes, and no photograph shows or needs, is set aside.
 
         What is set aside leaves the scene, and is none of what the target is completed with.
+        Without witnesses nothing is: what the context does not show, others may have shown.
         """
         completion, config = sight.completion, self.config.support
-        if completion.evidence is None or config.min_support is None or config.keep_unsupported:
+        if completion.evidence is None or not completion.witnesses or config.keep_unsupported:
             return sight
         camera, scene = sight.window.wide, completion.scene
         in_holes = self.holes(sight)[..., None].float()
         covering = pixel_sums(scene, camera, self.renderer, in_holes)[:, 0] > MIN_COVER
-        values = self.support(completion, completion.evidence, camera)
         views = (*completion.views, *completion.witnesses)
-        doubtful = covering & (values < config.min_support) & (scene.generated == 0)
+        unseen = shown(completion.evidence, completion.context, camera, self.renderer) < UNSEEN
+        if completion.set_aside is not None:
+            unseen = unseen[~completion.set_aside]
+        unseen = torch.cat([unseen, unseen.new_zeros(len(completion.added))])
+        doubtful = covering & unseen & (scene.generated == 0)
         if not doubtful.any():
             return sight
         taken = not_needed(scene, doubtful, views, self.renderer)

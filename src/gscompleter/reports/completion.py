@@ -106,13 +106,17 @@ def summarize(
                 targets, completion.targets, target_images, strict=True
             )
         ],
-        "gaussians": {
-            "context": len(completion.context),
-            "added": len(completion.added),
-            "removed": len(completion.context) - completion.num_kept,
-        },
+        "gaussians": counts(completion),
         "seconds": dict(completion.seconds),
     }
+
+
+def counts(completion: Completion) -> dict[str, int]:
+    """How many Gaussians were given and added and, of a scene that was doubted, set aside."""
+    given = len(completion.context)
+    found = {"context": given, "added": len(completion.added)}
+    doubted = completion.evidence is not None
+    return found | ({"removed": given - completion.num_kept} if doubted else {})
 
 
 def write_report(

@@ -86,9 +86,7 @@ def support(
         config: From how far aside a photograph still tells something.
     """
     rays = normalize(scene.means - camera.center, dim=-1)
-    layers = torch.ones((camera.height, camera.width, 1), device=rays.device)
-    needed = pixel_sums(scene, camera, renderer, layers)[:, 0] * pixel_areas(scene, camera)
-    agreeing, weights, largest = (torch.zeros_like(needed) for _ in range(3))
+    agreeing, weights = torch.zeros_like(rays[:, 0]), torch.zeros_like(rays[:, 0])
     for k, center in enumerate(evidence.centers):
         cosine = (normalize(scene.means - center, dim=-1) * rays).sum(-1).clamp(-1, 1)
         turn = torch.rad2deg(torch.acos(cosine))
@@ -96,9 +94,18 @@ def support(
         weight = area * (torch.exp(-((turn / config.max_turn) ** 2)) + LEAST)
         agreeing += weight * evidence.agreement[:, k]
         weights += weight
-        largest = torch.maximum(largest, area)
-    share = (largest / (ENOUGH * needed).clamp_min(1e-20)).clamp_max(1.0)
+    share = (shown(evidence, scene, camera, renderer) / ENOUGH).clamp_max(1.0)
     return share * agreeing / weights.clamp_min(1e-20)
+
+
+def shown(
+    evidence: Evidence, scene: Gaussians, camera: Camera, renderer: Renderer
+) -> Float[Tensor, "n"]:
+    """How much of each Gaussian the photograph that shows most of it shows, as a share of what
+    `camera` sees; large where it sees nothing."""
+    layers = torch.ones((camera.height, camera.width, 1), device=scene.means.device)
+    needed = pixel_sums(scene, camera, renderer, layers)[:, 0] * pixel_areas(scene, camera)
+    return evidence.areas.amax(dim=1) / needed.clamp_min(1e-20)
 
 
 def believed_alpha(
