@@ -11,12 +11,13 @@ import torch
 
 from command import run
 from gscompleter.completer import GSCompleter
-from gscompleter.config import CompleterConfig, SupportConfig
+from gscompleter.config import CompleterConfig, ReconcileConfig, SupportConfig
 from gscompleter.geometry import inside, project
 from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
-from gscompleter.stages.integration import squared_error, worth_their_harm
+from gscompleter.stages.integration import squared_error
+from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.support import gather_evidence, pixel_sums, support
 from gscompleter.types import merge, sh_from_rgb
@@ -148,25 +149,39 @@ def test_the_paper_doubts_nothing():
     assert completion.evidence is None
 
 
-def test_what_is_worth_its_harm_is_what_photographs_do_not_see():
+def test_what_is_added_is_fitted_to_all_photographs_at_once():
     view = view_of(Room(), TARGET)
     hidden = gaussians_of(view)
     seen = torch.stack([inside(*project(hidden.means, c), c) for c in PHOTOGRAPHS]).any(0)
     # Before the photographs stands what is black in them.
-    depth = 0.5 * VIEWS[1].depth
-    before = replace(gaussians_of(VIEWS[1], depth), sh=sh_from_rgb(torch.zeros(SIZE * SIZE, 3)))
-    added = merge([hidden[~seen], before])
-    kept = worth_their_harm(
-        added,
-        RENDERER.freeze(SURFACES, TARGET),
+    before = gaussians_of(VIEWS[1], 0.5 * VIEWS[1].depth)
+    black = replace(before, sh=sh_from_rgb(torch.zeros(SIZE * SIZE, 3)))
+    allowed = [error_of(SURFACES, v) for v in VIEWS]
+    target = RENDERER.freeze(SURFACES, TARGET)
+    holes = target.context.alpha < 0.5
+    added, losses = reconcile(
+        merge([hidden[~seen], black]),
+        target,
         view,
+        holes,
         [RENDERER.freeze(SURFACES, v.camera) for v in VIEWS],
         VIEWS,
-        [1.01 * error_of(SURFACES, v) for v in VIEWS],
+        allowed,
     )
-    wanted = int((~seen).sum())
-    assert len(kept) > 0.9 * wanted
-    assert torch.isin(kept.means[:, 0], hidden.means[~seen][:, 0]).float().mean() > 0.99
+    scene = merge([SURFACES, added])
+    for photograph, error in zip(VIEWS, allowed, strict=True):
+        assert error_of(scene, photograph) < 1.01 * error
+    assert hole_error(RENDERER.render(scene, TARGET), view, holes) < 0.1 * hole_error(
+        target.context, view, holes
+    )
+    assert len(losses) == ReconcileConfig().iterations
+
+
+def test_photographs_take_turns_and_the_worst_of_them_more_often():
+    turns = Turns([0.0, 0.0, 5.0, 0.0, 0.0])
+    asked = [number for _ in range(4) for number in turns.take(2)]
+    assert set(asked) == set(range(5))
+    assert asked.count(2) == 4
 
 
 def complete(scene, splat, out, *more):

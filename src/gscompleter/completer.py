@@ -33,14 +33,13 @@ from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
     do_no_harm,
     error_with_loss,
-    harmless,
     hole_mask,
     keep_in_holes,
     keep_near_holes,
     refine_opacities,
     squared_error,
-    worth_their_harm,
 )
+from gscompleter.stages.reconciliation import reconcile
 from gscompleter.stages.registration import Registration, register, slide
 from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.support import (
@@ -71,6 +70,8 @@ MAX_TARGETS = 255
 
 UNSEEN = 0.1
 """Share of what the target sees of a Gaussian, below which no photograph shows it."""
+ROUNDING = 1e-4
+"""Decibels that a photograph may lose where it may lose nothing."""
 MIN_COVER = 0.5
 """Pixels of a hole that a Gaussian has to cover to stand in the way."""
 
@@ -187,10 +188,11 @@ class GSCompleter:
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
             context = init_context(self.reconstructor, views) if scene is None else scene
-            allowed = self.allowed_errors(context, (*views, *others))
             evidence = None
             if scene is not None and witnesses is not None:
                 evidence = self.evidence(scene, (*views, *others))
+            tolerance = 0.0 if evidence is not None else self.config.harm.tolerance or 0.0
+            allowed = self.allowed_errors(context, (*views, *others), tolerance)
         return Completion(
             context, context, views, allowed, (), clock.seconds, others, evidence=evidence
         )
@@ -389,19 +391,19 @@ class GSCompleter:
         watching = (*completion.views, *completion.witnesses)
         others = [self.renderer.freeze(completion.scene, v.camera) for v in completion.witnesses]
         frozen, allowed = (*frozen_views, *others), completion.allowed_errors
-        if completion.evidence is not None:
-            kept = worth_their_harm(kept, sight.frozen, reference, frozen, watching, allowed)
-        nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
-        refined, losses = refine_opacities(
-            kept,
-            sight.frozen,
-            reference,
-            [frozen_views[i] for i in nearest],
-            [completion.views[i] for i in nearest],
-            config.refine,
-        )
-        if completion.evidence is not None and not harmless(refined, frozen, watching, allowed):
-            refined = kept
+        if completion.evidence is None:
+            nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
+            near_frozen = [frozen_views[i] for i in nearest]
+            near_views = [completion.views[i] for i in nearest]
+            refined, losses = refine_opacities(
+                kept, sight.frozen, reference, near_frozen, near_views, config.refine
+            )
+        else:
+            holes, degree = self.holes(sight), completion.context.sh_degree
+            settings = config.reconcile.at_most(degree)
+            refined, losses = reconcile(
+                kept, sight.frozen, reference, holes, frozen, watching, allowed, settings
+            )
         return do_no_harm(refined, frozen, watching, allowed, config.harm), losses
 
     def sight(self, completion: Completion, target: Camera) -> Sight:
@@ -479,12 +481,13 @@ class GSCompleter:
         cameras = [view.camera for view in views]
         return depth_range_of(views, lambda _: depth_range_of_scene(scene, cameras, self.renderer))
 
-    def allowed_errors(self, context: Gaussians, views: Sequence[View]) -> tuple[float, ...]:
+    def allowed_errors(
+        self, context: Gaussians, views: Sequence[View], tolerance: float
+    ) -> tuple[float, ...]:
         """Largest mean squared error that each photograph may have once all is done."""
-        tolerance = self.config.harm.tolerance or 0.0
         renders = [self.renderer.render(context, view.camera).image for view in views]
         return tuple(
-            error_with_loss(squared_error(image, view.image).item(), tolerance)
+            error_with_loss(squared_error(image, view.image).item(), max(tolerance, ROUNDING))
             for image, view in zip(renders, views, strict=True)
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -130,10 +130,35 @@ class RefineConfig(Settings):
 
 
 @dataclass(frozen=True)
+class ReconcileConfig(Settings):
+    """How what is added to a scene that is doubted is fitted to all photographs at once. It takes
+    the place of `RefineConfig` there."""
+
+    iterations: Count = 75
+    """Steps of Adam; 0 leaves colours and opacities as they were lifted."""
+    views_per_step: Annotated[int, Interval(ge=1, le=1000)] = 4
+    """How many photographs take part in a step, besides the synthesized image."""
+    photograph_weight: Weight = 20.0
+    """Weight of what a photograph's error is above the allowed, as a share of it, against the error
+    in the holes, as a share of what it was."""
+    opacity_step: Step = 0.2
+    """Step of Adam on the logit of opacities."""
+    colour_step: Step = 0.03
+    """Step of Adam on spherical harmonics."""
+    sh_degree: Annotated[int, Interval(ge=0, le=3)] = 2
+    """Degree of spherical harmonics up to which an added Gaussian may look different from
+    different sides, as those of a trained scene do; never above the scene's."""
+
+    def at_most(self, sh_degree: int) -> ReconcileConfig:
+        """The same for a scene of this degree."""
+        return replace(self, sh_degree=min(self.sh_degree, sh_degree))
+
+
+@dataclass(frozen=True)
 class HarmConfig(Settings):
     tolerance: Annotated[float, Interval(ge=0, le=100)] | None = 0.045
     """Largest loss of PSNR, in dB, that any context view may suffer; None checks nothing, as in
-    the paper."""
+    the paper. Photographs of a scene that is doubted lose nothing, whatever it is."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +182,8 @@ class CompleterConfig(Settings):
     """What counts as no hole only as far as photographs support it."""
     refine: RefineConfig = RefineConfig()
     """How the opacities of the added Gaussians are refined."""
+    reconcile: ReconcileConfig = ReconcileConfig()
+    """How what is added to a scene that is doubted is brought to agree with its photographs."""
     harm: HarmConfig = HarmConfig()
     """How much worse a photograph may be matched than before."""
 

@@ -14,14 +14,8 @@ from gscompleter.config import HarmConfig, HoleConfig, RefineConfig
 from gscompleter.geometry import inside, project
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, OpacityRender
-from gscompleter.types import SH_C0, Camera, Gaussians, Lift, View
+from gscompleter.types import Camera, Gaussians, Lift, View
 
-FAINT = 0.05
-"""Share of its opacity at which a Gaussian is asked how it would look by itself."""
-FREE = 1e-8
-"""Share of its squared error that a Gaussian may cost a photograph for nothing."""
-FINENESS = 256
-"""In how many parts candidates are told apart where photographs see them."""
 MAX_TRIALS = 16
 """How often harmful Gaussians lose half of their opacity before a view that still does not hold
 loses all it sees of them."""
@@ -96,91 +90,6 @@ def refine_opacities(
     return replace(added, opacities=opacities().detach(), encoded=None), tuple(losses)
 
 
-def worth_their_harm(
-    added: Gaussians,
-    frozen_target: FrozenView,
-    reference: View,
-    frozen_views: Sequence[FrozenView],
-    views: Sequence[View],
-    allowed_errors: Sequence[float],
-) -> Gaussians:
-    """As many of `added` as no photograph is matched worse by than allowed, the best ones.
-
-    Where a scene matches its photographs almost exactly, hardly anything may be added where they
-    see it, and much where they do not. By what each brings at the target for what it costs the
-    photograph that it costs most, the worth of a Gaussian is a number, and the least worth that may
-    join is found by bisection.
-
-    Args:
-        added: Generated Gaussians.
-        frozen_target: The scene frozen at the target.
-        reference: The synthesized image.
-        frozen_views: The scene frozen at the camera of each of `views`.
-        views: The photographs.
-        allowed_errors: Largest mean squared error allowed in each view.
-    """
-    if len(added) == 0:
-        return added
-    wrong = (frozen_target.context.image - reference.image).square().sum(-1)
-    costs = [
-        strangeness(frozen, view.image, added) / max(allowed, 1e-12)
-        for frozen, view, allowed in zip(frozen_views, views, allowed_errors, strict=True)
-    ]
-    gain = -strangeness(frozen_target, reference.image, added, wrong)
-    cost = torch.stack(costs).amax(dim=0).clamp_min(0.0)
-    order = (gain / (cost + FREE)).argsort(descending=True, stable=True)
-    low, high = 0, len(added) + 1
-    while high - low > max(len(added) // FINENESS, 1):
-        middle = (low + high) // 2
-        if harmless(added[order[:middle]], frozen_views, views, allowed_errors):
-            low = middle
-        else:
-            high = middle
-    return added[order[:low].sort().values]
-
-
-def strangeness(
-    frozen: FrozenView,
-    image: Float[Tensor, "h w 3"],
-    added: Gaussians,
-    before: Float[Tensor, "h w"] | None = None,
-) -> Float[Tensor, "n"]:
-    """Mean squared difference from `image` of each of `added` alone, where a camera sees it in the
-    scene, less what was there `before`.
-
-    The sum over the pixels of weight times squared difference needs the sums of the weights, and of
-    the weights times the image and its square: slopes of the drawn colours.
-    """
-    colour = 0.5 + SH_C0 * added.sh[:, 0]
-    with torch.enable_grad():
-        sh = torch.zeros_like(added.sh[:, :1], requires_grad=True)
-        # So faint that none hides another.
-        faint = replace(added, sh=sh, opacities=FAINT * added.opacities, encoded=None)
-        drawn = frozen.composite(faint).image
-        squares = image.square().sum(-1)
-        was = torch.zeros_like(squares) if before is None else before
-        layers = torch.stack([torch.ones_like(squares), squares, was], dim=-1)
-        (first,) = torch.autograd.grad((drawn * image).sum(), sh, retain_graph=True)
-        (second,) = torch.autograd.grad((drawn * layers).sum(), sh)
-    scale = FAINT * SH_C0 * image.numel()
-    weight, square, was = (second[:, 0] / scale).unbind(-1)
-    mixed = (colour * first[:, 0] / scale).sum(-1)
-    return weight * colour.square().sum(-1) - 2 * mixed + square - was
-
-
-def harmless(
-    added: Gaussians,
-    frozen_views: Sequence[FrozenView],
-    views: Sequence[View],
-    allowed_errors: Sequence[float],
-) -> bool:
-    """Whether no photograph is matched worse than allowed with `added` in the scene."""
-    return all(
-        squared_error(frozen.plan(added)(added.opacities).image, view.image).item() <= allowed
-        for frozen, view, allowed in zip(frozen_views, views, allowed_errors, strict=True)
-    )
-
-
 def do_no_harm(
     added: Gaussians,
     frozen_views: Sequence[FrozenView],
@@ -212,10 +121,13 @@ def do_no_harm(
     for trial in range(MAX_TRIALS + 1):
         lowered = torch.zeros_like(opacities, dtype=torch.bool)
         for plan, photograph, allowed in checks:
-            error, slope = error_slope(plan, photograph, opacities)
-            if error > allowed and trial == MAX_TRIALS:
+            error = squared_error(plan(opacities).image, photograph).item()
+            if error <= allowed:
+                continue
+            _, slope = error_slope(plan, photograph, opacities)
+            if trial == MAX_TRIALS:
                 lowered |= slope != 0
-            elif error > allowed:
+            else:
                 lowered |= most_harmful(slope * opacities / 2, error - allowed)
         if not lowered.any():
             break
