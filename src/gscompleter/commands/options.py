@@ -72,7 +72,7 @@ class SceneOptions(Options):
     format: str | None = None
     """What SCENE is: colmap, nerfstudio, cameras-json, llff, kitti, dgp, chunks or
     real-estate-10k. Found by what lies there if not given."""
-    scene: Path | None = None
+    scene: Path | None
     """A file of Gaussians."""
     resolution: Size = LONG_SIDE
     """Height and width to work at: photographs are scaled to cover it and cropped around the
