@@ -20,6 +20,7 @@ from gscompleter import __version__
 from gscompleter.commands.convert import ConvertOptions
 from gscompleter.commands.generator_options import generator_flags
 from gscompleter.commands.options import (
+    CleanOptions,
     CompleteOptions,
     DemoOptions,
     EvaluateOptions,
@@ -38,6 +39,7 @@ from gscompleter.interrupts import treat_stops_alike
 # that `--help` does not wait for torch.
 COMMANDS: dict[str, tuple[type, str, str]] = {
     "complete": (CompleteOptions, "gscompleter.commands.complete", "run_completion"),
+    "clean": (CleanOptions, "gscompleter.commands.clean", "run_clean"),
     "demo": (DemoOptions, "gscompleter.commands.demo", "run_demo"),
     "evaluate": (EvaluateOptions, "gscompleter.commands.evaluate", "run_evaluation"),
     "tables": (TablesOptions, "gscompleter.commands.evaluate", "run_tables"),

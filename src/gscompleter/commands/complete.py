@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -13,21 +11,23 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.commands.opening import (
-    POSES,
     Opened,
     Task,
     check_context,
+    check_targets,
     in_frame_of_splat,
     open_scene,
     read_task,
     say,
+    with_witnesses,
 )
 from gscompleter.commands.options import CompleteOptions
+from gscompleter.commands.output import holds_poses_only, opened_as, saying_what_stays
 from gscompleter.commands.understood import understood
 from gscompleter.completer import Clock, GSCompleter, total
 from gscompleter.config import CompleterConfig
 from gscompleter.generators import load_generator
-from gscompleter.io.files import SUMMARY, check_output, output_folder
+from gscompleter.io.files import check_output, output_folder
 from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
@@ -53,10 +53,12 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, options.overwrite or holds_poses_only(options.out))
     check_context(options)
+    check_targets(options)
     device = choose_device(options.device)
     opened = open_scene(options, console)
     task = read_task(options, opened, device)
     if options.scene is not None:
+        task = with_witnesses(task, opened.photographs)
         task = in_frame_of_splat(task, options.scene, options, opened)
     completer = completer_for(options, task.targets, device)
     clock = Clock()
@@ -87,56 +89,12 @@ def said_in_advance(
     options: CompleteOptions, opened: Opened, task: Task, device: str
 ) -> dict[str, Any]:
     """What `summary.json` says of a completion besides its scores."""
-    camera = task.views[0].camera
     return {
         "settings": settings_of(options),
         "seed": options.seed,
         "device": device,
-        "scene": {
-            "format": opened.format,
-            "photographs": opened.number,
-            "used": len(task.views),
-            "splat": None if options.scene is None else str(options.scene),
-        },
-        "frame": {
-            "method": task.method,
-            "transform": task.frame.tolist(),
-            "origin": task.origin.tolist(),
-        },
-        "depth_range": {"near": camera.near, "far": camera.far, "from": asdict(task.depths)},
+        **opened_as(options, opened, task),
     }
-
-
-def holds_poses_only(out: Path) -> bool:
-    """Whether a folder has nothing in it but the poses that an earlier run found."""
-    return os.path.isdir(out) and os.listdir(out) == [POSES]
-
-
-@contextmanager
-def saying_what_stays(out: Path) -> Iterator[None]:
-    """Let an interrupt say what it leaves in the output folder, where that is more than nothing.
-
-    Raises:
-        KeyboardInterrupt: with a sentence, or as it came.
-    """
-    before = written(out)
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        there = written(out)
-        if there[0] != before[0]:
-            raise KeyboardInterrupt(f"the result is written: {out}") from stop
-        if there[1] != before[1]:
-            raise KeyboardInterrupt(
-                f"nothing was written but the cameras that were found: {out / POSES}"
-            ) from stop
-        raise
-
-
-def written(out: Path) -> list[int | None]:
-    """When a result, and the cameras of its photographs, were written; None where they are not."""
-    summaries = [out / SUMMARY, out / POSES / SUMMARY]
-    return [s.stat().st_mtime_ns if s.is_file() else None for s in summaries]
 
 
 def completer_for(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 from torch import Tensor
 
-from gscompleter.commands.options import CompleteOptions, working_size
+from gscompleter.commands.options import CompleteOptions, SceneOptions, working_size
 from gscompleter.data.formats import open_photographs, recognised
 from gscompleter.data.framing import Resolution
 from gscompleter.data.origin import frame_from_photographs, origin_of, told_from
@@ -97,7 +97,7 @@ class Task:
     """The other photographs of `scene`, small: they tell what of it is supported."""
 
 
-def open_scene(options: CompleteOptions, console: Console) -> Opened:
+def open_scene(options: SceneOptions, console: Console) -> Opened:
     """The posed photographs of `options.folder`. Where it has no cameras, they are found first, and
     kept in the output folder, whatever becomes of the completion.
 
@@ -140,7 +140,27 @@ def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
     return Task(views, targets, frame_from_photographs(given.origin), given.origin, depths)
 
 
-def in_frame_of_splat(task: Task, path: Path, options: CompleteOptions, opened: Opened) -> Task:
+def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task:
+    """The photographs that the options name, or all, and no target.
+
+    Raises:
+        InputError: where one does not exist, is impossible or cannot be read, or there is none.
+    """
+    given, resolution = opened.photographs, working_size(options.resolution)
+    frames = options.context or tuple(usable_cameras(given, range(len(given)), resolution))
+    if not frames:
+        raise InputError(
+            f"No photograph of {quoted(options.folder)} can be used; bring those that the splat "
+            "was trained on."
+        )
+    ranged = with_depth_range(given, frames, resolution)
+    depths = depth_source(options, given, ranged)
+    check_sides([ranged.camera(frame, resolution) for frame in frames])
+    views = [view.to(device) for view in ranged.views(frames, resolution)]
+    return Task(views, (), frame_from_photographs(given.origin), given.origin, depths)
+
+
+def in_frame_of_splat(task: Task, path: Path, options: SceneOptions, opened: Opened) -> Task:
     """`task` with the splat of a file, its cameras brought to where the photographs show it.
 
     Raises:
@@ -164,13 +184,13 @@ def in_frame_of_splat(task: Task, path: Path, options: CompleteOptions, opened: 
         brought=Brought(path, rows_kept(path) if options.drop_nonfinite else None),
         method=found.method,
         said=found.sentence(),
-        witnesses=[moved_view(v, found.transform) for v in witnesses_of(task, given)],
+        witnesses=[moved_view(view, found.transform) for view in task.witnesses or ()],
     )
 
 
-def witnesses_of(task: Task, given: Photographs) -> list[View]:
-    """The photographs that are neither context nor target, those closest to the targets; none of
-    them that cannot be read."""
+def with_witnesses(task: Task, given: Photographs) -> Task:
+    """`task` with the photographs that are neither context nor target, those closest to the
+    targets; none of them that cannot be read."""
     taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
     others = [frame for frame in range(len(given)) if frame not in taken]
     cameras = usable_cameras(given, others, WITNESS_SIDE)
@@ -180,7 +200,7 @@ def witnesses_of(task: Task, given: Photographs) -> list[View]:
     for frame in sorted(sorted(cameras, key=remoteness.__getitem__)[:MAX_WITNESSES]):
         with suppress(InputError):
             views += given.views([frame], WITNESS_SIDE)
-    return [view.to(task.views[0].image.device) for view in views]
+    return replace(task, witnesses=[view.to(task.views[0].image.device) for view in views])
 
 
 def rows_kept(path: Path) -> Bool[Tensor, "n"] | None:
@@ -188,7 +208,7 @@ def rows_kept(path: Path) -> Bool[Tensor, "n"] | None:
     return drawable_rows(path) if format_of(path) == "ply" else None
 
 
-def check_context(options: CompleteOptions) -> None:
+def check_context(options: SceneOptions) -> None:
     """Refuse too few context frames, and the same one twice."""
     context, needed = options.context, needed_views(options)
     if context is not None and len(context) < needed:
@@ -201,12 +221,16 @@ def check_context(options: CompleteOptions) -> None:
             f"--context names a frame twice ({' '.join(map(str, context))}), which gives "
             "identical cameras and no baseline; name different frames."
         )
+
+
+def check_targets(options: CompleteOptions) -> None:
+    """Refuse a completion for nothing."""
     if not options.target:
         raise InputError("--target names no frame; name at least one, as in --target 8.")
 
 
-def needed_views(options: CompleteOptions) -> int:
-    """The fewest photographs that a completion starts from."""
+def needed_views(options: SceneOptions) -> int:
+    """The fewest photographs that the work starts from."""
     return 2 if options.scene is None else 1
 
 
@@ -263,7 +287,7 @@ def points_told(
     return torch.cat([points_before(target, near, far) for target in targets])
 
 
-def depth_source(options: CompleteOptions, given: Photographs, ranged: Photographs) -> DepthSource:
+def depth_source(options: SceneOptions, given: Photographs, ranged: Photographs) -> DepthSource:
     """Who told each end of the depth range: who comes first."""
 
     def teller(name: str) -> str:
@@ -307,13 +331,18 @@ def with_photograph(target: Target, given: Photographs, resolution: Resolution) 
 
 def check_sizes(cameras: Sequence[Camera]) -> None:
     """Refuse images with nothing in them to match and to score, and those beyond all memory."""
+    check_sides(cameras)
+    check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
+
+
+def check_sides(cameras: Sequence[Camera]) -> None:
+    """Refuse images with nothing in them to match and to score."""
     for camera in cameras:
         if min(camera.width, camera.height) < MIN_SIZE:
             raise InputError(
                 f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
                 f"least {MIN_SIZE}; choose a larger --resolution, or another camera."
             )
-    check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
 
 
 def frame_number(word: str) -> int | None:

@@ -14,6 +14,7 @@ from annotated_types import Interval
 
 from gscompleter.commands.generator_options import GeneratorOptions
 from gscompleter.config import CompleterConfig
+from gscompleter.config.cleaning import CleaningConfig
 from gscompleter.config.settings import Seed, Settings
 
 Frame = Annotated[int, Interval(ge=0, lt=10**9)]
@@ -56,14 +57,41 @@ class ModelOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompleteOptions(ModelOptions):
-    """Fill what the photographs never saw, as seen from the targets, and write the scene."""
+class SceneOptions(Options):
+    """What every command can be told that opens posed photographs, and may bring a splat."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Posed photographs: a folder with a COLMAP model or a nerfstudio transforms.json, a
     cameras.json beside its photographs, a poses_bounds.npy of LLFF, a sequence of KITTI, a scene
     of DGP, a chunk of pixelSplat, or a camera file of RealEstate10K beside its frames. The cameras
     of photographs that have none are found by COLMAP and kept in OUT/colmap."""
+    context: tuple[Frame, ...] | None = None
+    """Numbers of the frames to work with, in the order of the sorted file paths."""
+    out: Path
+    """The folder to write."""
+    format: str | None = None
+    """What SCENE is: colmap, nerfstudio, cameras-json, llff, kitti, dgp, chunks or
+    real-estate-10k. Found by what lies there if not given."""
+    scene: Path | None
+    """A file of Gaussians."""
+    resolution: Size = LONG_SIDE
+    """Height and width to work at: photographs are scaled to cover it and cropped around the
+    centre. One number is the most pixels of the longer side, to which larger photographs are
+    shrunk; `full` keeps their own size."""
+    near: float | None = None
+    """Smallest depth in the scene, in its own unit. Estimated if not given."""
+    far: float | None = None
+    """Largest depth in the scene, in its own unit. Estimated if not given."""
+    drop_nonfinite: bool = False
+    """Leave out Gaussians of the scene that hold NaN or infinity."""
+    overwrite: bool = False
+    """Replace what an earlier run left in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompleteOptions(SceneOptions, ModelOptions):
+    """Fill what the photographs never saw, as seen from the targets, and write the scene."""
+
     context: tuple[Frame, ...] | None = None
     """Numbers of the frames to start from, in the order of the sorted file paths. If not given,
     those that matter to the targets are chosen; a target's own photograph is none of them."""
@@ -73,29 +101,35 @@ class CompleteOptions(ModelOptions):
     completed one after the other into one scene."""
     out: Path
     """Folder for completed.ply, generated.ply, context.ply, images/ and summary.json."""
-    format: str | None = None
-    """What SCENE is: colmap, nerfstudio, cameras-json, llff, kitti, dgp, chunks or
-    real-estate-10k. Found by what lies there if not given."""
     scene: Path | None = None
     """A file of Gaussians to complete, which is kept as it is. Without it the context is
     reconstructed from the photographs."""
     keep_unsupported: bool = False
     """Never set Gaussians of the scene aside that no photograph supports."""
-    resolution: Size = LONG_SIDE
-    """Height and width to work at: photographs are scaled to cover it and cropped around the
-    centre. One number is the most pixels of the longer side, to which larger photographs are
-    shrunk; `full` keeps their own size."""
-    near: float | None = None
-    """Smallest depth in the scene, in its own unit. Estimated if not given."""
-    far: float | None = None
-    """Largest depth in the scene, in its own unit. Estimated if not given."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
     """Settings of the stages. `--config NAME` says where they start: default, paper, an ablation
     such as no-sa, or a YAML file. Those given here are applied over it."""
-    drop_nonfinite: bool = False
-    """Leave out Gaussians of the scene that hold NaN or infinity."""
-    overwrite: bool = False
-    """Replace what an earlier run left in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CleanOptions(SceneOptions):
+    """Take out of a splat what its photographs are better without or do not need.
+
+    Nothing is generated, and no photograph is matched worse by more than a hundredth of a decibel.
+    `gscompleter strip` puts back what was taken out.
+    """
+
+    context: tuple[Frame, ...] | None = None
+    """Numbers of the frames that judge, in the order of the sorted file paths. All that have a
+    photograph if not given. What only others need is not safe."""
+    out: Path
+    """Folder for completed.ply, removed.ply and summary.json."""
+    scene: Path
+    """The file of Gaussians to clean."""
+    device: Device = "auto"
+    """Where to run."""
+    config: CleaningConfig = CleaningConfig()
+    """What is taken out."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gscompleter.commands.opening import Opened, Task
-from gscompleter.commands.options import CompleteOptions
+from gscompleter.commands.options import CompleteOptions, SceneOptions
 from gscompleter.data.formats import FORMATS
 from gscompleter.data.frame import Frame
 from gscompleter.errors import quoted
@@ -26,13 +26,17 @@ MAX_NAMED = 8
 
 def understood(options: CompleteOptions, opened: Opened, task: Task, device: str) -> list[str]:
     """The three lines. The cameras of `task` know the depth range that is worked in."""
+    return [*found_out(options, opened, task), f"To do: {plan_line(options, task, device)}."]
+
+
+def found_out(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
+    """The lines on what was opened and found out."""
     splat = ""
     if task.scene is not None and options.scene is not None:
         splat = f"; {splat_line(options.scene, task.scene)}"
     return [
         f"Opened: {quoted(options.folder)}, {photographs_line(opened)}{splat}.",
         f"Found: {found_line(options, opened, task)}.",
-        f"To do: {plan_line(options, task, device)}.",
     ]
 
 
@@ -61,7 +65,7 @@ def splat_line(path: Path, scene: Gaussians) -> str:
     return f"{quoted(path)}, {len(scene):,} Gaussians of SH degree {scene.sh_degree}"
 
 
-def found_line(options: CompleteOptions, opened: Opened, task: Task) -> str:
+def found_line(options: SceneOptions, opened: Opened, task: Task) -> str:
     """The frame, the unit where it is known, the depth range and the working size."""
     format = FORMATS.get(opened.format)
     unit = f" {format.unit}" if format is not None and format.unit is not None else ""
@@ -71,7 +75,7 @@ def found_line(options: CompleteOptions, opened: Opened, task: Task) -> str:
     return f"{task.said.rstrip('.')}; {depth}; {size_line(options, opened, task)}"
 
 
-def size_line(options: CompleteOptions, opened: Opened, task: Task) -> str:
+def size_line(options: SceneOptions, opened: Opened, task: Task) -> str:
     """The working size, and that of the photographs where they were shrunk."""
     frames = [view.frame for view in task.views if view.frame is not None]
     own = sizes_line([opened.photographs.camera(frame) for frame in frames])

@@ -20,7 +20,7 @@ from gscompleter.render import Renderer
 from gscompleter.splats.layout import save_like
 from gscompleter.splats.removed import NAME as REMOVED
 from gscompleter.splats.removed import save_removed
-from gscompleter.types import Camera, Completion, TargetCompletion
+from gscompleter.types import Camera, Completion, Gaussians, TargetCompletion
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,8 @@ def write_report(
     if brought is None:
         save_ply(folder / "completed.ply", completion.scene, provenance=True)
     else:
-        save_brought(folder, completion, brought)
+        context, scene = completion.context, completion.scene
+        save_brought(folder, context, scene, completion.set_aside, brought)
     save_ply(folder / "generated.ply", completion.added, provenance=True)
     (folder / "images").mkdir()
     for number, (result, images) in enumerate(zip(completion.targets, target_images, strict=True)):
@@ -160,19 +161,33 @@ def write_report(
     return summary
 
 
-def save_brought(folder: Path, completion: Completion, brought: Brought) -> None:
-    """Write `completed.ply` in the layout of the file that was brought, and what was set aside."""
-    aside, kept = completion.set_aside, brought.kept
+def save_brought(
+    folder: Path,
+    context: Gaussians,
+    scene: Gaussians,
+    aside: Bool[Tensor, "n"] | None,
+    brought: Brought,
+) -> None:
+    """Write `completed.ply` in the layout of the file that was brought, and `removed.ply`.
+
+    Args:
+        folder: Where to.
+        context: The n Gaussians that were brought.
+        scene: What became of them.
+        aside: Which of them are no more in `scene`; None for none.
+        brought: The file.
+    """
+    kept = brought.kept
     if aside is None or not aside.any():
-        save_like(folder / "completed.ply", completion.scene, brought.path, kept)
+        save_like(folder / "completed.ply", scene, brought.path, kept)
         return
     rows = torch.nonzero(aside.cpu())[:, 0]
-    removed = completion.context[aside].to("cpu")
+    removed = context[aside].to("cpu")
     save_removed(folder / REMOVED, removed, rows, brought.path, kept)
     stays = ~aside.cpu()
     if kept is not None:
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
-    save_like(folder / "completed.ply", completion.scene, brought.path, stays)
+    save_like(folder / "completed.ply", scene, brought.path, stays)
 
 
 def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:

@@ -1,0 +1,150 @@
+"""The command `clean`: a splat and its photographs in, the splat without its floaters out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from rich.console import Console
+from torch import Tensor
+
+from gscompleter import __version__
+from gscompleter.commands.opening import (
+    Task,
+    check_context,
+    in_frame_of_splat,
+    open_scene,
+    read_photographs,
+    say,
+)
+from gscompleter.commands.options import CleanOptions
+from gscompleter.commands.output import holds_poses_only, opened_as, saying_what_stays
+from gscompleter.commands.understood import found_out
+from gscompleter.completer import Clock, ranged
+from gscompleter.errors import InputError, quoted
+from gscompleter.io.files import SUMMARY, check_output, output_folder
+from gscompleter.matching.depth_range import depth_range_of
+from gscompleter.metrics.image import psnr
+from gscompleter.progress import shown_on
+from gscompleter.render import Renderer, choose_device, load_renderer
+from gscompleter.reports.completion import save_brought
+from gscompleter.stages.cleaning import superfluous
+from gscompleter.stages.context import depth_range_of_scene
+from gscompleter.types import Gaussians
+
+
+def run_clean(options: CleanOptions) -> None:
+    """Clean the splat of `options.scene`, write `options.out` and say what was done."""
+    with saying_what_stays(options.out):
+        summary = clean_splat(options)
+        if not options.quiet:
+            tell(summary, options.out)
+
+
+def clean_splat(options: CleanOptions) -> dict[str, Any]:
+    """Clean the splat of `options.scene` and write `options.out`; also returns the summary.
+
+    Raises:
+        InputError: anything about the input that the user can mend; nothing is written then but
+            cameras that were found.
+    """
+    console = Console(stderr=True, quiet=options.quiet)
+    overwrite = options.overwrite or holds_poses_only(options.out)
+    check_output(options.out, overwrite)
+    check_context(options)
+    device = choose_device(options.device)
+    renderer, clock = load_renderer(device), Clock(())
+    opened = open_scene(options, console)
+    task = read_photographs(options, opened, device)
+    task = with_planes_of(in_frame_of_splat(task, options.scene, options, opened), renderer)
+    plan = f"judged by {len(task.views)} photographs on {device}, written to {quoted(options.out)}"
+    say(console, *found_out(options, opened, task), f"To do: {plan}.")
+    overwrite = options.overwrite or holds_poses_only(options.out)
+    with output_folder(options.out, overwrite) as folder:
+        with shown_on(None if options.quiet else console), clock("clean"):
+            taken = superfluous(splat_of(task), task.views, renderer, options.config)
+        said = {"settings": settings_of(options), "device": device}
+        said |= opened_as(options, opened, task)
+        summary = said | scores(task, taken, renderer) | {"seconds": clock.seconds}
+        write(folder, task, taken, {"version": __version__, **summary})
+    return summary
+
+
+def splat_of(task: Task) -> Gaussians:
+    """The splat that was brought."""
+    assert task.scene is not None
+    return task.scene
+
+
+def with_planes_of(task: Task, renderer: Renderer) -> Task:
+    """`task`, its cameras with the depth range that the splat tells where nobody else does."""
+    cameras = [view.camera for view in task.views]
+    near, far = depth_range_of(
+        task.views, lambda _: depth_range_of_scene(splat_of(task), cameras, renderer)
+    )
+    return replace(task, views=[ranged(view, near, far) for view in task.views])
+
+
+def settings_of(options: CleanOptions) -> dict[str, Any]:
+    """Everything that decided the result, for `summary.json`."""
+    return {
+        "folder": str(options.folder),
+        "format": options.format,
+        "context": None if options.context is None else list(options.context),
+        "scene": str(options.scene),
+        "resolution": options.resolution,
+        "near": options.near,
+        "far": options.far,
+        "config": asdict(options.config),
+    }
+
+
+def scores(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str, Any]:
+    """How many Gaussians were taken out, and PSNR (dB) at the photographs before and after."""
+    given = splat_of(task)
+    rows = []
+    for view in task.views:
+        before, after = (
+            psnr(renderer.render(scene, view.camera).image, view.image)
+            for scene in (given, given[~taken])
+        )
+        rows.append({"frame": view.frame, "psnr_before": before, "psnr_after": after})
+    removed = int(taken.sum())
+    counts = {"given": len(given), "kept": len(given) - removed, "removed": removed}
+    return {"photographs": rows, "gaussians": counts}
+
+
+def write(folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[str, Any]) -> None:
+    """Write the splat without what is `taken`, what was taken, and the summary.
+
+    Raises:
+        InputError: where nothing would be left, or a file cannot be written.
+    """
+    given = splat_of(task)
+    if taken.all():
+        raise InputError(
+            "The photographs are better without any Gaussian of the splat; check that they show "
+            "the same scene."
+        )
+    assert task.brought is not None
+    save_brought(folder, given, given[~taken], taken, task.brought)
+    (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def tell(summary: Mapping[str, Any], out: Path) -> None:
+    """Say how much was taken out, what that did to the photographs, and where it lies."""
+    rows, counts = summary["photographs"], summary["gaussians"]
+    before, after = (
+        torch.tensor([row[f"psnr_{when}"] for row in rows]) for when in ("before", "after")
+    )
+    print(
+        f"{counts['removed']:,} of {counts['given']:,} Gaussians taken out in "
+        f"{summary['seconds']['total']:.1f} s; the photographs went from {before.mean():.2f} to "
+        f"{after.mean():.2f} dB, at worst by {(after - before).min():+.3f} dB: "
+        f"{out / 'completed.ply'}"
+    )

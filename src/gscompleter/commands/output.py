@@ -1,0 +1,65 @@
+"""What commands that open a scene say of it in `summary.json`, and what an interrupt leaves."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from gscompleter.commands.opening import POSES, Opened, Task
+from gscompleter.commands.options import SceneOptions
+from gscompleter.io.files import SUMMARY
+
+
+def opened_as(options: SceneOptions, opened: Opened, task: Task) -> dict[str, Any]:
+    """What was opened, in which frame the result is, and the depth range that was worked in."""
+    camera = task.views[0].camera
+    return {
+        "scene": {
+            "format": opened.format,
+            "photographs": opened.number,
+            "used": len(task.views),
+            "splat": None if options.scene is None else str(options.scene),
+        },
+        "frame": {
+            "method": task.method,
+            "transform": task.frame.tolist(),
+            "origin": task.origin.tolist(),
+        },
+        "depth_range": {"near": camera.near, "far": camera.far, "from": asdict(task.depths)},
+    }
+
+
+def holds_poses_only(out: Path) -> bool:
+    """Whether a folder has nothing in it but the poses that an earlier run found."""
+    return os.path.isdir(out) and os.listdir(out) == [POSES]
+
+
+@contextmanager
+def saying_what_stays(out: Path) -> Iterator[None]:
+    """Let an interrupt say what it leaves in the output folder, where that is more than nothing.
+
+    Raises:
+        KeyboardInterrupt: with a sentence, or as it came.
+    """
+    before = written(out)
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        there = written(out)
+        if there[0] != before[0]:
+            raise KeyboardInterrupt(f"the result is written: {out}") from stop
+        if there[1] != before[1]:
+            raise KeyboardInterrupt(
+                f"nothing was written but the cameras that were found: {out / POSES}"
+            ) from stop
+        raise
+
+
+def written(out: Path) -> list[int | None]:
+    """When a result, and the cameras of its photographs, were written; None where they are not."""
+    summaries = [out / SUMMARY, out / POSES / SUMMARY]
+    return [s.stat().st_mtime_ns if s.is_file() else None for s in summaries]
