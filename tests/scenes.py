@@ -17,7 +17,16 @@ from torch import Tensor
 from gscompleter.data.scene import write_cameras
 from gscompleter.generators import Request, Synthesis, as_generator
 from gscompleter.io.image import write_image
-from gscompleter.types import Camera, Gaussians, View, observed, sh_from_rgb
+from gscompleter.types import (
+    Camera,
+    DepthMap,
+    Gaussians,
+    Reconstruction,
+    View,
+    merge,
+    observed,
+    sh_from_rgb,
+)
 
 
 @dataclass(frozen=True)
@@ -114,6 +123,19 @@ def gaussians_of(view: View, depth: Float[Tensor, "h w"] | None = None) -> Gauss
         scales=(0.6 * depth / camera.K[0, 0]).reshape(-1, 1).repeat(1, 3),
         opacities=torch.full((n,), 0.95),
         sh=sh_from_rgb(view.image.reshape(-1, 3)),
+    )
+
+
+def reconstruction_of(
+    views: Sequence[View], depths: Sequence[Float[Tensor, "h w"]]
+) -> Reconstruction:
+    """What a pixel-aligned Ψ says that finds these depths."""
+    parts = [gaussians_of(v, d) for v, d in zip(views, depths, strict=True)]
+    return Reconstruction(
+        merge(parts),
+        tuple(DepthMap(d, torch.ones_like(d, dtype=torch.bool)) for d in depths),
+        torch.cat([torch.full((d.numel(),), i) for i, d in enumerate(depths)]),
+        torch.cat([torch.arange(d.numel()) for d in depths]),
     )
 
 

@@ -19,9 +19,9 @@ from gscompleter.metrics.image import psnr
 from gscompleter.stages.anchor import lift
 from gscompleter.stages.integration import hole_mask
 from gscompleter.stages.registration import apply_affine
-from gscompleter.types import Camera, DepthMap, Gaussians, Reconstruction, View, merge
+from gscompleter.types import Camera, Gaussians, View, merge
 from parity import assert_close
-from scenes import Room, camera_at, gaussians_of, scaled, view_of
+from scenes import Room, camera_at, gaussians_of, reconstruction_of, scaled, view_of
 
 SIZE = 64
 
@@ -56,13 +56,7 @@ class KnowingReconstructor:
             # A pair is consistent in itself: the anchor errs by the same scale as the reference.
             paired = any(v.frame is None for v in views)
             depths.append(depth * (bumps(view.camera) if invented else 0.8 if paired else 1.0))
-        parts = [gaussians_of(v, d) for v, d in zip(views, depths, strict=True)]
-        return Reconstruction(
-            merge(parts),
-            tuple(DepthMap(d, torch.ones_like(d, dtype=torch.bool)) for d in depths),
-            torch.cat([torch.full((d.numel(),), i) for i, d in enumerate(depths)]),
-            torch.cat([torch.arange(d.numel()) for d in depths]),
-        )
+        return reconstruction_of(views, depths)
 
 
 class KnowingGenerator:

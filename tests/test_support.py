@@ -19,9 +19,10 @@ from gscompleter.render import load_renderer
 from gscompleter.stages.integration import squared_error
 from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed
-from gscompleter.stages.support import gather_evidence, pixel_sums, support
-from gscompleter.types import merge, sh_from_rgb
-from scenes import Room, camera_at, gaussians_of, photographed, view_of
+from gscompleter.stages.stereo import corrected, stereo_among
+from gscompleter.stages.support import believed_alpha, gather_evidence, pixel_sums, support
+from gscompleter.types import SceneContext, merge, sh_from_rgb
+from scenes import Room, camera_at, gaussians_of, photographed, reconstruction_of, view_of
 
 RENDERER = load_renderer("cpu")
 SIZE = 64
@@ -48,16 +49,7 @@ ARE_SHREDS = torch.arange(len(SCENE)) >= len(SURFACES)
 
 class KnowingReconstructor:
     def __call__(self, views):
-        from gscompleter.types import DepthMap, Reconstruction
-
-        depths = [view_of(Room(), view.camera).depth for view in views]
-        parts = [gaussians_of(v, d) for v, d in zip(views, depths, strict=True)]
-        return Reconstruction(
-            merge(parts),
-            tuple(DepthMap(d, torch.ones_like(d, dtype=torch.bool)) for d in depths),
-            torch.cat([torch.full((d.numel(),), i) for i, d in enumerate(depths)]),
-            torch.cat([torch.arange(d.numel()) for d in depths]),
-        )
+        return reconstruction_of(views, [view_of(Room(), view.camera).depth for view in views])
 
 
 def error_of(scene, view):
@@ -175,6 +167,31 @@ def test_what_is_added_is_fitted_to_all_photographs_at_once():
         target.context, view, holes
     )
     assert len(losses) == ReconcileConfig().iterations
+
+
+def test_what_photographs_show_by_themselves_takes_the_place_of_what_is_doubted():
+    camera = camera_at(0.15, size=SIZE)
+    truth = view_of(Room(), camera)
+    in_the_way = gaussians_of(truth, 0.8 * truth.depth)[: SIZE * SIZE // 4]
+    black = sh_from_rgb(torch.zeros(len(in_the_way), 3))
+    scene = merge([SURFACES, replace(in_the_way, sh=black)])
+    drawn = RENDERER.render(scene, camera)
+    config = SupportConfig(max_difference=0.03)
+    found = support(gather_evidence(scene, VIEWS, RENDERER, config), scene, camera, RENDERER)
+    believed = believed_alpha(drawn, scene, found, camera, RENDERER)
+    stereo = stereo_among(VIEWS, camera, drawn, KnowingReconstructor(), RENDERER, config)
+    context = SceneContext(tuple(VIEWS), (), drawn, believed=believed)
+    told = corrected(context, stereo)
+    assert context.holes.float().mean() > 0.15
+    assert told.holes.float().mean() < 0.75 * context.holes.float().mean()
+    assert psnr(told.at_target.image, truth.image) > psnr(drawn.image, truth.image) + 3
+    assert torch.equal(told.at_target.image[~context.holes], drawn.image[~context.holes])
+
+
+def test_one_photograph_makes_no_stereo():
+    drawn = RENDERER.render(SCENE, TARGET)
+    config = SupportConfig()
+    assert stereo_among(VIEWS[:1], TARGET, drawn, KnowingReconstructor(), RENDERER, config) is None
 
 
 def test_photographs_take_turns_and_the_worst_of_them_more_often():

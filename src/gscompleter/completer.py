@@ -42,6 +42,7 @@ from gscompleter.stages.integration import (
 from gscompleter.stages.reconciliation import reconcile
 from gscompleter.stages.registration import Registration, register, slide
 from gscompleter.stages.setting_aside import not_needed
+from gscompleter.stages.stereo import Stereo, corrected, stereo_among
 from gscompleter.stages.support import (
     believed_alpha,
     front,
@@ -93,6 +94,8 @@ class Sight:
     believed: Float[Tensor, "h w"] | None = None
     """Alpha at the wider camera as far as photographs support it; None where nothing is
     doubted."""
+    stereo: Stereo | None = None
+    """What stereo among the photographs shows there; None where nothing is doubted."""
 
     @property
     def alpha(self) -> Float[Tensor, "h w"]:
@@ -293,21 +296,16 @@ class GSCompleter:
 
     def synthesize(self, sights: Sequence[Sight], at_views: Sequence[Render]) -> list[Synthesized]:
         """Stage 2: Φ's image at each of the wider cameras."""
-        max_alpha = self.config.holes.max_alpha
-        asked = [
-            (
-                sight.window.wide,
-                SceneContext(
-                    sight.completion.views,
-                    tuple(at_views),
-                    sight.frozen.context,
-                    max_alpha,
-                    sight.believed,
-                ),
-            )
-            for sight in sights
-        ]
+        asked = [(sight.window.wide, self.known(sight, at_views)) for sight in sights]
         return synthesize_all(self.generator, asked) if asked else []
+
+    def known(self, sight: Sight, at_views: Sequence[Render]) -> SceneContext:
+        """What Φ is told of the scene."""
+        drawn, max_alpha = sight.frozen.context, self.config.holes.max_alpha
+        context = SceneContext(
+            sight.completion.views, tuple(at_views), drawn, max_alpha, sight.believed
+        )
+        return context if sight.stereo is None else corrected(context, sight.stereo)
 
     def lift(self, sight: Sight, reference: Synthesized) -> Lift:
         """Stage 2: the image as Gaussians, those that lie near a hole."""
@@ -416,6 +414,22 @@ class GSCompleter:
             frozen,
             select_anchor(window.target, completion.views, self.config.anchor),
             self.believed(completion, frozen.context, window.wide),
+            self.stereo(completion, frozen.context, window),
+        )
+
+    def stereo(self, completion: Completion, drawn: Render, window: Window) -> Stereo | None:
+        """What stereo among the photographs shows to the wider camera; None where nothing is
+        doubted, or there is nothing to complete."""
+        cameras = [view.camera for view in completion.views]
+        if completion.evidence is None or any(same_camera(window.target, c) for c in cameras):
+            return None
+        return stereo_among(
+            completion.views,
+            window.wide,
+            drawn,
+            self.reconstructor,
+            self.renderer,
+            self.config.support,
         )
 
     def believed(self, completion: Completion, drawn: Render, camera: Camera) -> Tensor | None:
@@ -438,7 +452,7 @@ class GSCompleter:
 
     def evidence(self, scene: Gaussians, views: Sequence[View]) -> Evidence | None:
         """What the photographs show of a scene that was brought; None where nothing is doubted."""
-        if self.config.support.min_support is None:
+        if not self.config.support.doubts:
             return None
         return gather_evidence(scene, views, self.renderer, self.config.support)
 
@@ -463,6 +477,8 @@ class GSCompleter:
         if not doubtful.any():
             return sight
         taken = not_needed(scene, doubtful, views, self.renderer)
+        if not taken.any():
+            return sight
         return self.sight(without(completion, taken), sight.window.target)
 
     def window(self, completion: Completion, target: Camera) -> Window:

@@ -24,7 +24,7 @@ from gscompleter.commands.opening import (
 from gscompleter.commands.options import CompleteOptions
 from gscompleter.commands.output import holds_poses_only, opened_as, saying_what_stays
 from gscompleter.commands.understood import understood
-from gscompleter.completer import Clock, GSCompleter, total
+from gscompleter.completer import Clock, GSCompleter, ranged, total
 from gscompleter.config import CompleterConfig
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
@@ -63,7 +63,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     completer = completer_for(options, task.targets, device)
     clock = Clock()
     with clock("context"):
-        task = replace(task, views=ranged(task, completer))
+        task = with_planes_of(task, completer)
     before = clock.seconds
     say(console, *understood(options, opened, task, device))
     overwrite = options.overwrite or holds_poses_only(options.out)
@@ -79,10 +79,10 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     return summary, completion
 
 
-def ranged(task: Task, completer: GSCompleter) -> list[View]:
-    """The photographs, their cameras with the depth range that is worked in."""
+def with_planes_of(task: Task, completer: GSCompleter) -> Task:
+    """`task`, its photographs with the depth range that is worked in."""
     near, far = completer.depth_range(task.views, task.scene)
-    return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in task.views]
+    return replace(task, views=[ranged(view, near, far) for view in task.views])
 
 
 def said_in_advance(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -194,10 +194,8 @@ def with_witnesses(task: Task, given: Photographs) -> Task:
     taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
     others = [frame for frame in range(len(given)) if frame not in taken]
     cameras = usable_cameras(given, others, WITNESS_SIDE)
-    centers = torch.stack([target.camera.center for target in task.targets])
-    remoteness = {f: (centers - c.center).norm(dim=-1).min().item() for f, c in cameras.items()}
     views = []
-    for frame in sorted(sorted(cameras, key=remoteness.__getitem__)[:MAX_WITNESSES]):
+    for frame in closest([t.camera for t in task.targets], cameras, MAX_WITNESSES):
         with suppress(InputError):
             views += given.views([frame], WITNESS_SIDE)
     return replace(task, witnesses=[view.to(task.views[0].image.device) for view in views])
@@ -273,16 +271,21 @@ def usable_cameras(
     return cameras
 
 
+def closest(targets: Sequence[Camera], cameras: Mapping[int, Camera], count: int) -> list[int]:
+    """The frames, ascending, whose cameras stand closest to a target."""
+    centers = torch.stack([target.center for target in targets])
+    distance = {f: (centers - c.center).norm(dim=-1).min().item() for f, c in cameras.items()}
+    return sorted(sorted(cameras, key=distance.__getitem__)[:count])
+
+
 def points_told(
     given: Photographs, targets: Sequence[Camera], cameras: dict[int, Camera]
 ) -> Float[Tensor, "n 3"]:
     """About where the targets see the scene, by the depth range, as known or told by features."""
     near, far = given.near, given.far
     if near is None or far is None:
-        centers = torch.stack([target.center for target in targets])
-        distance = {f: (centers - c.center).norm(dim=-1).min().item() for f, c in cameras.items()}
-        closest = sorted(sorted(cameras, key=distance.__getitem__)[:WITNESSES])
-        low, high = estimate_depth_range(given.views(closest, WITNESS_SIDE))
+        frames = closest(targets, cameras, WITNESSES)
+        low, high = estimate_depth_range(given.views(frames, WITNESS_SIDE))
         near, far = low if near is None else near, high if far is None else far
     return torch.cat([points_before(target, near, far) for target in targets])
 

@@ -102,9 +102,9 @@ class SupportConfig(Settings):
     """What is doubted of a scene that was brought. Of one that Ψ made of the photographs nothing
     is."""
 
-    min_support: Share | None = 0.5
-    """Support by the photographs under which a Gaussian counts as none when holes are looked for.
-    None doubts nothing, as in the paper."""
+    doubts: bool = True
+    """Whether what the scene shows counts only as far as its photographs support it. Without, it is
+    taken as it is, as in the paper."""
     max_difference: Annotated[float, Interval(gt=0, le=1)] = 0.08
     """Difference of colour, in [0, 1], from a photograph at which the scene's agreement with it has
     fallen to 1/e. Where the whole scene is less exact, it grows in proportion."""
@@ -211,7 +211,7 @@ class CompleterConfig(Settings):
             refine=RefineConfig(iterations=30, learning_rate=0.08),
             holes=HoleConfig(neighbourhood=None),
             harm=HarmConfig(tolerance=None),
-            support=SupportConfig(min_support=None),
+            support=SupportConfig(doubts=False),
         )
 
 
