@@ -19,13 +19,16 @@ from torch.nn.functional import pad
 from gscompleter.config import ReconcileConfig
 from gscompleter.progress import track
 from gscompleter.render import FrozenView
-from gscompleter.types import Gaussians, Render, View
+from gscompleter.types import SH_C0, Gaussians, Render, View
 
 FAINT = 0.2
 """Share of its opacity with which something new begins. It grows where it is welcome, which harms
 less on the way than fading does where it is not."""
 GOAL = 0.99
 """Share of its allowed error that a photograph is brought to, so that it holds once all is done."""
+
+MAX_BAND = 0.2
+"""Largest coefficient of spherical harmonics beyond the constant."""
 
 
 def reconcile(
@@ -81,6 +84,7 @@ def reconcile(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+        keep_colours(sh)
         losses.append(loss.item())
     fitted = replace(added, opacities=logits.sigmoid().detach(), sh=sh.detach(), encoded=None)
     return fitted, tuple(losses)
@@ -101,6 +105,16 @@ class Turns:
         chosen = [*worst, *others[: count - len(worst)]]
         self._waiting = [*others[count - len(worst) :], *chosen]
         return chosen
+
+
+@torch.no_grad()
+def keep_colours(sh: Float[Tensor, "n k 3"]) -> None:
+    """Bring colours back into [0, 1], and what they change by with the direction to less than that.
+
+    What is seen from few sides would else glitter from the others.
+    """
+    sh[:, 0].clamp_(-0.5 / SH_C0, 0.5 / SH_C0)
+    sh[:, 1:].clamp_(-MAX_BAND, MAX_BAND)
 
 
 def hole_error(drawn: Render, reference: View, holes: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
