@@ -26,7 +26,6 @@ FAINT = 0.2
 less on the way than fading does where it is not."""
 GOAL = 0.99
 """Share of its allowed error that a photograph is brought to, so that it holds once all is done."""
-
 MAX_BAND = 0.2
 """Largest coefficient of spherical harmonics beyond the constant."""
 
@@ -73,7 +72,8 @@ def reconcile(
         error = (drawn(frozen_views[k]).image - views[k].image).square().mean()
         return (error / max(allowed_errors[k], 1e-12) - GOAL).clamp_min(0.0)
 
-    turns = Turns([excess(k).item() for k in range(len(views))])
+    with torch.no_grad():
+        turns = Turns([excess(k).item() for k in range(len(views))])
     losses = []
     for _ in track(range(config.iterations), "Reconciling"):
         loss = hole_error(drawn(frozen_target), reference, holes) / before
