@@ -18,7 +18,6 @@ from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import project, same_camera, sample, widened
 from gscompleter.masks import dilate
-from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, load_renderer
 from gscompleter.stages.anchor import (
@@ -28,7 +27,7 @@ from gscompleter.stages.anchor import (
     select_anchor,
     synthesize_all,
 )
-from gscompleter.stages.context import depth_range_of_scene, init_context
+from gscompleter.stages.context import init_context, working_range
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
     do_no_harm,
@@ -187,7 +186,7 @@ class GSCompleter:
             )
         clock = Clock()
         with clock("context"):
-            near, far = self.depth_range(views, scene)
+            near, far = working_range(views, scene, self.renderer)
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
             context = init_context(self.reconstructor, views) if scene is None else scene
@@ -489,13 +488,6 @@ class GSCompleter:
     def holes(self, sight: Sight) -> Bool[Tensor, "h w"]:
         """Where the scene has a hole at the wider camera, by the settings of this completer."""
         return hole_mask(sight.alpha, self.config.holes)
-
-    def depth_range(self, views: Sequence[View], scene: Gaussians | None) -> tuple[float, float]:
-        """Near and far plane in scene units: as given, else estimated from what there is."""
-        if scene is None:
-            return depth_range_of(views)
-        cameras = [view.camera for view in views]
-        return depth_range_of(views, lambda _: depth_range_of_scene(scene, cameras, self.renderer))
 
     def allowed_errors(
         self, context: Gaussians, views: Sequence[View], tolerance: float

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +20,24 @@ from gscompleter.commands.opening import (
     open_scene,
     read_photographs,
     say,
+    with_working_range,
 )
 from gscompleter.commands.options import CleanOptions
-from gscompleter.commands.output import holds_poses_only, opened_as, saying_what_stays
+from gscompleter.commands.output import (
+    opened_as,
+    replaceable,
+    saying_what_stays,
+    settings_of,
+)
 from gscompleter.commands.understood import found_out
-from gscompleter.completer import Clock, ranged
+from gscompleter.completer import Clock
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import SUMMARY, check_output, output_folder
-from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.metrics.image import psnr
 from gscompleter.progress import shown_on
 from gscompleter.render import Renderer, choose_device, load_renderer
 from gscompleter.reports.completion import save_brought
 from gscompleter.stages.cleaning import superfluous
-from gscompleter.stages.context import depth_range_of_scene
 from gscompleter.types import Gaussians
 
 
@@ -54,22 +57,21 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
             cameras that were found.
     """
     console = Console(stderr=True, quiet=options.quiet)
-    overwrite = options.overwrite or holds_poses_only(options.out)
-    check_output(options.out, overwrite)
+    check_output(options.out, replaceable(options))
     check_context(options)
     device = choose_device(options.device)
     renderer, clock = load_renderer(device), Clock(())
     opened = open_scene(options, console)
     task = read_photographs(options, opened, device)
-    task = with_planes_of(in_frame_of_splat(task, options.scene, options, opened), renderer)
+    task = in_frame_of_splat(task, options.scene, options, opened)
+    task = with_working_range(task, renderer)
     plan = f"judged by {len(task.views)} photographs on {device}, written to {quoted(options.out)}"
     say(console, *found_out(options, opened, task), f"To do: {plan}.")
-    overwrite = options.overwrite or holds_poses_only(options.out)
-    with output_folder(options.out, overwrite) as folder:
+    with output_folder(options.out, replaceable(options)) as folder:
         with shown_on(None if options.quiet else console), clock("clean"):
             taken = superfluous(splat_of(task), task.views, renderer, options.config)
-        said = {"settings": settings_of(options), "device": device}
-        said |= opened_as(options, opened, task)
+        settings = settings_of(options, options.config, targets={}, models={})
+        said = {"settings": settings, "device": device, **opened_as(options, opened, task)}
         summary = said | scores(task, taken, renderer) | {"seconds": clock.seconds}
         write(folder, task, taken, {"version": __version__, **summary})
     return summary
@@ -79,29 +81,6 @@ def splat_of(task: Task) -> Gaussians:
     """The splat that was brought."""
     assert task.scene is not None
     return task.scene
-
-
-def with_planes_of(task: Task, renderer: Renderer) -> Task:
-    """`task`, its cameras with the depth range that the splat tells where nobody else does."""
-    cameras = [view.camera for view in task.views]
-    near, far = depth_range_of(
-        task.views, lambda _: depth_range_of_scene(splat_of(task), cameras, renderer)
-    )
-    return replace(task, views=[ranged(view, near, far) for view in task.views])
-
-
-def settings_of(options: CleanOptions) -> dict[str, Any]:
-    """Everything that decided the result, for `summary.json`."""
-    return {
-        "folder": str(options.folder),
-        "format": options.format,
-        "context": None if options.context is None else list(options.context),
-        "scene": str(options.scene),
-        "resolution": options.resolution,
-        "near": options.near,
-        "far": options.far,
-        "config": asdict(options.config),
-    }
 
 
 def scores(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str, Any]:

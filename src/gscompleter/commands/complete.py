@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,17 @@ from gscompleter.commands.opening import (
     read_task,
     say,
     with_witnesses,
+    with_working_range,
 )
 from gscompleter.commands.options import CompleteOptions
-from gscompleter.commands.output import holds_poses_only, opened_as, saying_what_stays
+from gscompleter.commands.output import (
+    opened_as,
+    replaceable,
+    saying_what_stays,
+    settings_of,
+)
 from gscompleter.commands.understood import understood
-from gscompleter.completer import Clock, GSCompleter, ranged, total
+from gscompleter.completer import Clock, GSCompleter, total
 from gscompleter.config import CompleterConfig
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
@@ -51,7 +57,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
             cameras that were found.
     """
     console = Console(stderr=True, quiet=options.quiet)
-    check_output(options.out, options.overwrite or holds_poses_only(options.out))
+    check_output(options.out, replaceable(options))
     check_context(options)
     check_targets(options)
     device = choose_device(options.device)
@@ -63,11 +69,10 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     completer = completer_for(options, task.targets, device)
     clock = Clock()
     with clock("context"):
-        task = with_planes_of(task, completer)
+        task = with_working_range(task, completer.renderer)
     before = clock.seconds
     say(console, *understood(options, opened, task, device))
-    overwrite = options.overwrite or holds_poses_only(options.out)
-    with output_folder(options.out, overwrite) as folder:
+    with output_folder(options.out, replaceable(options)) as folder:
         with shown_on(None if options.quiet else console):
             cameras = [target.camera.to(device) for target in task.targets]
             completion = completer(task.views, cameras, task.scene, task.witnesses)
@@ -79,18 +84,13 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     return summary, completion
 
 
-def with_planes_of(task: Task, completer: GSCompleter) -> Task:
-    """`task`, its photographs with the depth range that is worked in."""
-    near, far = completer.depth_range(task.views, task.scene)
-    return replace(task, views=[ranged(view, near, far) for view in task.views])
-
-
 def said_in_advance(
     options: CompleteOptions, opened: Opened, task: Task, device: str
 ) -> dict[str, Any]:
     """What `summary.json` says of a completion besides its scores."""
+    targets = {"target": list(options.target)}
     return {
-        "settings": settings_of(options),
+        "settings": settings_of(options, stages_of(options), targets, models_of(options)),
         "seed": options.seed,
         "device": device,
         **opened_as(options, opened, task),
@@ -122,22 +122,13 @@ def stages_of(options: CompleteOptions) -> CompleterConfig:
     return replace(options.config, support=support)
 
 
-def settings_of(options: CompleteOptions) -> dict[str, Any]:
-    """Everything that decided the result, for `summary.json`."""
+def models_of(options: CompleteOptions) -> dict[str, Any]:
+    """The models that decided the result, for `summary.json`."""
     return {
-        "folder": str(options.folder),
-        "format": options.format,
-        "context": None if options.context is None else list(options.context),
-        "target": list(options.target),
-        "scene": None if options.scene is None else str(options.scene),
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
         **options.synthesis.as_summary(),
         "uses_target_photographs": options.synthesis.name == "oracle",
-        "resolution": options.resolution,
-        "near": options.near,
-        "far": options.far,
-        "config": asdict(stages_of(options)),
     }
 
 

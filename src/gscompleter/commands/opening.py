@@ -16,6 +16,7 @@ from rich.console import Console
 from torch import Tensor
 
 from gscompleter.commands.options import CompleteOptions, SceneOptions, working_size
+from gscompleter.completer import ranged
 from gscompleter.data.formats import open_photographs, recognised
 from gscompleter.data.framing import Resolution
 from gscompleter.data.origin import frame_from_photographs, origin_of, told_from
@@ -33,9 +34,10 @@ from gscompleter.io.ply import drawable_rows
 from gscompleter.matching.depth_range import estimate_depth_range
 from gscompleter.memory import check_memory
 from gscompleter.progress import shown_on
-from gscompleter.render import load_renderer
+from gscompleter.render import Renderer, load_renderer
 from gscompleter.reports.completion import Brought, Target
 from gscompleter.splats.formats import format_of, load_splat
+from gscompleter.stages.context import working_range
 from gscompleter.stages.selection import points_before, select_context
 from gscompleter.types import Camera, Gaussians, View
 
@@ -199,6 +201,12 @@ def with_witnesses(task: Task, given: Photographs) -> Task:
         with suppress(InputError):
             views += given.views([frame], WITNESS_SIDE)
     return replace(task, witnesses=[view.to(task.views[0].image.device) for view in views])
+
+
+def with_working_range(task: Task, renderer: Renderer) -> Task:
+    """`task`, its photographs with the depth range that is worked in."""
+    near, far = working_range(task.views, task.scene, renderer)
+    return replace(task, views=[ranged(view, near, far) for view in task.views])
 
 
 def rows_kept(path: Path) -> Bool[Tensor, "n"] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +11,8 @@ from typing import Any
 
 from gscompleter.commands.opening import POSES, Opened, Task
 from gscompleter.commands.options import SceneOptions
+from gscompleter.config import CompleterConfig
+from gscompleter.config.cleaning import CleaningConfig
 from gscompleter.io.files import SUMMARY
 
 
@@ -31,6 +33,33 @@ def opened_as(options: SceneOptions, opened: Opened, task: Task) -> dict[str, An
         },
         "depth_range": {"near": camera.near, "far": camera.far, "from": asdict(task.depths)},
     }
+
+
+def settings_of(
+    options: SceneOptions,
+    config: CompleterConfig | CleaningConfig,
+    targets: Mapping[str, Any],
+    models: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Everything that decided the result: what was opened, the targets and the models where there
+    are any, and `config`."""
+    return {
+        "folder": str(options.folder),
+        "format": options.format,
+        "context": None if options.context is None else list(options.context),
+        **targets,
+        "scene": None if options.scene is None else str(options.scene),
+        **models,
+        "resolution": options.resolution,
+        "near": options.near,
+        "far": options.far,
+        "config": asdict(config),
+    }
+
+
+def replaceable(options: SceneOptions) -> bool:
+    """Whether what lies in the output folder may give way to the result."""
+    return options.overwrite or holds_poses_only(options.out)
 
 
 def holds_poses_only(out: Path) -> bool:

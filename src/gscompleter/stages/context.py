@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 
 from gscompleter.errors import InputError
+from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.reconstructors import Reconstructor, reconstructed
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, View
@@ -16,6 +17,17 @@ from gscompleter.types import Camera, Gaussians, View
 def init_context(reconstructor: Reconstructor, views: Sequence[View]) -> Gaussians:
     """`G_ctx = Ψ(views)`: the Gaussians of the observed regions (paper, Eq. 5)."""
     return reconstructed(reconstructor, views).gaussians
+
+
+def working_range(
+    views: Sequence[View], scene: Gaussians | None, renderer: Renderer
+) -> tuple[float, float]:
+    """Near and far plane in scene units: as given, else told by `scene` where one was brought, or
+    by the photographs."""
+    if scene is None:
+        return depth_range_of(views)
+    cameras = [view.camera for view in views]
+    return depth_range_of(views, lambda _: depth_range_of_scene(scene, cameras, renderer))
 
 
 def depth_range_of_scene(
