@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -129,17 +129,10 @@ def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
     Raises:
         InputError: where one does not exist, is impossible or cannot be read.
     """
-    given, resolution = opened.photographs, working_size(options.resolution)
+    given = opened.photographs
     targets = read_targets(given, options)
     frames = options.context or chosen_context(options, given, targets)
-    ranged = with_depth_range(given, frames, resolution)
-    depths = depth_source(options, given, ranged)
-    targets = [replace(t, camera=with_planes(t.camera, ranged)) for t in targets]
-    cameras = [ranged.camera(frame, resolution) for frame in frames]
-    check_sizes([*cameras, *(target.camera for target in targets)])
-    views = [view.to(device) for view in ranged.views(frames, resolution)]
-    targets = [with_photograph(target, ranged, resolution) for target in targets]
-    return Task(views, targets, frame_from_photographs(given.origin), given.origin, depths)
+    return task_of(options, given, frames, targets, device, check_sizes)
 
 
 def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task:
@@ -155,11 +148,27 @@ def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task
             f"No photograph of {quoted(options.folder)} can be used; bring those that the splat "
             "was trained on."
         )
-    ranged = with_depth_range(given, frames, resolution)
-    depths = depth_source(options, given, ranged)
-    check_sides([ranged.camera(frame, resolution) for frame in frames])
-    views = [view.to(device) for view in ranged.views(frames, resolution)]
-    return Task(views, (), frame_from_photographs(given.origin), given.origin, depths)
+    return task_of(options, given, frames, (), device, check_sides)
+
+
+def task_of(
+    options: SceneOptions,
+    given: Photographs,
+    frames: Sequence[int],
+    targets: Sequence[Target],
+    device: str,
+    check: Callable[[Sequence[Camera]], None],
+) -> Task:
+    """The photographs of `frames`, and the targets with theirs, once their cameras pass `check`."""
+    resolution = working_size(options.resolution)
+    bounded = with_depth_range(given, frames, resolution)
+    targets = [replace(t, camera=with_planes(t.camera, bounded)) for t in targets]
+    cameras = [bounded.camera(frame, resolution) for frame in frames]
+    check([*cameras, *(target.camera for target in targets)])
+    views = [view.to(device) for view in bounded.views(frames, resolution)]
+    targets = [with_photograph(target, bounded, resolution) for target in targets]
+    depths = depth_source(options, given, bounded)
+    return Task(views, targets, frame_from_photographs(given.origin), given.origin, depths)
 
 
 def in_frame_of_splat(task: Task, path: Path, options: SceneOptions, opened: Opened) -> Task:
@@ -298,7 +307,7 @@ def points_told(
     return torch.cat([points_before(target, near, far) for target in targets])
 
 
-def depth_source(options: SceneOptions, given: Photographs, ranged: Photographs) -> DepthSource:
+def depth_source(options: SceneOptions, given: Photographs, bounded: Photographs) -> DepthSource:
     """Who told each end of the depth range: who comes first."""
 
     def teller(name: str) -> str:
@@ -306,7 +315,7 @@ def depth_source(options: SceneOptions, given: Photographs, ranged: Photographs)
             return "given"
         if getattr(given, name) is not None:
             return "scene"
-        if getattr(ranged, name) is not None:
+        if getattr(bounded, name) is not None:
             return "points"
         return "features" if options.scene is None else "splat"
 
