@@ -114,7 +114,13 @@ def test_the_summary_says_what_was_opened_and_between_which_depths(chosen):
 def test_too_few_photographs_beside_the_targets_are_refused(scene, tmp_path, monkeypatch, capsys):
     words = ["complete", scene, "--out", tmp_path / "out", "--target", 0, 1, 2, 3]
     assert run(monkeypatch, *words) == 2
-    assert "Besides the targets there are 1 photographs that can be used" in capsys.readouterr().err
+    assert (
+        "Besides the targets there is 1 photograph that can be used, and at least 2 are needed;"
+    ) in capsys.readouterr().err
+    assert run(monkeypatch, *words, 4) == 2
+    assert (
+        "Besides the targets there are 0 photographs that can be used, and at least 2 are needed;"
+    ) in capsys.readouterr().err
 
 
 def foreign(given: Path, path: Path) -> Path:

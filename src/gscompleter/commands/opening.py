@@ -261,9 +261,11 @@ def chosen_context(
     resolution = working_size(options.resolution)
     cameras = usable_cameras(given, [f for f in range(len(given)) if f not in asked], resolution)
     if len(cameras) < needed_views(options):
+        there = "is 1 photograph" if len(cameras) == 1 else f"are {len(cameras)} photographs"
+        needed = "1 is" if needed_views(options) == 1 else f"{needed_views(options)} are"
         raise InputError(
-            f"Besides the targets there are {len(cameras)} photographs that can be used, and at "
-            f"least {needed_views(options)} are needed; name fewer targets, or add photographs."
+            f"Besides the targets there {there} that can be used, and at least {needed} needed; "
+            "name fewer targets, or add photographs."
         )
     points = given.points()
     if points is None or len(points) == 0:
