@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+import plyfile
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -17,6 +19,7 @@ from torch import Tensor
 from gscompleter.data.scene import write_cameras
 from gscompleter.generators import Request, Synthesis, as_generator
 from gscompleter.io.image import write_image
+from gscompleter.io.ply import save_ply
 from gscompleter.types import (
     Camera,
     DepthMap,
@@ -137,6 +140,18 @@ def reconstruction_of(
         torch.cat([torch.full((d.numel(),), i) for i, d in enumerate(depths)]),
         torch.cat([torch.arange(d.numel()) for d in depths]),
     )
+
+
+def labelled(path: Path, scene: Gaussians) -> Path:
+    """`path`, with the scene as another program writes it: a column of its own numbers the rows."""
+    save_ply(path, scene)
+    vertex = plyfile.PlyData.read(str(path))["vertex"].data
+    rows = np.zeros(len(vertex), [("label", "<i4"), *vertex.dtype.descr])
+    for name in vertex.dtype.names:
+        rows[name] = vertex[name]
+    rows["label"] = np.arange(len(rows))
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(str(path))
+    return path
 
 
 def random_gaussians(n: int, seed: int = 0, sh_degree: int = 0) -> Gaussians:

@@ -5,20 +5,19 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
-import numpy as np
 import plyfile
 import pytest
 import torch
 
 from command import run
 from gscompleter.config.cleaning import CleaningConfig
-from gscompleter.io.ply import load_ply, save_ply
+from gscompleter.io.ply import load_ply
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
 from gscompleter.stages.cleaning import change_without, superfluous, unwanted
 from gscompleter.stages.integration import squared_error
 from gscompleter.types import View, merge, sh_from_rgb
-from scenes import Room, camera_at, gaussians_of, photographed, view_of
+from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 
 RENDERER = load_renderer("cpu")
 SIZE = 64
@@ -125,20 +124,8 @@ def scene(tmp_path):
     return photographed(tmp_path / "scene", CAMERAS)
 
 
-def labelled(path):
-    """SCENE as another program writes it, with a column of its own."""
-    save_ply(path, SCENE)
-    vertex = plyfile.PlyData.read(str(path))["vertex"].data
-    rows = np.zeros(len(vertex), [("label", "<i4"), *vertex.dtype.descr])
-    for name in vertex.dtype.names:
-        rows[name] = vertex[name]
-    rows["label"] = np.arange(len(rows))
-    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(str(path))
-    return path
-
-
 def test_the_command_cleans_and_strip_puts_back(scene, tmp_path, monkeypatch):
-    splat, out = labelled(tmp_path / "splat.ply"), tmp_path / "out"
+    splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *clean(scene, splat, out)) == 0
     kept, removed = load_ply(out / "completed.ply"), load_ply(out / "removed.ply")
     assert len(kept) + len(removed) == len(SCENE)
@@ -157,7 +144,7 @@ def test_the_command_cleans_and_strip_puts_back(scene, tmp_path, monkeypatch):
 
 
 def test_the_command_says_what_it_did(scene, tmp_path, monkeypatch, capsys):
-    splat = labelled(tmp_path / "splat.ply")
+    splat = labelled(tmp_path / "splat.ply", SCENE)
     words = [word for word in clean(scene, splat, tmp_path / "out") if word != "--quiet"]
     assert run(monkeypatch, *words, "--context", 0, 2) == 0
     said = capsys.readouterr()
@@ -177,7 +164,7 @@ def test_the_command_says_what_it_did(scene, tmp_path, monkeypatch, capsys):
     ],
 )
 def test_wrong_input_gets_a_sentence(scene, tmp_path, monkeypatch, capsys, more, sentence):
-    splat, out = labelled(tmp_path / "splat.ply"), tmp_path / "out"
+    splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *clean(scene, splat, out, *more)) == 2
     said = capsys.readouterr().err
     assert said.startswith("gscompleter: ")
@@ -190,6 +177,6 @@ def test_a_folder_with_something_in_it_is_kept(scene, tmp_path, monkeypatch):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
-    splat = labelled(tmp_path / "splat.ply")
+    splat = labelled(tmp_path / "splat.ply", SCENE)
     assert run(monkeypatch, *clean(scene, splat, out)) == 2
     assert [file.name for file in out.iterdir()] == ["mine.txt"]

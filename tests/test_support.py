@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-import plyfile
 import pytest
 import torch
 
@@ -22,7 +20,15 @@ from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.stereo import corrected, stereo_among
 from gscompleter.stages.support import believed_alpha, gather_evidence, pixel_sums, support
 from gscompleter.types import SceneContext, merge, sh_from_rgb
-from scenes import Room, camera_at, gaussians_of, photographed, reconstruction_of, view_of
+from scenes import (
+    Room,
+    camera_at,
+    gaussians_of,
+    labelled,
+    photographed,
+    reconstruction_of,
+    view_of,
+)
 
 RENDERER = load_renderer("cpu")
 SIZE = 64
@@ -231,14 +237,7 @@ def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
 
 def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch):
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
-    ours, splat, out = tmp_path / "ours.ply", tmp_path / "splat.ply", tmp_path / "out"
-    save_ply(ours, SCENE)
-    vertex = plyfile.PlyData.read(str(ours))["vertex"].data
-    rows = np.zeros(len(vertex), [("label", "<i4"), *vertex.dtype.descr])
-    for name in vertex.dtype.names:
-        rows[name] = vertex[name]
-    rows["label"] = np.arange(len(rows))
-    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(str(splat))
+    splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *complete(scene, splat, out)) == 0
     assert len(load_ply(out / "removed.ply")) > 0
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
