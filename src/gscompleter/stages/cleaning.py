@@ -22,8 +22,8 @@ from torch.nn.functional import avg_pool2d
 from gscompleter.config.cleaning import CleaningConfig
 from gscompleter.progress import track
 from gscompleter.render import OpacityRender, Renderer
-from gscompleter.stages.integration import error_slope, error_with_loss, squared_error
-from gscompleter.stages.setting_aside import needed
+from gscompleter.stages.integration import error_slope, error_with_loss
+from gscompleter.stages.setting_aside import error_of, without_needed
 from gscompleter.stages.support import pixel_sums
 from gscompleter.types import Gaussians, View
 
@@ -123,26 +123,6 @@ def mean_squares(
     return squares / probes / image.numel()
 
 
-def without_needed(
-    scene: Gaussians,
-    doubtful: Bool[Tensor, "n"],
-    views: Sequence[View],
-    allowed: Sequence[float],
-    renderer: Renderer,
-) -> Bool[Tensor, "n"]:
-    """The `doubtful` Gaussians but for those that a photograph needs most, no more of them than it
-    takes for its error to be allowed."""
-    candidates, rest = scene[doubtful], scene[~doubtful]
-    missing = torch.ones(len(candidates), dtype=torch.bool, device=doubtful.device)
-    before = None
-    while before is None or not torch.equal(missing, before):
-        before = missing
-        for view, error in zip(views, allowed, strict=True):
-            plan = renderer.freeze(rest, view.camera).plan(candidates)
-            missing = missing & ~needed(plan, candidates.opacities, missing, view.image, error)
-    return doubtful.masked_scatter(doubtful, missing)
-
-
 def guarded(
     scene: Gaussians,
     taken: Bool[Tensor, "n"],
@@ -170,8 +150,3 @@ def halved(view: View) -> View:
     K = view.camera.K * view.camera.K.new_tensor([[0.5], [0.5], [1.0]])
     camera = replace(view.camera, K=K, height=image.shape[0], width=image.shape[1])
     return replace(view, image=image, camera=camera, depth=None)
-
-
-def error_of(scene: Gaussians, view: View, renderer: Renderer) -> Float[Tensor, ""]:
-    """Mean squared error of the scene against a photograph."""
-    return squared_error(renderer.render(scene, view.camera).image, view.image)

@@ -34,19 +34,33 @@ def not_needed(
     matched as well as by the whole scene.
     """
     doubtful = doubtful & ~wanted(scene, doubtful, views, renderer)
+    if not doubtful.any():
+        return doubtful
+    allowed = [error_of(scene, view, renderer).item() for view in views]
+    return without_needed(scene, doubtful, views, allowed, renderer)
+
+
+def without_needed(
+    scene: Gaussians,
+    doubtful: Bool[Tensor, "n"],
+    views: Sequence[View],
+    allowed: Sequence[float],
+    renderer: Renderer,
+) -> Bool[Tensor, "n"]:
+    """The `doubtful` Gaussians but for those that a photograph needs most, no more of them than it
+    takes for its mean squared error to be `allowed`.
+
+    What is put back for one photograph may change another, so they are asked until all agree.
+    """
     candidates, rest = scene[doubtful], scene[~doubtful]
     missing = torch.ones(len(candidates), dtype=torch.bool, device=doubtful.device)
-    waiting = list(views)
-    while waiting and missing.any():
+    before = None
+    while before is None or not torch.equal(missing, before):
         before = missing
-        for view in waiting:
-            allowed = squared_error(renderer.render(scene, view.camera).image, view.image).item()
+        for view, error in zip(views, allowed, strict=True):
             plan = renderer.freeze(rest, view.camera).plan(candidates)
-            missing = missing & ~needed(plan, candidates.opacities, missing, view.image, allowed)
-        waiting = [] if torch.equal(missing, before) else waiting
-    result = doubtful.clone()
-    result[doubtful] = missing
-    return result
+            missing = missing & ~needed(plan, candidates.opacities, missing, view.image, error)
+    return doubtful.masked_scatter(doubtful, missing)
 
 
 def wanted(
@@ -82,3 +96,8 @@ def needed(
         _, slope = error_slope(plan, photograph, torch.where(out, FADED, 1.0) * opacities)
         back = back | most_harmful(torch.where(out, -slope * opacities, 0.0), error - allowed)
     return back | (missing & (slope != 0))
+
+
+def error_of(scene: Gaussians, view: View, renderer: Renderer) -> Float[Tensor, ""]:
+    """Mean squared error of the scene against a photograph."""
+    return squared_error(renderer.render(scene, view.camera).image, view.image)
