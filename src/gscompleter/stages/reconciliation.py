@@ -9,7 +9,7 @@ paper's Eq. 13, on the condition that no photograph gets worse. The scene stays 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -58,36 +58,84 @@ def reconcile(
     """
     if config.iterations == 0 or len(added) == 0:
         return added, ()
-    k = (config.sh_degree + 1) ** 2
-    sh = pad(added.sh[:, :k], (0, 0, 0, max(k - added.sh.shape[1], 0))).clone().requires_grad_()
-    logits = (FAINT * added.opacities).logit(eps=1e-4).requires_grad_()
-    steps = [(logits, config.opacity_step), (sh, config.colour_step)]
-    optimizer = torch.optim.Adam([{"params": [part], "lr": step} for part, step in steps])
+    fit = Fit(added, config)
     before = hole_error(frozen_target.context, reference, holes).clamp_min(1e-12)
-
-    def drawn(frozen: FrozenView) -> Render:
-        return frozen.composite(replace(added, opacities=logits.sigmoid(), sh=sh, encoded=None))
-
-    def excess(k: int) -> Tensor:
-        error = (drawn(frozen_views[k]).image - views[k].image).square().mean()
-        return (error / max(allowed_errors[k], 1e-12) - GOAL).clamp_min(0.0)
-
+    asked = [Asked(*each) for each in zip(frozen_views, views, allowed_errors, strict=True)]
     with torch.no_grad():
-        turns = Turns([excess(k).item() for k in range(len(views))])
+        turns = Turns([fit.excess(photograph).item() for photograph in asked])
+    weight = config.photograph_weight / config.views_per_step
     losses = []
     for _ in track(range(config.iterations), "Reconciling"):
-        loss = hole_error(drawn(frozen_target), reference, holes) / before
-        for k in turns.take(config.views_per_step):
-            over = excess(k)
-            turns.excess[k] = over.item()
-            loss = loss + config.photograph_weight / config.views_per_step * over
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        keep_colours(sh)
+        loss = hole_error(fit.drawn(frozen_target), reference, holes) / before
+        for over in objections(fit, asked, turns, config.views_per_step):
+            loss = loss + weight * over
+        fit.step(loss)
         losses.append(loss.item())
-    fitted = replace(added, opacities=logits.sigmoid().detach(), sh=sh.detach(), encoded=None)
-    return fitted, tuple(losses)
+    return fit.fitted(), tuple(losses)
+
+
+def objections(
+    fit: Fit, asked: Sequence[Asked], turns: Turns, count: int
+) -> list[Float[Tensor, ""]]:
+    """The excess of the `count` photographs whose turn it is; `turns` learns it."""
+    chosen = turns.take(count)
+    found = [fit.excess(asked[k]) for k in chosen]
+    for k, over in zip(chosen, found, strict=True):
+        turns.excess[k] = over.item()
+    return found
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A photograph that is asked whether it agrees."""
+
+    frozen: FrozenView
+    """The scene frozen at its camera."""
+    view: View
+    """The photograph."""
+    allowed: float
+    """Largest mean squared error allowed in it."""
+
+
+class Fit:
+    """Opacities and colours of what is added, as far as they are fitted."""
+
+    def __init__(self, added: Gaussians, config: ReconcileConfig) -> None:
+        self._added = added
+        self._sh = widened(added.sh, (config.sh_degree + 1) ** 2).requires_grad_()
+        self._logits = (FAINT * added.opacities).logit(eps=1e-4).requires_grad_()
+        steps = [(self._logits, config.opacity_step), (self._sh, config.colour_step)]
+        self._optimizer = torch.optim.Adam([{"params": [part], "lr": lr} for part, lr in steps])
+
+    def gaussians(self) -> Gaussians:
+        """What is added, as it is now; differentiable."""
+        return replace(self._added, opacities=self._logits.sigmoid(), sh=self._sh, encoded=None)
+
+    def drawn(self, frozen: FrozenView) -> Render:
+        """The scene with it."""
+        return frozen.composite(self.gaussians())
+
+    def excess(self, photograph: Asked) -> Float[Tensor, ""]:
+        """By how much the error of a photograph is above its goal, relative to what is allowed."""
+        error = (self.drawn(photograph.frozen).image - photograph.view.image).square().mean()
+        return (error / max(photograph.allowed, 1e-12) - GOAL).clamp_min(0.0)
+
+    def step(self, loss: Float[Tensor, ""]) -> None:
+        """One step down the slope of `loss`; colours stay colours."""
+        self._optimizer.zero_grad()
+        loss.backward()
+        self._optimizer.step()
+        keep_colours(self._sh)
+
+    def fitted(self) -> Gaussians:
+        """What is added, as it was fitted."""
+        now = self.gaussians()
+        return replace(now, opacities=now.opacities.detach(), sh=now.sh.detach())
+
+
+def widened(sh: Float[Tensor, "n k 3"], count: int) -> Float[Tensor, "n l 3"]:
+    """A copy of spherical harmonics with `count` coefficients: the first of them, and zeros."""
+    return pad(sh[:, :count], (0, 0, 0, max(count - sh.shape[1], 0))).clone()
 
 
 class Turns:
