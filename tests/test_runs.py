@@ -2,10 +2,12 @@
 
 import json
 import mmap
+import os
 import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
@@ -15,6 +17,7 @@ import torch
 from chunk_files import as_tensor, example, save_chunk
 from command import run
 from gscompleter import GSCompleter, InputError, memory
+from gscompleter.baselines.reggs import RegGSConfig
 from gscompleter.completer import STAGES
 from gscompleter.data.cases import Case
 from gscompleter.io.image import read_image
@@ -22,6 +25,7 @@ from gscompleter.metrics.image import psnr
 from gscompleter.reports.plots import plots
 from gscompleter.reports.summary import gain_of, gains_by_gap, summarize
 from gscompleter.reports.tables import tables
+from gscompleter.runs import methods as runs_methods
 from gscompleter.runs import runner
 from gscompleter.runs.memory import peak_memory
 from gscompleter.runs.methods import BASELINES, METHODS, check_methods, methods_named
@@ -124,40 +128,49 @@ from gscompleter.data.cases import read_cases
 from gscompleter.runs.runner import RunConfig, evaluate
 from gscompleter.runs.tasks import task_of
 
-cases, out, methods, iterations, delay = sys.argv[1:]
+cases, out, methods, iterations, *delays = sys.argv[1:]
 
 def written():
     return {path for path in Path(out).rglob("*") if path.suffix in (".npz", ".json")}
 
-def die(before):
+def die(before, delay):
     while written() == before:
         time.sleep(0.005)
     time.sleep(float(delay))
     os.kill(os.getpid(), signal.SIGKILL)
 
-if delay != "never":
-    threading.Thread(target=die, args=(written(),), daemon=True).start()
-config = RunConfig(baseline_iterations=int(iterations))
-evaluate(list(map(task_of, read_cases(Path(cases)))), methods.split(), Path(out), config)
+def live(delay):
+    if delay != "never":
+        threading.Thread(target=die, args=(written(), delay), daemon=True).start()
+    config = RunConfig(baseline_iterations=int(iterations))
+    evaluate(list(map(task_of, read_cases(Path(cases)))), methods.split(), Path(out), config)
+    os._exit(0)
+
+for delay in delays:
+    child = os.fork()
+    if child == 0:
+        live(delay)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""A run that is killed some seconds after it has written something new, or never."""
+"""Runs one after the other, each killed some seconds after it has written something new, or never.
+What they import is imported once, before anything is computed."""
 
 
-def test_a_run_killed_five_times_ends_as_one_that_was_not(scenes, tmp_path):
+@pytest.mark.skipif(os.name != "posix", reason="forks, and kills with a POSIX signal")
+def test_a_run_killed_five_times_ends_as_one_that_was_not(scenes, finished, tmp_path):
     """Every life is a process of its own, as it is for a user."""
 
-    def live(out: Path, delay: float | str) -> int:
-        words = [scenes / "cases.json", out, " ".join(METHOD_NAMES), 6, delay]
-        life = subprocess.run([sys.executable, "-c", LIFE, *map(str, words)], check=False)
-        return life.returncode
+    def live(*delays: float | str) -> list[int]:
+        words = [scenes / "cases.json", out, " ".join(METHOD_NAMES), 6, *delays]
+        command = [sys.executable, "-c", LIFE, *map(str, words)]
+        lives = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+        return [int(code) for code in lives.stdout.split()]
 
-    out, whole, random = tmp_path / "out", tmp_path / "whole", Random(0)
-    for _ in range(5):
-        assert live(out, random.uniform(0, 0.05)) == -signal.SIGKILL
+    out, random = tmp_path / "out", Random(0)
+    assert live(*(random.uniform(0, 0.05) for _ in range(5))) == [-signal.SIGKILL] * 5
     assert 0 < len(list((out / "tasks").glob("*/*.json"))) < 8
-    assert live(out, "never") == live(whole, "never") == 0
-    tables(whole)
-    same_tables(out, whole)
+    assert live("never") == [0]
+    same_tables(out, finished)
 
 
 def test_failures_and_scores_can_be_done_again(tasks, tmp_path, monkeypatch):
@@ -293,7 +306,15 @@ def test_a_broken_case_is_a_row_with_its_reason(scenes, tasks, tmp_path, monkeyp
     assert "RuntimeError" in (out / "tables.md").read_text()
 
 
-def test_baselines_run(tasks, tmp_path):
+@dataclass(frozen=True)
+class CoarseRegGS(RegGSConfig):
+    """Few clusters, for the distance between two sets of them costs their number squared."""
+
+    components: int = 50
+
+
+def test_baselines_run(tasks, tmp_path, monkeypatch):
+    monkeypatch.setattr(runs_methods, "RegGSConfig", CoarseRegGS)
     out = tmp_path / "out"
     config = RunConfig(baseline_iterations=2)
     assert evaluate(tasks[:1], ("distill", "reggs"), out, config) == RowCounts(2, 0, 0)
