@@ -45,6 +45,10 @@ def complete(scene, out, *more, context=(0, 1), target=(2,)) -> list:
     return ["complete", scene, "--context", *context, "--target", *target, "--out", out, *more]
 
 
+SMALL = ("--resolution", 32, "--near", 0.5, "--far", 20, "--quiet")
+"""Where what is completed matters less than that it is."""
+
+
 @pytest.fixture(scope="module")
 def completed(scene, tmp_path_factory) -> Path:
     """The output of one plain run."""
@@ -108,7 +112,7 @@ def test_the_same_command_gives_the_same_bytes(scene, completed, tmp_path, monke
 def test_a_given_ply_is_kept_bit_for_bit(scene, completed, tmp_path, monkeypatch):
     given = completed / "context.ply"
     out = tmp_path / "out"
-    assert run(monkeypatch, *complete(scene, out, "--scene", given, "--quiet")) == 0
+    assert run(monkeypatch, *complete(scene, out, "--scene", given, *SMALL)) == 0
     assert (out / "context.ply").read_bytes() == given.read_bytes()
     mine, whole = load_ply(given), load_ply(out / "completed.ply")
     assert len(whole) > len(mine)
@@ -120,7 +124,7 @@ def test_cameras_from_a_file_are_completed_without_scores(scene, tmp_path, monke
     file = tmp_path / "targets.json"
     write_cameras(file, [camera_at(0.7, yaw=12, size=SIZE), camera_at(-0.9, yaw=-12, size=SIZE)])
     out = tmp_path / "out"
-    assert run(monkeypatch, *complete(scene, out, "--quiet", target=(file,))) == 0
+    assert run(monkeypatch, *complete(scene, out, *SMALL, target=(file,))) == 0
     rows = json.loads((out / "summary.json").read_text())["targets"]
     assert [(row["frame"], row["psnr_after"]) for row in rows] == [(None, None), (None, None)]
     assert set(load_ply(out / "completed.ply").generated.tolist()) == {0, 1, 2}
@@ -393,7 +397,7 @@ def test_a_ply_with_nan_is_refused_with_a_count_unless_they_are_dropped(
     gaussians.means[:3] = float("nan")
     damaged, out = tmp_path / "damaged.ply", tmp_path / "out"
     save_ply(damaged, gaussians)
-    arguments = complete(scene, out, "--quiet", "--scene", damaged)
+    arguments = complete(scene, out, *SMALL, "--scene", damaged)
     refused(monkeypatch, capsys, out, arguments, "--drop-nonfinite")
     assert run(monkeypatch, *arguments, "--drop-nonfinite") == 0
     assert len(load_ply(out / "context.ply")) == len(gaussians) - 3
@@ -408,7 +412,7 @@ def test_a_folder_with_something_in_it_is_kept_unless_overwritten(
     assert run(monkeypatch, *complete(scene, out)) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert [p.name for p in out.iterdir()] == ["mine.txt"]
-    assert run(monkeypatch, *complete(scene, out, "--overwrite", "--quiet")) == 0
+    assert run(monkeypatch, *complete(scene, out, "--overwrite", *SMALL)) == 0
     assert (out / "completed.ply").exists()
     assert (out / "mine.txt").read_text() == "precious"
 
@@ -446,7 +450,7 @@ def test_help_does_not_wait_for_torch():
 def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
     """The process is killed once it has begun to write so many files and folders."""
     out = tmp_path / "out"
-    process = gscompleter(*complete(scene, out, "--quiet"))
+    process = gscompleter(*complete(scene, out, *SMALL))
     while process.poll() is None and len(list(tmp_path.rglob("*.*"))) < written:
         time.sleep(0.001)
     process.send_signal(signal.SIGKILL)

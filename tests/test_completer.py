@@ -1,6 +1,7 @@
 """The whole: what holds whatever the models are."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from gscompleter.metrics.image import psnr
 from gscompleter.stages.anchor import lift
 from gscompleter.stages.integration import hole_mask
 from gscompleter.stages.registration import apply_affine
-from gscompleter.types import Camera, Gaussians, View, merge
+from gscompleter.types import Camera, Completion, Gaussians, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, reconstruction_of, scaled, view_of
 
@@ -89,6 +90,18 @@ def knowing(config: CompleterConfig = CompleterConfig(), unit: float = 1.0) -> G
     return GSCompleter(KnowingReconstructor(unit), KnowingGenerator(unit), config=config)
 
 
+@cache
+def completed(config: CompleterConfig) -> Completion:
+    """The target, completed by models that know the room."""
+    return knowing(config)(photographs(), cameras()[1])
+
+
+@cache
+def completed_by_embedded_models(unit: float) -> Completion:
+    """The same by the models that need no weights."""
+    return GSCompleter(seed=3)(photographs(unit), cameras(unit)[1])
+
+
 def tensors(gaussians: Gaussians) -> dict[str, torch.Tensor]:
     names = ("means", "quats", "scales", "opacities", "sh", "generated")
     return {name: getattr(gaussians, name) for name in names}
@@ -97,8 +110,7 @@ def tensors(gaussians: Gaussians) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("config", [CompleterConfig(), CompleterConfig.paper()])
 def test_the_hole_closes_and_the_picture_gets_better(config):
     _, target = cameras()
-    completion = knowing(config)(photographs(), target)
-    (result,) = completion.targets
+    (result,) = completed(config).targets
     truth = view_of(Room(), target).image
     assert result.hole_fraction > 0.1
     assert hole_mask(result.after.alpha).float().mean() < 0.2 * result.hole_fraction
@@ -118,7 +130,7 @@ def test_the_context_is_bit_for_bit_what_it_was(config):
 
 
 def test_only_what_was_added_is_marked_as_generated():
-    completion = knowing()(photographs(), cameras()[1])
+    completion = completed(CompleterConfig())
     assert (completion.context.generated == 0).all()
     assert len(completion.added) > 0
     assert (completion.added.generated == 1).all()
@@ -148,10 +160,9 @@ def test_the_depth_error_of_the_completed_region_shrinks_through_each_stage():
 
 
 def test_no_photograph_is_matched_worse_than_before():
-    views, (_, target) = photographs(), cameras()
-    completion = knowing()(views, target)
+    completion = completed(CompleterConfig())
     renderer = load_renderer("cpu")
-    for view in views:
+    for view in photographs():
         before = psnr(renderer.render(completion.context, view.camera).image, view.image)
         after = psnr(renderer.render(completion.scene, view.camera).image, view.image)
         assert after >= before - 0.05
@@ -199,9 +210,8 @@ def test_targets_are_synthesized_together_where_the_generator_can():
 
 
 def test_numbers_of_targets_go_on_where_the_given_scene_ends():
-    views, (_, right) = photographs(), cameras()
-    first = knowing()(views, right)
-    second = knowing()(views, camera_at(-0.9, yaw=-12, size=SIZE), first.scene)
+    first = completed(CompleterConfig())
+    second = knowing()(photographs(), camera_at(-0.9, yaw=-12, size=SIZE), first.scene)
     assert set(second.added.generated.tolist()) == {2}
     assert torch.equal(second.scene.generated[: len(first.scene)], first.scene.generated)
 
@@ -216,15 +226,14 @@ def test_a_target_that_is_a_context_view_has_nothing_to_complete():
 
 def test_with_the_embedded_models_the_same_seed_gives_the_same_bytes():
     views, (_, target) = photographs(), cameras()
-    a, b = (GSCompleter(seed=3)(views, target) for _ in range(2))
+    a, b = completed_by_embedded_models(1.0), GSCompleter(seed=3)(views, target)
     for name, tensor in tensors(a.scene).items():
         assert torch.equal(tensor, tensors(b.scene)[name]), name
 
 
 @pytest.mark.parametrize("unit", [0.001, 1000.0])
 def test_with_the_embedded_models_the_unit_scales_the_result_and_changes_no_image(unit):
-    ours = GSCompleter()(photographs(), cameras()[1])
-    theirs = GSCompleter()(photographs(unit), cameras(unit)[1])
+    ours, theirs = completed_by_embedded_models(1.0), completed_by_embedded_models(unit)
     (a,), (b,) = ours.targets, theirs.targets
     # Rounding flips a few decisions (1/255 of alpha, the best of near-equal patches); no more.
     assert (a.before.image - b.before.image).abs().mean() < 2e-3

@@ -123,6 +123,10 @@ def test_too_few_photographs_beside_the_targets_are_refused(scene, tmp_path, mon
     ) in capsys.readouterr().err
 
 
+SMALL = ("--resolution", 32, "--config.reconcile.iterations", 10, "--quiet", "--keep-unsupported")
+"""Where what is completed matters less than that it is."""
+
+
 def foreign(given: Path, path: Path) -> Path:
     """The same Gaussians as another program writes them: a comment, normals, columns of its own."""
     vertex = plyfile.PlyData.read(str(given))["vertex"].data
@@ -142,8 +146,7 @@ def test_a_splat_of_another_program_is_completed_in_its_own_layout(
     given = foreign(chosen[0] / "context.ply", tmp_path / "given.ply")
     for number, splat in enumerate((given, tmp_path / "out0" / "completed.ply")):
         out = tmp_path / f"out{number}"
-        more = ("--resolution", 48, "--quiet", "--keep-unsupported", "--scene", splat)
-        assert run(monkeypatch, *complete(scene, out, *more)) == 0
+        assert run(monkeypatch, *complete(scene, out, *SMALL, "--scene", splat)) == 0
         names = plyfile.PlyData.read(str(out / "completed.ply"))["vertex"].data.dtype.names
         assert names == ("label", *plyfile_names(given)[1:], "generated")
         assert summary_of(out)["scene"]["splat"] == str(splat)
@@ -164,16 +167,8 @@ def test_rows_that_were_dropped_stay_out_of_the_users_layout(scene, chosen, tmp_
     damaged.means[[2, 9]] = torch.nan
     save_ply(tmp_path / "ours.ply", damaged)
     given = foreign(tmp_path / "ours.ply", tmp_path / "given.ply")
-    more = (
-        "--resolution",
-        48,
-        "--quiet",
-        "--scene",
-        given,
-        "--drop-nonfinite",
-        "--keep-unsupported",
-    )
-    assert run(monkeypatch, *complete(scene, tmp_path / "out", *more)) == 0
+    more = ("--scene", given, "--drop-nonfinite")
+    assert run(monkeypatch, *complete(scene, tmp_path / "out", *SMALL, *more)) == 0
     rows = plyfile.PlyData.read(str(tmp_path / "out" / "completed.ply"))["vertex"].data
     labels = rows["label"][rows["generated"] == 0].tolist()
     assert labels == [n for n in range(len(gaussians)) if n not in (2, 9)]

@@ -211,6 +211,7 @@ def test_photographs_take_turns_and_the_worst_of_them_more_often():
 
 def complete(scene, splat, out, *more):
     asked = ["--context", "0", "2", "--target", "3", "--near", "0.5", "--far", "20"]
+    asked += ["--resolution", "48", "--config.reconcile.iterations", "10"]
     return ["complete", scene, "--scene", splat, *asked, "--out", out, "--quiet", *more]
 
 
