@@ -87,12 +87,12 @@ def triangulated(images: Sequence[StereoImage]) -> Float[np.ndarray, "n"]:
     for i, j in pairs[:MAX_PAIRS]:
         a, b = matches(features[i], features[j])
         if len(a):
-            found.append(_inverse_depths(images[i], images[j], a, b))
-            found.append(_inverse_depths(images[j], images[i], b, a))
+            found.append(inverse_depths(images[i], images[j], a, b))
+            found.append(inverse_depths(images[j], images[i], b, a))
     return np.concatenate(found)
 
 
-def _inverse_depths(
+def inverse_depths(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> Float[np.ndarray, "k"]:
     """Inverse z-depths in `reference` of the matches that lie on their epipolar lines.

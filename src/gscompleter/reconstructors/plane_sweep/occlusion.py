@@ -11,6 +11,9 @@ from jaxtyping import Float32
 from gscompleter.kernels import stereo
 from gscompleter.reconstructors.plane_sweep.confidence import MAX_RETURN_ERROR, Map, Mask
 
+UNKNOWN = np.float32(1e-9)
+"""Inverse depth of what a view is not sure of."""
+
 
 @dataclass(frozen=True)
 class Neighbour:

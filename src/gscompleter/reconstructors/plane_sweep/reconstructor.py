@@ -4,32 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations, permutations
+from itertools import combinations
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
+from torch import Tensor
 
 from gscompleter.kernels import stereo
 from gscompleter.matching.depth_range import depth_range_of
-from gscompleter.matching.features import features_of, matches
+from gscompleter.matching.neighbours import Neighbours, neighbours_among
 from gscompleter.matching.stereo_image import StereoImage, source_from_reference, stereo_images
 from gscompleter.reconstructors.plane_sweep.aggregation import aggregate
 from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance
-from gscompleter.reconstructors.plane_sweep.confidence import confidence_of, consistent
+from gscompleter.reconstructors.plane_sweep.confidence import Mask, confidence_of, consistent
 from gscompleter.reconstructors.plane_sweep.epipolar import rotated_to_matches
+from gscompleter.reconstructors.plane_sweep.fusion import (
+    Layer,
+    Transforms,
+    finest_pixels,
+    free_pixels,
+)
 from gscompleter.reconstructors.plane_sweep.gaussians import discs, normals_of
+from gscompleter.reconstructors.plane_sweep.joint_fit import FAINTEST, fit_jointly
 from gscompleter.reconstructors.plane_sweep.matching import cost_volume, inverse_depth_planes
-from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
+from gscompleter.reconstructors.plane_sweep.occlusion import (
+    UNKNOWN,
+    Neighbour,
+    hidden_from_others,
+)
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
 
 Map = Float32[np.ndarray, "_ _"]
-Transforms = dict[tuple[int, int], Float32[np.ndarray, "3 4"]]
-"""`transforms[i, j]` is j_from_i: from the pixels of view i, at an inverse depth, to those of j."""
-UNKNOWN = np.float32(1e-9)
-"""Inverse depth of what a view is not sure of."""
+MIN_ALPHA = 0.7
+"""Alpha below which a surface that no view was to show is shown by the view that meets the gap."""
 BACKGROUND_WEIGHT = np.float32(0.3)
 """How much the background's depth counts where an object hides it from the other views."""
 
@@ -53,6 +63,17 @@ class Sweep:
 
 
 @dataclass(frozen=True)
+class Rig:
+    """How the views stand to each other."""
+
+    images: list[StereoImage]
+    unit: float
+    """The widest baseline, in scene units; lengths of stereo are multiples of it."""
+    neighbours: Neighbours
+    transforms: Transforms
+
+
+@dataclass(frozen=True)
 class PlaneSweep:
     """Plane-sweep stereo, completed by surfaces, splatted, and fitted to the photographs."""
 
@@ -62,75 +83,96 @@ class PlaneSweep:
     """Draws Gaussians while they are fitted."""
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
-        """Gaussians of all pixels of `views`, and their depths.
+        """Gaussians of what `views` show, and the depths of all of their pixels.
+
+        Two views keep all of their pixels. Of more views each surface is kept once, by the view
+        that sees it best, and nothing where another view sees through it.
 
         Raises:
             InputError: fewer than two views, no baseline between them, an empty depth range.
         """
         near, far = depth_range_of(views)
         views = [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
-        depths = self.depths(views)
+        rig = rig_of(views)
+        layers = self.layers(rig, near, far)
+        depths = depth_maps(layers, rig.unit, views)
         parts = [self.splat(view, depth) for view, depth in zip(views, depths, strict=True)]
+        every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
+        chosen = self.chosen(every, on_cpu, layers, rig.transforms)
+        fit = fit_appearance if len(views) == 2 else fit_jointly
+        fitted = fit(every[chosen], on_cpu, self.renderer)
         device = views[0].image.device
-        fitted = fit_appearance(
-            merge(parts).to("cpu"), [view.to("cpu") for view in views], self.renderer
-        )
+        rows = [torch.arange(len(part)) for part in parts]
+        numbers = [torch.full((len(part),), i) for i, part in enumerate(parts)]
         return Reconstruction(
             fitted.to(device),
             tuple(depths),
-            torch.cat([torch.full((len(p),), i, device=device) for i, p in enumerate(parts)]),
-            torch.cat([torch.arange(len(p), device=device) for p in parts]),
+            torch.cat(numbers)[chosen].to(device),
+            torch.cat(rows)[chosen].to(device),
         )
 
     def depths(self, views: Sequence[View]) -> list[DepthMap]:
         """z-depth of all pixels of `views`, valid where it was measured, and how sure of it."""
-        images, unit = stereo_images(views)
-        near, far = depth_range_of(views)
-        transforms = transforms_among(images)
+        rig = rig_of(views)
+        return depth_maps(self.layers(rig, *depth_range_of(views)), rig.unit, views)
+
+    def layers(self, rig: Rig, near: float, far: float) -> list[Layer]:
+        """What stereo says of each view; `near` and `far` are z-depths in scene units."""
         sweeps = [
-            self.sweep(i, images, transforms, near / unit, far / unit) for i in range(len(images))
+            self.sweep(i, rig, near / rig.unit, far / rig.unit) for i in range(len(rig.images))
         ]
-        confidences = self.confidences(sweeps, transforms)
+        confidences = self.confidences(sweeps, rig)
         sure = [
             np.where(confidence > 0, sweep.inverse(sweep.index), UNKNOWN)
             for sweep, confidence in zip(sweeps, confidences, strict=True)
         ]
-        depths = []
-        for i, (view, sweep) in enumerate(zip(views, sweeps, strict=True)):
-            measured, weight = self.with_background(i, sweep, confidences[i], sure, transforms)
-            heights = fit_surfaces(measured, weight, images[i].image)
-            depth = torch.from_numpy(np.float32(unit) / sweep.inverse(heights))
-            confidence = torch.from_numpy(confidences[i]).to(view.image.device)
-            depths.append(DepthMap(depth.to(confidence.device), confidence > 0, confidence))
-        return depths
+        layers = []
+        for i, (sweep, confidence) in enumerate(zip(sweeps, confidences, strict=True)):
+            measured, weight = self.with_background(i, sweep, confidence, sure, rig)
+            heights = fit_surfaces(measured, weight, rig.images[i].image)
+            layers.append(Layer(rig.images[i], sweep.inverse(heights), confidence))
+        return layers
 
-    def sweep(
-        self,
-        number: int,
-        images: Sequence[StereoImage],
-        transforms: Transforms,
-        near: float,
-        far: float,
-    ) -> Sweep:
+    def sweep(self, number: int, rig: Rig, near: float, far: float) -> Sweep:
         """The planes that match best in view `number`."""
-        image = images[number]
-        sources = [(other, transforms[number, i]) for i, other in enumerate(images) if i != number]
+        image = rig.images[number]
+        sources = [(rig.images[i], rig.transforms[number, i]) for i in rig.neighbours.of[number]]
         planes = inverse_depth_planes(image, sources, near, far)
         costs = cost_volume(image, sources, planes)
         index, margin = stereo.winners(aggregate(costs, image))
         return Sweep(planes, index, margin)
 
-    def confidences(self, sweeps: Sequence[Sweep], transforms: Transforms) -> list[Map]:
+    def confidences(self, sweeps: Sequence[Sweep], rig: Rig) -> list[Map]:
         """How much each pixel's match counts: 0 where no other view agrees with it."""
         inverses = [sweep.inverse(sweep.index) for sweep in sweeps]
-        agrees = [np.zeros(inverse.shape, bool) for inverse in inverses]
-        for i, j in permutations(range(len(sweeps)), 2):
-            j_from_i, i_from_j = transforms[i, j], transforms[j, i]
-            agrees[i] |= consistent(inverses[i], inverses[j], j_from_i, i_from_j)
-        return [
-            confidence_of(sweep.index, sweep.margin, agree)
-            for sweep, agree in zip(sweeps, agrees, strict=True)
-        ]
+        confidences = []
+        for i, sweep in enumerate(sweeps):
+            agrees = np.zeros(inverses[i].shape, bool)
+            for j in rig.neighbours.either_way(i):
+                there, back = rig.transforms[i, j], rig.transforms[j, i]
+                agrees |= consistent(inverses[i], inverses[j], there, back)
+            confidences.append(confidence_of(sweep.index, sweep.margin, agrees))
+        return confidences
+
+    def chosen(
+        self,
+        every: Gaussians,
+        views: Sequence[View],
+        layers: Sequence[Layer],
+        transforms: Transforms,
+    ) -> Bool[Tensor, "n"]:
+        """Which of the Gaussians of all pixels make the scene."""
+        if len(views) == 2:
+            return torch.ones(len(every), dtype=torch.bool)
+        free = free_pixels(layers, transforms)
+        kept = as_rows(finest_pixels(layers, free, transforms))
+        start = 0
+        for view, mask in zip(views, free, strict=True):
+            alpha = self.renderer.render(every[kept], view.camera).alpha
+            gap = torch.from_numpy(mask) & (alpha < MIN_ALPHA)
+            kept[start : start + gap.numel()] |= gap.reshape(-1)
+            start += gap.numel()
+        return kept
 
     def with_background(
         self,
@@ -138,7 +180,7 @@ class PlaneSweep:
         sweep: Sweep,
         confidence: Map,
         sure: Sequence[Map],
-        transforms: Transforms,
+        rig: Rig,
     ) -> tuple[Map, Map]:
         """The planes of view `number` and how much each counts, those of occluded pixels too.
 
@@ -146,9 +188,8 @@ class PlaneSweep:
         """
         background = stereo.background(sweep.index, confidence > 0)
         neighbours = [
-            Neighbour(inverse, transforms[number, i], transforms[i, number])
-            for i, inverse in enumerate(sure)
-            if i != number
+            Neighbour(sure[i], rig.transforms[number, i], rig.transforms[i, number])
+            for i in rig.neighbours.either_way(number)
         ]
         occluded = (confidence == 0) & hidden_from_others(sweep.inverse(background), neighbours)
         weight = np.where(occluded, BACKGROUND_WEIGHT, confidence)
@@ -159,13 +200,34 @@ class PlaneSweep:
         return discs(view, depth.depth, normals_of(depth.depth, view), self.disc_sigma)
 
 
-def transforms_among(images: Sequence[StereoImage]) -> Transforms:
-    """From every view to every other, through poses that agree with the matched features."""
-    features = [features_of(image) for image in images]
+def rig_of(views: Sequence[View]) -> Rig:
+    """Where `views` stand, through poses that agree with the matched features.
+
+    Raises:
+        InputError: fewer than two views, no baseline between them.
+    """
+    images, unit = stereo_images(views)
+    neighbours = neighbours_among(images)
     transforms = {}
     for i, j in combinations(range(len(images)), 2):
-        pixels, matched = matches(features[i], features[j])
-        rotated = rotated_to_matches(images[i], images[j], pixels, matched)
-        transforms[i, j] = source_from_reference(images[i], rotated)
-        transforms[j, i] = source_from_reference(rotated, images[i])
-    return transforms
+        source = images[j]
+        if (i, j) in neighbours.matches:
+            source = rotated_to_matches(images[i], source, *neighbours.matches[i, j])
+        transforms[i, j] = source_from_reference(images[i], source)
+        transforms[j, i] = source_from_reference(source, images[i])
+    return Rig(images, unit, neighbours, transforms)
+
+
+def depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> list[DepthMap]:
+    """z-depths in scene units, on the device of the views."""
+    depths = []
+    for layer, view in zip(layers, views, strict=True):
+        depth = torch.from_numpy(np.float32(unit) / layer.inverse)
+        confidence = torch.from_numpy(layer.confidence).to(view.image.device)
+        depths.append(DepthMap(depth.to(confidence.device), confidence > 0, confidence))
+    return depths
+
+
+def as_rows(masks: Sequence[Mask]) -> Bool[Tensor, "n"]:
+    """Masks of the views one after the other, row by row."""
+    return torch.cat([torch.from_numpy(mask).reshape(-1) for mask in masks])
