@@ -18,7 +18,7 @@ from gscompleter.matching.depth_range import inverse_depths
 from gscompleter.matching.features import Pixels, features_of, matches
 from gscompleter.matching.stereo_image import StereoImage
 
-COUNT = 3
+COUNT = 2
 """Photographs that each one is matched with."""
 CANDIDATES = 6
 """Photographs close to each one whose features are compared with its own."""

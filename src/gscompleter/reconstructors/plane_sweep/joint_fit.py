@@ -1,8 +1,7 @@
 """Gaussians of many views, brought nearer to all photographs at once.
 
 What several views measured lies a fraction of a pixel off in some of them. So not only opacities
-and colours are fitted here, as for two views, but places, sizes and directions too, a few views at
-a time, so that the time grows with the number of photographs only.
+and colours are fitted here, as for two views, but places, sizes and directions too, one photograph a step, so that the time grows with their number.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ from torch import Tensor
 from gscompleter.render import Renderer
 from gscompleter.types import Gaussians, View
 
-PASSES = 20
+PASSES = 12
 """How often each photograph is asked."""
-VIEWS_PER_STEP = 2
-"""Photographs asked in one step."""
-RATES = {"moved": 0.1, "quats": 0.01, "grown": 0.05, "logits": 0.2, "sh": 0.03}
+RATES = {"moved": 0.15, "quats": 0.015, "grown": 0.075, "logits": 0.3, "sh": 0.045}
 """Steps of Adam: on the place, in units of the Gaussian's own size; on the quaternion; on the
 logarithm of the size; on the logit of the opacity; and on the colour."""
+BETAS = 0.9, 0.99
+"""Decay of Adam's means: shorter than usual, as the steps are few."""
 FAINTEST = 0.02
 """Opacity below which a Gaussian has faded."""
 
@@ -30,15 +29,13 @@ FAINTEST = 0.02
 def fit_jointly(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
     """`gaussians` fitted to `views` by the squared difference."""
     unknown = unknowns(gaussians)
-    optimizer = torch.optim.Adam([{"params": [unknown[k]], "lr": lr} for k, lr in RATES.items()])
-    for numbers in minibatches(len(views)):
-        fitted = moved_by(gaussians, unknown)
-        errors = [
-            (renderer.render(fitted, views[i].camera).image - views[i].image).square().mean()
-            for i in numbers
-        ]
+    groups = [{"params": [unknown[name]], "lr": rate} for name, rate in RATES.items()]
+    optimizer = torch.optim.Adam(groups, betas=BETAS)
+    for number in order_of(len(views)):
+        view, fitted = views[number], moved_by(gaussians, unknown)
+        error = (renderer.render(fitted, view.camera).image - view.image).square().mean()
         optimizer.zero_grad()
-        torch.stack(errors).sum().backward()
+        error.backward()
         optimizer.step()
     return moved_by(gaussians, {name: value.detach() for name, value in unknown.items()})
 
@@ -68,8 +65,8 @@ def moved_by(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussians:
     )
 
 
-def minibatches(count: int) -> list[list[int]]:
-    """Numbers of the views that are asked together: each view PASSES times, in random order."""
+def order_of(count: int) -> list[int]:
+    """Whose turn it is: each of `count` views PASSES times, in random order."""
     generator = torch.Generator().manual_seed(0)
-    order = torch.cat([torch.randperm(count, generator=generator) for _ in range(PASSES)])
-    return [part.tolist() for part in order.split(VIEWS_PER_STEP)]
+    rounds = [torch.randperm(count, generator=generator) for _ in range(PASSES)]
+    return torch.cat(rounds).tolist()

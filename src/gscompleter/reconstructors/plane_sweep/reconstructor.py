@@ -26,7 +26,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
     free_pixels,
 )
 from gscompleter.reconstructors.plane_sweep.gaussians import discs, normals_of
-from gscompleter.reconstructors.plane_sweep.joint_fit import FAINTEST, fit_jointly
+from gscompleter.reconstructors.plane_sweep.joint_fit import fit_jointly
 from gscompleter.reconstructors.plane_sweep.matching import cost_volume, inverse_depth_planes
 from gscompleter.reconstructors.plane_sweep.occlusion import (
     UNKNOWN,

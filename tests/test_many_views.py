@@ -1,0 +1,161 @@
+"""Ψ without weights, of many views: who is matched with whom, each surface once, one joint fit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gscompleter import View, load_renderer
+from gscompleter.geometry import project
+from gscompleter.kernels import stereo
+from gscompleter.matching.neighbours import CANDIDATES, COUNT, neighbours_among
+from gscompleter.matching.stereo_image import stereo_images
+from gscompleter.metrics.image import psnr
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.fusion import Layer, finest_pixels, free_pixels
+from gscompleter.reconstructors.plane_sweep.joint_fit import PASSES, fit_jointly, order_of
+from gscompleter.reconstructors.plane_sweep.reconstructor import rig_of
+from scenes import Room, camera_at, gaussians_of, view_of
+
+SIZE = 64
+
+
+def row_of_views(count: int, size: int = SIZE) -> list[View]:
+    """Photographs taken side by side, 0.2 apart."""
+    offsets = (torch.arange(count) - (count - 1) / 2) * 0.2
+    return [view_of(Room(), camera_at(x, size=size)) for x in offsets.tolist()]
+
+
+def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[Layer], dict]:
+    """What perfect stereo says of them."""
+    rig = rig_of(views)
+    layers = []
+    for view, image in zip(views, rig.images, strict=True):
+        inverse = np.float32(rig.unit) / view.depth.numpy()
+        layers.append(Layer(image, inverse, np.full_like(inverse, measured)))
+    return layers, rig.transforms
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Five views, and what is made of four of them; the one in the middle is held back."""
+    views = row_of_views(5)
+    given = [*views[:2], *views[3:]]
+    return given, views[2], PlaneSweep()(given)
+
+
+def test_each_view_is_matched_with_the_ones_beside_it():
+    neighbours = neighbours_among(stereo_images(row_of_views(6))[0])
+    for number, others in enumerate(neighbours.of):
+        assert len(others) == COUNT and number not in others
+        assert all(abs(number - other) <= 2 for other in others)
+    assert neighbours.either_way(0) == sorted(
+        {*neighbours.of[0], *(i for i, others in enumerate(neighbours.of) if 0 in others)}
+    )
+
+
+def test_a_view_from_the_same_place_tells_no_depth_and_is_not_chosen():
+    left, right = row_of_views(2)
+    neighbours = neighbours_among(stereo_images([left, left, right, right])[0])
+    for number, others in enumerate(neighbours.of):
+        assert others and {number, number ^ 1}.isdisjoint(others)
+
+
+def test_the_work_grows_with_the_number_of_views_and_not_with_its_square(monkeypatch):
+    swept, compared = [], []
+    costs = stereo.matching_costs
+    monkeypatch.setattr(stereo, "matching_costs", lambda *a: swept.append(1) or costs(*a))
+    for count in (5, 10):
+        views = row_of_views(count, size=16)
+        rig = rig_of(views)
+        PlaneSweep().layers(rig, 1.0, 10.0)
+        assert len(swept) == COUNT * count
+        assert len(rig.neighbours.matches) <= CANDIDATES * count
+        compared.append(len(order_of(count)))
+        swept.clear()
+    assert compared == [PASSES * 5, PASSES * 10]
+
+
+def test_what_another_view_sees_through_is_left_out():
+    layers, transforms = true_layers(row_of_views(3))
+    patch = np.s_[20:40, 20:40]
+    layers[0].inverse[patch] *= 2.0
+    layers[0].confidence[patch] = 0.0
+    free = free_pixels(layers, transforms)
+    assert free[0][patch].mean() < 0.1
+    # Measured or not, two views know better than one.
+    layers[0].confidence[patch] = 1.0
+    assert free_pixels(layers, transforms)[0][patch].mean() < 0.1
+    untouched = np.ones_like(free[0])
+    untouched[patch] = False
+    assert free[0][untouched].mean() > 0.95
+
+
+def test_each_surface_is_kept_once():
+    layers, transforms = true_layers(row_of_views(3))
+    kept = finest_pixels(layers, free_pixels(layers, transforms), transforms)
+    shares = [mask.mean() for mask in kept]
+    assert shares[0] > 0.95
+    assert sum(shares) < 1.6
+
+
+def test_the_view_that_sees_a_surface_finest_keeps_it():
+    far, near = (view_of(Room(), camera_at(z=z, size=SIZE)) for z in (0.0, 1.0))
+    aside = view_of(Room(), camera_at(0.2, size=SIZE))
+    layers, transforms = true_layers([far, near, aside])
+    kept = finest_pixels(layers, free_pixels(layers, transforms), transforms)
+    assert kept[1].mean() > 0.9
+    middle = np.s_[24:40, 24:40]
+    assert kept[0][middle].mean() < 0.1
+
+
+def test_what_was_filled_in_gives_way_to_what_was_measured():
+    layers, transforms = true_layers(row_of_views(3))
+    layers[0].confidence[:] = 0.0
+    kept = finest_pixels(layers, free_pixels(layers, transforms), transforms)
+    assert kept[0].mean() < 0.4
+    assert kept[1].mean() > 0.9
+
+
+def test_many_views_show_a_place_between_them(found):
+    given, between, made = found
+    renderer = load_renderer("cpu")
+    for view in given:
+        assert psnr(renderer.render(made.gaussians, view.camera).image, view.image) > 26
+    drawn = renderer.render(made.gaussians, between.camera)
+    assert psnr(drawn.image, between.image) > 24
+    assert (drawn.alpha > 0.5).float().mean() > 0.98
+
+
+def test_the_indices_tell_where_each_gaussian_came_from(found):
+    given, _, made = found
+    assert len(made.gaussians) < 0.7 * len(given) * SIZE**2
+    assert len(made.view_index) == len(made.pixel_index) == len(made.gaussians)
+    for index, view in enumerate(given):
+        own = made.view_index == index
+        pixels, _ = project(made.gaussians.means[own], view.camera)
+        rows, columns = made.pixel_index[own] // SIZE, made.pixel_index[own] % SIZE
+        apart = (pixels - torch.stack([columns, rows], dim=-1) - 0.5).norm(dim=-1)
+        assert apart.median() < 1.0
+
+
+def test_the_joint_fit_brings_every_photograph_nearer_and_repeats_itself():
+    views = row_of_views(3, size=32)
+    renderer = load_renderer("cpu")
+    start = gaussians_of(views[1])
+    start = replace(start, sh=start.sh * 0.8)
+    fitted = fit_jointly(start, views, renderer)
+
+    def errors(gaussians):
+        renders = [renderer.render(gaussians, view.camera).image for view in views]
+        return [(r - v.image).square().mean() for r, v in zip(renders, views, strict=True)]
+
+    for before, after in zip(errors(start), errors(fitted), strict=True):
+        assert after < 0.7 * before
+    again = fit_jointly(start, views, renderer)
+    assert torch.equal(fitted.means, again.means) and torch.equal(fitted.sh, again.sh)
+
+
+def test_each_view_has_its_turn_as_often_as_the_others():
+    assert torch.bincount(torch.tensor(order_of(7))).tolist() == [PASSES] * 7
