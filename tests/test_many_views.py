@@ -48,7 +48,8 @@ def found():
 def test_each_view_is_matched_with_the_ones_beside_it():
     neighbours = neighbours_among(stereo_images(row_of_views(6))[0])
     for number, others in enumerate(neighbours.of):
-        assert len(others) == COUNT and number not in others
+        assert len(others) == COUNT
+        assert number not in others
         assert all(abs(number - other) <= 2 for other in others)
     assert neighbours.either_way(0) == sorted(
         {*neighbours.of[0], *(i for i, others in enumerate(neighbours.of) if 0 in others)}
@@ -59,7 +60,8 @@ def test_a_view_from_the_same_place_tells_no_depth_and_is_not_chosen():
     left, right = row_of_views(2)
     neighbours = neighbours_among(stereo_images([left, left, right, right])[0])
     for number, others in enumerate(neighbours.of):
-        assert others and {number, number ^ 1}.isdisjoint(others)
+        assert others
+        assert {number, number ^ 1}.isdisjoint(others)
 
 
 def test_the_work_grows_with_the_number_of_views_and_not_with_its_square(monkeypatch):
@@ -154,7 +156,8 @@ def test_the_joint_fit_brings_every_photograph_nearer_and_repeats_itself():
     for before, after in zip(errors(start), errors(fitted), strict=True):
         assert after < 0.7 * before
     again = fit_jointly(start, views, renderer)
-    assert torch.equal(fitted.means, again.means) and torch.equal(fitted.sh, again.sh)
+    assert torch.equal(fitted.means, again.means)
+    assert torch.equal(fitted.sh, again.sh)
 
 
 def test_each_view_has_its_turn_as_often_as_the_others():

@@ -1,7 +1,8 @@
 """Gaussians of many views, brought nearer to all photographs at once.
 
 What several views measured lies a fraction of a pixel off in some of them. So not only opacities
-and colours are fitted here, as for two views, but places, sizes and directions too, one photograph a step, so that the time grows with their number.
+and colours are fitted here, as for two views, but places, sizes and directions too; one photograph
+a step, so that the time grows with their number.
 """
 
 from __future__ import annotations
