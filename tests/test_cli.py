@@ -61,6 +61,7 @@ def test_out_holds_all_that_the_contract_names(completed):
         "generated.ply",
         "images",
         "summary.json",
+        "targets.json",
     }
     names = ("before", "after", "reference", "hole_mask", "truth")
     assert {p.name for p in (completed / "images").iterdir()} == {
