@@ -178,7 +178,6 @@ def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
         ({"context": (0, 9)}, "no frame 9"),
         ({"target": (9,)}, "no frame 9"),
         ({"target": (-1,)}, "-1"),
-        ({"target": ()}, "at least one"),
         ({"target": ("nowhere.json",)}, "nowhere.json"),
         ({"target": ("²",)}, "²"),
         ({"target": ("--2",)}, "--2"),
@@ -200,6 +199,8 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
     ("more", "sentence"),
     [
         (("--near", 5, "--far", 1), "near"),
+        (("--auto", 2), "Targets are named, and others are to be found besides; "),
+        (("--auto",), "complete the result for the others (--auto)."),
         (("--near", 0), "near"),
         (("--near", -1), "near"),
         (("--far", "nan"), "far"),

@@ -84,7 +84,8 @@ def test_the_second_camera_is_chosen_in_the_scene_that_the_first_left(begun):
 def test_nothing_is_found_where_nothing_is_left(begun):
     completion, choices = explorer(min_gain=1.0).explore(begun, cameras(), 3)
     assert choices == ()
-    assert completion is begun
+    assert completion.scene is begun.scene
+    assert completion.targets == ()
 
 
 def test_a_plan_takes_the_first_camera_that_is_completed_and_then_another(begun):

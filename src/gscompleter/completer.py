@@ -244,8 +244,11 @@ class GSCompleter:
         with clock("register"):
             registration = self.register(sight, lifted, reference, frozen_views)
         with clock("integrate"):
-            kept = self.keep(sight, lifted, registration, frozen_views)
-            added, losses = self.refine(sight, kept, reference, frozen_views)
+            others = [
+                self.renderer.freeze(completion.scene, v.camera) for v in completion.witnesses
+            ]
+            kept = self.keep(sight, lifted, registration, frozen_views, others)
+            added, losses = self.refine(sight, kept, reference, frozen_views, others)
             after = self.renderer.render(merge([completion.scene, added]), target)
         return replace(
             result,
@@ -341,17 +344,20 @@ class GSCompleter:
         lifted: Lift,
         registration: Registration,
         frozen_views: Sequence[FrozenView],
+        others: Sequence[FrozenView],
     ) -> Gaussians:
         """Stage 4: what lies in the holes, where no photograph saw through it."""
         mask = dilate(self.holes(sight), self.config.holes.dilation)
-        wide, views = sight.window.wide, sight.completion.views
+        wide, views, frozen = sight.window.wide, sight.completion.views, [*frozen_views]
+        if sight.completion.evidence is None:
+            views, frozen = (*views, *sight.completion.witnesses), [*frozen_views, *others]
         kept, placed = respect_free_space(
             self.before_doubted(
                 keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide), sight
             ),
             wide,
             [view.camera for view in views],
-            [self.as_believed(sight, f, v) for f, v in zip(frozen_views, views, strict=True)],
+            [self.as_believed(sight, f, v) for f, v in zip(frozen, views, strict=True)],
             self.config.registration.footprint,
             self.config.free_space,
         )
@@ -383,11 +389,14 @@ class GSCompleter:
         kept: Gaussians,
         reference: Synthesized,
         frozen_views: Sequence[FrozenView],
+        others: Sequence[FrozenView],
     ) -> tuple[Gaussians, tuple[float, ...]]:
-        """Stage 4: what joins the scene with the opacities it has there, and the losses."""
+        """Stage 4: what joins the scene with the opacities it has there, and the losses.
+
+        The scene is frozen at its photographs, and at its witnesses.
+        """
         completion, config = sight.completion, self.config
         watching = (*completion.views, *completion.witnesses)
-        others = [self.renderer.freeze(completion.scene, v.camera) for v in completion.witnesses]
         frozen, allowed = (*frozen_views, *others), completion.allowed_errors
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
@@ -631,4 +640,4 @@ class Clock:
 
 def total(before: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:
     """Seconds of both, stage by stage."""
-    return {stage: before[stage] + more[stage] for stage in before}
+    return {stage: before[stage] + more.get(stage, 0.0) for stage in before}

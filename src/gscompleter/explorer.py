@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.completer import GSCompleter
+from gscompleter.completer import Clock, GSCompleter
 from gscompleter.config import ExplorationConfig
 from gscompleter.progress import track
 from gscompleter.stages.anchor import select_anchor
@@ -66,7 +66,12 @@ class Explorer:
             cameras: Those of all photographs of the scene, whether or not it was made of them.
             count: How many cameras it is completed for at most. It is fewer where little is left.
         """
-        return self.take(completion, cameras, count, self.completer.advance)
+        clock, begun = Clock(()), completion.seconds["total"]
+        completion, choices = self.take(completion, cameras, count, self.completer.advance)
+        completed = completion.seconds["total"]
+        spent = begun + clock.seconds["total"]
+        seconds = {**completion.seconds, "explore": spent - completed, "total": spent}
+        return replace(completion, seconds=seconds), choices
 
     def plan(
         self, completion: Completion, cameras: Sequence[Camera], count: int

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from gscompleter.commands.opening import Opened, Task, say, usable_cameras
 from gscompleter.commands.options import FOUND, CompleteOptions, working_size
+from gscompleter.completer import check_numbers
 from gscompleter.data.origin import frame_from_photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import quoted
@@ -62,6 +63,7 @@ def completed(
     if task.targets:
         targets = [target.camera.to(task.views[0].image.device) for target in task.targets]
         return completer(task.views, targets, task.scene, task.witnesses), task
+    check_numbers(task.scene, most(options))
     begun = completer.begin(task.views, task.scene, task.witnesses)
     completion, choices = explorer.explore(begun, list(cameras.values()), most(options))
     return completion, replace(task, targets=targets_of(choices, list(cameras)))
@@ -122,11 +124,14 @@ def targets_of(choices: Iterable[Choice], frames: Sequence[int]) -> list[Target]
 
 
 def write_targets(folder: Path, task: Task) -> None:
-    """Write the cameras of the targets as `--target` takes them: in the frame of the photographs.
+    """Write the cameras of the targets, if any, as `--target` takes them: in the frame of the
+    photographs.
 
     Raises:
         InputError: where the file cannot be written.
     """
+    if not task.targets:
+        return
     back = np.linalg.inv(task.frame)
     write_cameras(folder / TARGETS, [as_given(target.camera, back) for target in task.targets])
 

@@ -69,7 +69,7 @@ def medoids(cameras: Sequence[Camera], count: int) -> list[int]:
     for _ in range(NUM_ROUNDS):
         groups = apart[:, chosen].argmin(dim=1)
         members = [torch.nonzero(groups == group)[:, 0] for group in range(len(chosen))]
-        before, chosen = chosen, [middle(apart, own) for own in members]
+        before, chosen = chosen, [middle(apart, own) for own in members if len(own) > 0]
         if chosen == before:
             break
     return sorted(set(chosen))
