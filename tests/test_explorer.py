@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from gscompleter import CompleterConfig, GSCompleter
-from gscompleter.config import ExplorationConfig
-from gscompleter.explorer import Explorer
+from gscompleter.config import AffineConfig, ExplorationConfig, RegistrationConfig
+from gscompleter.explorer import Explorer, with_bystanders
 from gscompleter.metrics.coverage import coverage_of, covered, held_out_cameras
 from gscompleter.render import load_renderer
 from gscompleter.stages.exploration import gain, miniature, overlap_of, stand_ins
-from gscompleter.types import Completion, Render, View
+from gscompleter.types import Camera, Completion, Gaussians, Render, View
 from scenes import Room, camera_at, cast, gaussians_of, view_of
-from test_completer import KnowingGenerator, KnowingReconstructor
+from test_completer import KnowingGenerator, KnowingReconstructor, knowing
 
 SIZE = 64
 PLACES = (-0.3, 0.1)
@@ -138,3 +138,25 @@ def test_cameras_that_judge_coverage_are_the_same_for_the_same_seed():
     assert centers[:, 0].min() < 0.2
     assert centers[:, 0].max() > 1.0
     assert centers[:, 1:].abs().max() < 1.5
+
+
+def test_nothing_is_added_before_what_a_bystander_sees(begun):
+    """What is lifted stands a fifth too near, and nothing mends that but who looks through it."""
+    unmended = RegistrationConfig(affine=AffineConfig(bridge="none"), iterations=0)
+    completer = replace(knowing(), config=replace(CompleterConfig(), registration=unmended))
+    target = camera_at(0.7, yaw=12, size=SIZE)
+    aside = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((0.5, 4), (-0.6, -4))]
+    watched = with_bystanders(begun, [*cameras(), *aside])
+    assert len(watched.bystanders) == 2
+    hidden = []
+    for state in (begun, watched):
+        scene = completer.advance(state, target).scene
+        hidden.append(sum(nearer(scene, begun.scene, camera) for camera in aside))
+    assert hidden[1] < 0.5 * hidden[0]
+
+
+def nearer(scene: Gaussians, before: Gaussians, camera: Camera) -> float:
+    """Share of what a camera saw of a scene before that something new hides."""
+    renderer = load_renderer("cpu")
+    seen, now = renderer.render(before, camera).depth_map(), renderer.render(scene, camera)
+    return (seen.valid & (now.depth < 0.9 * seen.depth)).float().mean().item()

@@ -28,7 +28,9 @@ from gscompleter.stages.anchor import (
     select_anchor,
     synthesize_all,
 )
+from gscompleter.stages.candidates import shrunk
 from gscompleter.stages.context import depth_range_of_scene, init_context
+from gscompleter.stages.exploration import small_renders
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
     do_no_harm,
@@ -244,11 +246,8 @@ class GSCompleter:
         with clock("register"):
             registration = self.register(sight, lifted, reference, frozen_views)
         with clock("integrate"):
-            others = [
-                self.renderer.freeze(completion.scene, v.camera) for v in completion.witnesses
-            ]
-            kept = self.keep(sight, lifted, registration, frozen_views, others)
-            added, losses = self.refine(sight, kept, reference, frozen_views, others)
+            kept = self.keep(sight, lifted, registration, frozen_views)
+            added, losses = self.refine(sight, kept, reference, frozen_views)
             after = self.renderer.render(merge([completion.scene, added]), target)
         return replace(
             result,
@@ -344,20 +343,22 @@ class GSCompleter:
         lifted: Lift,
         registration: Registration,
         frozen_views: Sequence[FrozenView],
-        others: Sequence[FrozenView],
     ) -> Gaussians:
         """Stage 4: what lies in the holes, where no photograph saw through it."""
         mask = dilate(self.holes(sight), self.config.holes.dilation)
-        wide, views, frozen = sight.window.wide, sight.completion.views, [*frozen_views]
-        if sight.completion.evidence is None:
-            views, frozen = (*views, *sight.completion.witnesses), [*frozen_views, *others]
+        wide, views = sight.window.wide, sight.completion.views
+        side = self.config.exploration.side
+        aside = [shrunk(camera, side) for camera in sight.completion.bystanders]
         kept, placed = respect_free_space(
             self.before_doubted(
                 keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide), sight
             ),
             wide,
-            [view.camera for view in views],
-            [self.as_believed(sight, f, v) for f, v in zip(frozen, views, strict=True)],
+            [*(view.camera for view in views), *aside],
+            [
+                *(self.as_believed(sight, f, v) for f, v in zip(frozen_views, views, strict=True)),
+                *small_renders(sight.completion.scene, aside, self.renderer),
+            ],
             self.config.registration.footprint,
             self.config.free_space,
         )
@@ -389,14 +390,11 @@ class GSCompleter:
         kept: Gaussians,
         reference: Synthesized,
         frozen_views: Sequence[FrozenView],
-        others: Sequence[FrozenView],
     ) -> tuple[Gaussians, tuple[float, ...]]:
-        """Stage 4: what joins the scene with the opacities it has there, and the losses.
-
-        The scene is frozen at its photographs, and at its witnesses.
-        """
+        """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
         watching = (*completion.views, *completion.witnesses)
+        others = [self.renderer.freeze(completion.scene, v.camera) for v in completion.witnesses]
         frozen, allowed = (*frozen_views, *others), completion.allowed_errors
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]

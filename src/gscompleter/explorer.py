@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gscompleter.completer import Clock, GSCompleter
 from gscompleter.config import ExplorationConfig
+from gscompleter.geometry import same_camera
 from gscompleter.progress import track
 from gscompleter.stages.anchor import select_anchor
 from gscompleter.stages.candidates import (
@@ -30,6 +31,9 @@ from gscompleter.stages.exploration import (
 )
 from gscompleter.stages.integration import hole_mask
 from gscompleter.types import Camera, Completion, Render, merge
+
+MAX_BYSTANDERS = 40
+"""Photographs, besides the context, before which nothing is added."""
 
 Complete = Callable[[Completion, Camera], Completion]
 """What is done at a camera once it is chosen."""
@@ -67,6 +71,7 @@ class Explorer:
             count: How many cameras it is completed for at most. It is fewer where little is left.
         """
         clock, begun = Clock(()), completion.seconds["total"]
+        completion = with_bystanders(completion, cameras)
         completion, choices = self.take(completion, cameras, count, self.completer.advance)
         completed = completion.seconds["total"]
         spent = begun + clock.seconds["total"]
@@ -154,3 +159,16 @@ class Explorer:
         look = self.look(completion, self.completer.window(completion, camera).wide)
         added = stand_ins(look.render, look.holes, look.camera)
         return replace(completion, scene=merge([completion.scene, added]))
+
+
+def with_bystanders(completion: Completion, cameras: Sequence[Camera]) -> Completion:
+    """`completion` with those of `cameras` that it has no photographs of, or many of them, spread.
+
+    Not where the scene is doubted: what it shows them may be wrong, and its witnesses know better.
+    """
+    taken = [view.camera for view in completion.views]
+    others = [completion.ranged(c) for c in cameras if not any(same_camera(c, t) for t in taken)]
+    if completion.evidence is not None or not others:
+        return completion
+    chosen = spread_cameras(others, MAX_BYSTANDERS)
+    return replace(completion, bystanders=tuple(others[index] for index in chosen))

@@ -29,7 +29,6 @@ from gscompleter.commands.opening import (
     open_scene,
     read_task,
     say,
-    with_guards,
     with_witnesses,
 )
 from gscompleter.commands.options import CompleteOptions
@@ -116,8 +115,6 @@ def prepared(
     if options.scene is not None:
         task = with_witnesses(task, opened.photographs)
         task = in_frame_of_splat(task, options.scene, options, opened)
-    elif not task.targets:
-        task = with_guards(task, opened.photographs)
     completer = completer_for(options, task.targets, device)
     clock = Clock()
     with clock("context"):

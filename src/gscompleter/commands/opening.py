@@ -36,7 +36,7 @@ from gscompleter.progress import shown_on
 from gscompleter.render import load_renderer
 from gscompleter.reports.completion import Brought, Target
 from gscompleter.splats.formats import format_of, load_splat
-from gscompleter.stages.overview import medoids, overview, select_overview
+from gscompleter.stages.overview import overview, select_overview
 from gscompleter.stages.selection import points_before, select_context
 from gscompleter.types import Camera, Gaussians, View
 
@@ -53,8 +53,6 @@ CHOSEN_FOR_ALL = 8
 """Photographs that are chosen where no target is named either, and all of the scene matters."""
 WITNESSES, WITNESS_SIDE = 6, 320
 """Photographs that tell how far away things are where nobody says, and their longer side."""
-GUARDS = 8
-"""Photographs, besides the context, that no completion may harm where no target is named."""
 MAX_WITNESSES = 40
 """Photographs, besides the context, that tell what of a scene is supported."""
 
@@ -204,19 +202,6 @@ def with_witnesses(task: Task, given: Photographs) -> Task:
     for frame in closest(wanted, cameras, MAX_WITNESSES):
         with suppress(InputError):
             views += given.views([frame], WITNESS_SIDE)
-    return replace(task, witnesses=[view.to(task.views[0].image.device) for view in views])
-
-
-def with_guards(task: Task, given: Photographs) -> Task:
-    """`task` with a few of the photographs that are not context, spread over all: what is added
-    must not stand before what they show, nor make them worse."""
-    taken = {view.frame for view in task.views}
-    others = [frame for frame in range(len(given)) if frame not in taken]
-    cameras = usable_cameras(given, others, WITNESS_SIDE)
-    views = []
-    for index in medoids(list(cameras.values()), GUARDS) if cameras else ():
-        with suppress(InputError):
-            views += given.views([list(cameras)[index]], WITNESS_SIDE)
     return replace(task, witnesses=[view.to(task.views[0].image.device) for view in views])
 
 
