@@ -76,9 +76,8 @@ def test_a_dry_run_writes_the_cameras_alone_and_shows_them(scene, tmp_path, monk
     cameras = load_cameras(out / "targets.json")
     shown = " ".join(capsys.readouterr().out.split())
     assert "1: target near " in shown
-    assert f"To complete: {len(cameras)} cameras, about " in " ".join(
-        (shown, *capsys.readouterr().err.split())
-    )
+    assert f"To complete: {len(cameras)} camera" in shown
+    assert ", which takes about " in shown
 
 
 def test_a_plan_begins_as_the_completion_and_can_be_given_back(
@@ -96,6 +95,25 @@ def test_a_plan_begins_as_the_completion_and_can_be_given_back(
     summary = summary_of(out)
     assert summary["targets"][0]["near"] is None
     assert summary["coverage"]["after"] > summary["coverage"]["before"]
+
+
+def test_a_scene_that_was_brought_is_explored_with_its_doubts(
+    scene, completed, tmp_path, monkeypatch, capsys
+):
+    """What the photographs support of it is told for the small images, too."""
+    out = tmp_path / "out"
+    given = ("--scene", completed / "context.ply", "--context", 0, 2, 4)
+    said = [word for word in QUICK if word != "--quiet"]
+    words = ("complete", scene, "--out", out, *given, "--auto", 1, "--dry-run", *said)
+    assert run(monkeypatch, *words) == 0
+    (camera,) = load_cameras(out / "targets.json")
+    near = min(
+        baseline_between(camera, open_photographs(scene).camera(number))
+        for number in range(len(PLACES))
+    )
+    assert near < 0.5
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "To complete: 1 camera, how long that takes shows only then." in shown
 
 
 def test_a_dry_run_shows_what_named_targets_would_cost(scene, tmp_path, monkeypatch):

@@ -214,6 +214,8 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
             f"{' '.join(map(str, origin))}; summary.json has the transform.",
             soft_wrap=True,
         )
+    if not summary["targets"]:
+        console.print("No camera was found that has much to gain; nothing was completed.")
     covered = summary["coverage"]
     console.print(
         f"From around the photographs {100 * covered['before']:.1f} % was covered before, and "

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.opening import Opened, Task, say, usable_cameras
+from gscompleter.commands.opening import Opened, Task, usable_cameras
 from gscompleter.commands.options import FOUND, CompleteOptions, working_size
 from gscompleter.completer import check_numbers
 from gscompleter.data.origin import frame_from_photographs
@@ -99,11 +99,19 @@ def tell_plan(options: CompleteOptions, plan: Plan) -> None:
         table.add_row(f"{number + 1}: {name_of(target.frame, target.near)}", f"{100 * hole:.1f} %")
     console = Console(highlight=False)
     console.print(table)
-    said = "how long a target takes shows only then"
+    console.print(sentence_of(plan, options.out), soft_wrap=True)
+
+
+def sentence_of(plan: Plan, out: Path) -> str:
+    """How many cameras are to be completed, how long that takes, and where they can be edited."""
+    number = len(plan.holes)
+    if number == 0:
+        return "No camera was found that has much to gain; nothing is to be completed."
+    said = "how long that takes shows only then"
     if plan.seconds is not None:
-        said = f"about {plan.seconds * len(plan.holes):.0f} s for these after the context"
-    where = quoted(options.out / TARGETS)
-    say(console, f"To complete: {len(plan.holes)} cameras, {said}. Edit them in {where}.")
+        said = f"which takes about {plan.seconds * number:.0f} s after the context"
+    counted = "1 camera" if number == 1 else f"{number} cameras"
+    return f"To complete: {counted}, {said}. Edit them in {quoted(out / TARGETS)}."
 
 
 def name_of(frame: int | None, near: int | None) -> str:
