@@ -100,8 +100,8 @@ def test_a_plan_takes_the_first_camera_that_is_completed_and_then_another(begun)
 def test_a_camera_before_a_surface_gains_nothing(begun):
     searching = explorer()
     (found,) = searching.plan(begun, cameras(), 1)
-    (far,) = searching.judged(begun, [replace(found.candidate, depth=1e-3)])
-    (near,) = searching.judged(begun, [replace(found.candidate, depth=1e3)])
+    (far,) = searching.judged(begun, [replace(found.candidate, nearest=1e-3)])
+    (near,) = searching.judged(begun, [replace(found.candidate, nearest=1e3)])
     assert far.gain > 0
     assert near.gain == 0
 

@@ -116,7 +116,7 @@ def parsed(words: Sequence[str]) -> Any:
 def auto_counted(words: Sequence[str]) -> list[str]:
     """`words` with a number after `--auto`, which may stand alone."""
     alone = [
-        w == "--auto" and not n.isdecimal() for w, n in zip(words, [*words[1:], ""], strict=True)
+        w == "--auto" and not n.isdecimal() for w, n in zip(words, [*words, ""][1:], strict=True)
     ]
     counted = [(w, str(FOUND)) if a else (w,) for w, a in zip(words, alone, strict=True)]
     return [word for pair in counted for word in pair]

@@ -30,7 +30,7 @@ from gscompleter.stages.anchor import (
 )
 from gscompleter.stages.candidates import shrunk
 from gscompleter.stages.context import depth_range_of_scene, init_context
-from gscompleter.stages.exploration import small_renders
+from gscompleter.stages.exploration import overlap_of, small_renders
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
     do_no_harm,
@@ -419,10 +419,26 @@ class GSCompleter:
             completion,
             window,
             frozen,
-            select_anchor(window.target, completion.views, self.config.anchor),
+            self.anchor(completion, window.target),
             self.believed(completion, frozen.context, window.wide),
             self.stereo(completion, frozen.context, window),
         )
+
+    def anchor(self, completion: Completion, target: Camera) -> AnchorChoice:
+        """Which photograph forms the stereo pair with the target, as the scene stands."""
+        config, views = self.config.anchor, completion.views
+        if config.min_overlap == 0:
+            return select_anchor(target, views, config)
+        cameras = [
+            shrunk(c, self.config.exploration.side)
+            for c in (target, *(view.camera for view in views))
+        ]
+        seen, *at_views = small_renders(completion.scene, cameras, self.renderer)
+        overlaps = [
+            overlap_of(cameras[0], seen, camera, render)
+            for camera, render in zip(cameras[1:], at_views, strict=True)
+        ]
+        return select_anchor(target, views, config, overlaps)
 
     def stereo(self, completion: Completion, drawn: Render, window: Window) -> Stereo | None:
         """What stereo among the photographs shows to the wider camera; None where nothing is

@@ -139,12 +139,14 @@ class Explorer:
         """What there is to gain at one camera; nothing where it stands close to a surface."""
         look = self.look(completion, candidate.camera)
         hole = look.holes.float().mean().item()
-        if is_close(look.render, candidate.depth, self.config):
+        if is_close(look.render, candidate.nearest, self.config):
             return Choice(candidate, hole, 0.0)
-        config = self.completer.config.anchor
-        anchor = anchors[select_anchor(candidate.camera, completion.views, config).index]
-        overlap = overlap_of(look.camera, look.render, anchor.camera, anchor.render)
-        return Choice(candidate, hole, gain(look.holes, overlap, self.config))
+        overlaps = [
+            overlap_of(look.camera, look.render, anchor.camera, anchor.render) for anchor in anchors
+        ]
+        config, views = self.completer.config.anchor, completion.views
+        anchor = select_anchor(candidate.camera, views, config, overlaps).index
+        return Choice(candidate, hole, gain(look.holes, overlaps[anchor], self.config))
 
     def look(self, completion: Completion, camera: Camera) -> Look:
         """What a camera sees of a scene, in a small image."""

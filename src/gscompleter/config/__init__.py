@@ -23,6 +23,9 @@ class AnchorConfig(Settings):
     """Largest turn away from the target, in degrees, that still leaves overlap."""
     selection: Literal["widest", "nearest"] = "widest"
     """`widest` baseline is the paper's rule; `nearest` view is its ablation without it."""
+    min_overlap: Share = 0.25
+    """Smallest share of what the target observes of the scene that an anchor must see too, where
+    any view does. The paper asks for none."""
 
 
 @dataclass(frozen=True)
@@ -176,8 +179,9 @@ class ExplorationConfig(Settings):
     """Pixels of the longer side of the images that candidates are judged by."""
     reach: Share = 0.25
     """How far from what was observed a pixel of a hole still counts, as a share of that side."""
-    clearance: Share = 0.3
-    """Share of the usual depth before which a surface is close."""
+    clearance: Share = 0.5
+    """Share of the depth of the nearest twentieth of what a photograph sees, before which a surface
+    is close."""
     max_close: Share = 0.1
     """Largest share of the image that close surfaces may fill."""
     min_gain: Share = 0.01
@@ -220,6 +224,7 @@ class CompleterConfig(Settings):
         Gaussian slides, no occlusion mask in the stereo loss, nothing checked afterwards."""
         return CompleterConfig(
             margin=0.0,
+            anchor=AnchorConfig(min_overlap=0.0),
             registration=RegistrationConfig(
                 iterations=50,
                 learning_rate=0.01,

@@ -34,8 +34,8 @@ class Candidate:
     camera: Camera
     base: int
     """Index of the given camera that it was derived from."""
-    depth: float
-    """Median z-depth of what that camera sees, in scene units."""
+    nearest: float
+    """z-depth of the nearest twentieth of what that camera sees, in scene units."""
 
 
 def candidates(
@@ -52,13 +52,13 @@ def candidates(
         step: How far a camera moves at most, in scene units; 0 where the photographs do not tell.
         config: How far it moves otherwise.
     """
-    depths = median_depths(renders)
+    depths, nearest = depths_at(renders, 0.5), depths_at(renders, 0.05)
     up = upward(bases)
     found = []
     for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
         longest = config.max_step * depth
         away = moves(base, depth, min(step, longest) if step > 0 else longest, config.turn, up)
-        found += [Candidate(camera, index, depth) for camera in away]
+        found += [Candidate(camera, index, nearest[index]) for camera in away]
     small = [resized(b, *r.alpha.T.shape) for b, r in zip(bases, renders, strict=True)]
     return [c for c in found if in_the_open(c.camera.center, small, renders)]
 
@@ -149,28 +149,28 @@ def in_the_open(
     return not hidden
 
 
-def is_close(render: Render, depth: float, config: ExplorationConfig) -> bool:
-    """Whether surfaces before a camera fill more of its image than they may; `depth` is what is
-    usual there, in scene units."""
+def is_close(render: Render, nearest: float, config: ExplorationConfig) -> bool:
+    """Whether surfaces before a camera fill more of its image than they may; `nearest` is how near,
+    in scene units, they are where a photograph was taken."""
     seen = render.depth_map()
-    near = seen.valid & (seen.depth < config.clearance * depth)
+    near = seen.valid & (seen.depth < config.clearance * nearest)
     return near.float().mean().item() > config.max_close
 
 
-def median_depths(renders: Sequence[Render]) -> list[float]:
-    """The median z-depth of what each render shows, in scene units; of one that shows next to
-    nothing, that of all.
+def depths_at(renders: Sequence[Render], share: float) -> list[float]:
+    """The z-depth, in scene units, before which a share of what each render shows lies; of one that
+    shows next to nothing, that of all.
 
     Raises:
         ValueError: where none shows anything.
     """
-    shown = [(render.depth_map().valid, render.depth) for render in renders]
-    own = [depth[valid] for valid, depth in shown]
+    valid = [render.depth_map().valid for render in renders]
+    own = [render.depth[where] for render, where in zip(renders, valid, strict=True)]
     if sum(len(values) for values in own) == 0:
         raise ValueError("no camera sees the scene, so that nothing tells how far away it is")
-    usual = torch.cat(own).median().item()
-    known = [valid.float().mean().item() >= MIN_SEEN for valid, _ in shown]
-    return [v.median().item() if k else usual for v, k in zip(own, known, strict=True)]
+    usual = torch.cat(own).quantile(share).item()
+    known = [where.float().mean().item() >= MIN_SEEN for where in valid]
+    return [v.quantile(share).item() if k else usual for v, k in zip(own, known, strict=True)]
 
 
 def shrunk(camera: Camera, side: int) -> Camera:
