@@ -108,3 +108,13 @@ def test_of_another_reconstructor_all_that_the_target_sees_is_lifted():
     lifted = lift(two_views_reconstructed(aligned=False), reference, anchor)
     assert lifted.pixel_index is None
     assert 96 * 96 < len(lifted.gaussians) < 2 * 96 * 96
+
+
+def test_a_view_that_shows_something_else_loses_however_wide_its_baseline():
+    target = camera_at()
+    views = [view_of(Room(), camera_at(x)) for x in (0.2, 0.6, 2.0)]
+    assert select_anchor(target, views).index == 2
+    assert select_anchor(target, views, overlaps=[0.9, 0.5, 0.1]).index == 1
+    assert select_anchor(target, views, overlaps=[0.1, 0.05, 0.0]).index == 2
+    literal = AnchorConfig(min_overlap=0.0)
+    assert select_anchor(target, views, literal, [0.9, 0.5, 0.0]).index == 2

@@ -65,6 +65,7 @@ def test_out_holds_all_that_the_contract_names(completed):
         "generated.ply",
         "images",
         "summary.json",
+        "targets.json",
     }
     names = ("before", "after", "reference", "hole_mask", "truth")
     assert {p.name for p in (completed / "images").iterdir()} == {
@@ -181,7 +182,6 @@ def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
         ({"context": (0, 9)}, "no frame 9"),
         ({"target": (9,)}, "no frame 9"),
         ({"target": (-1,)}, "-1"),
-        ({"target": ()}, "at least one"),
         ({"target": ("nowhere.json",)}, "nowhere.json"),
         ({"target": ("²",)}, "²"),
         ({"target": ("--2",)}, "--2"),
@@ -203,6 +203,8 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
     ("more", "sentence"),
     [
         (("--near", 5, "--far", 1), "near"),
+        (("--auto", 2), "Targets are named, and others are to be found besides; "),
+        (("--auto",), "complete the result for the others (--auto)."),
         (("--near", 0), "near"),
         (("--near", -1), "near"),
         (("--far", "nan"), "far"),

@@ -93,3 +93,12 @@ def test_without_steps_nothing_is_checked():
     )
     assert placed.all()
     assert torch.allclose(moved.means, floaters(2.0).means, atol=1e-6)
+
+
+def test_nothing_stands_where_a_camera_stood():
+    """Behind the camera too, nearer to it than anything it sees: there it would fill the image."""
+    behind = WITNESS.center + torch.tensor([[0.0, 0.0, -0.3], [0.0, 0.0, -0.6]])
+    assert WITNESS.near == 0.5
+    assert seen_through(behind, [WITNESS], [wall(4.0)]).tolist() == [True, False]
+    unknown = replace(WITNESS, near=None)
+    assert not seen_through(behind, [unknown], [wall(4.0)]).any()

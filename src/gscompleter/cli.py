@@ -20,6 +20,7 @@ from gscompleter import __version__
 from gscompleter.commands.convert import ConvertOptions
 from gscompleter.commands.generator_options import generator_flags
 from gscompleter.commands.options import (
+    FOUND,
     CleanOptions,
     CompleteOptions,
     DemoOptions,
@@ -97,7 +98,7 @@ def parsed(words: Sequence[str]) -> Any:
     said = StringIO()
     try:
         with redirect_stderr(said):
-            config, words = config_named(words)
+            config, words = config_named(auto_counted(words))
             return tyro.cli(
                 Command,
                 prog="gscompleter",
@@ -110,6 +111,15 @@ def parsed(words: Sequence[str]) -> Any:
         if not stop.code:
             raise
         raise InputError(unboxed(said.getvalue(), words)) from None
+
+
+def auto_counted(words: Sequence[str]) -> list[str]:
+    """`words` with a number after `--auto`, which may stand alone."""
+    alone = [
+        w == "--auto" and not n.isdecimal() for w, n in zip(words, [*words, ""][1:], strict=True)
+    ]
+    counted = [(w, str(FOUND)) if a else (w,) for w, a in zip(words, alone, strict=True)]
+    return [word for pair in counted for word in pair]
 
 
 @dataclass(frozen=True)

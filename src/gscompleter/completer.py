@@ -27,7 +27,9 @@ from gscompleter.stages.anchor import (
     select_anchor,
     synthesize_all,
 )
+from gscompleter.stages.candidates import shrunk
 from gscompleter.stages.context import init_context, working_range
+from gscompleter.stages.exploration import overlap_of, small_renders
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
     do_no_harm,
@@ -344,13 +346,18 @@ class GSCompleter:
         """Stage 4: what lies in the holes, where no photograph saw through it."""
         mask = dilate(self.holes(sight), self.config.holes.dilation)
         wide, views = sight.window.wide, sight.completion.views
+        side = self.config.exploration.side
+        aside = [shrunk(camera, side) for camera in sight.completion.bystanders]
         kept, placed = respect_free_space(
             self.before_doubted(
                 keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide), sight
             ),
             wide,
-            [view.camera for view in views],
-            [self.as_believed(sight, f, v) for f, v in zip(frozen_views, views, strict=True)],
+            [*(view.camera for view in views), *aside],
+            [
+                *(self.as_believed(sight, f, v) for f, v in zip(frozen_views, views, strict=True)),
+                *small_renders(sight.completion.scene, aside, self.renderer),
+            ],
             self.config.registration.footprint,
             self.config.free_space,
         )
@@ -411,10 +418,26 @@ class GSCompleter:
             completion,
             window,
             frozen,
-            select_anchor(window.target, completion.views, self.config.anchor),
+            self.anchor(completion, window.target),
             self.believed(completion, frozen.context, window.wide),
             self.stereo(completion, frozen.context, window),
         )
+
+    def anchor(self, completion: Completion, target: Camera) -> AnchorChoice:
+        """Which photograph forms the stereo pair with the target, as the scene stands."""
+        config, views = self.config.anchor, completion.views
+        if config.min_overlap == 0:
+            return select_anchor(target, views, config)
+        cameras = [
+            shrunk(c, self.config.exploration.side)
+            for c in (target, *(view.camera for view in views))
+        ]
+        seen, *at_views = small_renders(completion.scene, cameras, self.renderer)
+        overlaps = [
+            overlap_of(cameras[0], seen, camera, render)
+            for camera, render in zip(cameras[1:], at_views, strict=True)
+        ]
+        return select_anchor(target, views, config, overlaps)
 
     def stereo(self, completion: Completion, drawn: Render, window: Window) -> Stereo | None:
         """What stereo among the photographs shows to the wider camera; None where nothing is
@@ -623,4 +646,4 @@ class Clock:
 
 def total(before: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:
     """Seconds of both, stage by stage."""
-    return {stage: before[stage] + more[stage] for stage in before}
+    return {stage: before[stage] + more.get(stage, 0.0) for stage in before}

@@ -358,6 +358,9 @@ class Completion:
     """Wall time of context, generate, lift, register, integrate and total."""
     witnesses: tuple[View, ...] = ()
     """Other photographs of the scene: none of them may get worse either."""
+    bystanders: tuple[Camera, ...] = ()
+    """Cameras of other photographs, which are not looked at: what they see of the scene stays in
+    sight."""
     evidence: Evidence | None = None
     """What `views` and `witnesses` show of the context; None where a context is not doubted."""
     set_aside: Bool[Tensor, "n"] | None = None

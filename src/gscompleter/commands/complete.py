@@ -10,6 +10,16 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from gscompleter.commands.exploring import (
+    cameras_of,
+    completed,
+    coverage,
+    most,
+    name_of,
+    planned,
+    tell_plan,
+    write_targets,
+)
 from gscompleter.commands.opening import (
     Opened,
     Task,
@@ -32,6 +42,7 @@ from gscompleter.commands.output import (
 from gscompleter.commands.understood import understood
 from gscompleter.completer import Clock, GSCompleter, total
 from gscompleter.config import CompleterConfig
+from gscompleter.explorer import Explorer
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.progress import shown_on
@@ -44,6 +55,9 @@ from gscompleter.types import Completion, View
 def run_completion(options: CompleteOptions) -> None:
     """Complete the scene of `options.folder`, write `options.out` and say what was done."""
     with saying_what_stays(options.out):
+        if options.dry_run:
+            plan_folder(options)
+            return
         summary, completion = complete_folder(options)
         if not options.quiet:
             tell(summary, completion, options.out)
@@ -57,6 +71,45 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
             cameras that were found.
     """
     console = Console(stderr=True, quiet=options.quiet)
+    opened, task, explorer, before = prepared(options, console)
+    cameras = cameras_of(options, opened, task)
+    with output_folder(options.out, replaceable(options)) as folder:
+        with shown_on(None if options.quiet else console):
+            completion, task = completed(options, task, cameras, explorer)
+        completion = replace(completion, seconds=total(completion.seconds, before))
+        said = said_in_advance(options, opened, task, task.views[0].image.device.type)
+        said["coverage"] = coverage(options, completion, cameras.values(), explorer)
+        renderer = explorer.completer.renderer
+        summary = write_report(folder, completion, task.targets, renderer, said, task.brought)
+        write_targets(folder, task)
+    return summary, completion
+
+
+def plan_folder(options: CompleteOptions) -> None:
+    """Show what completing the scene of `options.folder` would do, and write the targets alone.
+
+    Raises:
+        InputError: as `complete_folder`.
+    """
+    console = Console(stderr=True, quiet=options.quiet)
+    opened, task, explorer, _ = prepared(options, console)
+    cameras = cameras_of(options, opened, task)
+    with output_folder(options.out, replaceable(options)) as folder:
+        with shown_on(None if options.quiet else console):
+            plan = planned(options, task, cameras, explorer)
+        write_targets(folder, plan.task)
+    if not options.quiet:
+        tell_plan(options, plan)
+
+
+def prepared(
+    options: CompleteOptions, console: Console
+) -> tuple[Opened, Task, Explorer, Mapping[str, float]]:
+    """What is opened, what is to be done, by what, and the seconds that it took to find out.
+
+    Raises:
+        InputError: as `complete_folder`.
+    """
     check_output(options.out, replaceable(options))
     check_context(options)
     check_targets(options)
@@ -70,25 +123,16 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     clock = Clock()
     with clock("context"):
         task = with_working_range(task, completer.renderer)
-    before = clock.seconds
     say(console, *understood(options, opened, task, device))
-    with output_folder(options.out, replaceable(options)) as folder:
-        with shown_on(None if options.quiet else console):
-            cameras = [target.camera.to(device) for target in task.targets]
-            completion = completer(task.views, cameras, task.scene, task.witnesses)
-        completion = replace(completion, seconds=total(completion.seconds, before))
-        said = said_in_advance(options, opened, task, device)
-        summary = write_report(
-            folder, completion, task.targets, completer.renderer, said, task.brought
-        )
-    return summary, completion
+    return opened, task, Explorer(completer), clock.seconds
 
 
 def said_in_advance(
     options: CompleteOptions, opened: Opened, task: Task, device: str
 ) -> dict[str, Any]:
     """What `summary.json` says of a completion besides its scores."""
-    targets = {"target": list(options.target)}
+    auto = None if options.target else most(options)
+    targets = {"target": list(options.target), "auto": auto}
     return {
         "settings": settings_of(options, stages_of(options), targets, models_of(options)),
         "seed": options.seed,
@@ -144,7 +188,7 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
         table.add_row(name, "", cell(row["psnr_before"]), cell(row["psnr_after"]), "")
     notes = []
     for row, target in zip(summary["targets"], completion.targets, strict=True):
-        name = "target" if row["frame"] is None else f"target {row['frame']}"
+        name = name_of(row["frame"], row["near"])
         notes += [f"{name}: {note}" for note in target.notes]
         hole = f"{100 * row['hole_fraction']:.1f} %"
         scores = cell(row["psnr_before"]), cell(row["psnr_after"])
@@ -160,6 +204,14 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
             f"{' '.join(map(str, origin))}; summary.json has the transform.",
             soft_wrap=True,
         )
+    if not summary["targets"]:
+        console.print("No camera was found that has much to gain; nothing was completed.")
+    covered = summary["coverage"]
+    console.print(
+        f"From around the photographs {100 * covered['before']:.1f} % was covered before, and "
+        f"{100 * covered['after']:.1f} % is now.",
+        soft_wrap=True,
+    )
     counts = summary["gaussians"]
     seconds = summary["seconds"]["total"]
     console.print(

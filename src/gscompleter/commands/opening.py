@@ -38,6 +38,7 @@ from gscompleter.render import Renderer, load_renderer
 from gscompleter.reports.completion import Brought, Target
 from gscompleter.splats.formats import format_of, load_splat
 from gscompleter.stages.context import working_range
+from gscompleter.stages.overview import overview, select_overview
 from gscompleter.stages.selection import points_before, select_context
 from gscompleter.types import Camera, Gaussians, View
 
@@ -50,6 +51,8 @@ MAX_DIGITS = 9
 CHOSEN, CHOSEN_WITH_SCENE = 3, 8
 """Photographs that are chosen where none are named: to reconstruct the context, whose cost grows
 with the square of their number, and to keep an eye on a scene that was brought."""
+CHOSEN_FOR_ALL = 8
+"""Photographs that are chosen where no target is named either, and all of the scene matters."""
 WITNESSES, WITNESS_SIDE = 6, 320
 """Photographs that tell how far away things are where nobody says, and their longer side."""
 MAX_WITNESSES = 40
@@ -201,12 +204,13 @@ def in_frame_of_splat(task: Task, path: Path, options: SceneOptions, opened: Ope
 
 def with_witnesses(task: Task, given: Photographs) -> Task:
     """`task` with the photographs that are neither context nor target, those closest to the
-    targets; none of them that cannot be read."""
+    targets, or to the context where there is none; none of them that cannot be read."""
     taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
     others = [frame for frame in range(len(given)) if frame not in taken]
     cameras = usable_cameras(given, others, WITNESS_SIDE)
+    wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
     views = []
-    for frame in closest([t.camera for t in task.targets], cameras, MAX_WITNESSES):
+    for frame in closest(wanted, cameras, MAX_WITNESSES):
         with suppress(InputError):
             views += given.views([frame], WITNESS_SIDE)
     return replace(task, witnesses=[view.to(task.views[0].image.device) for view in views])
@@ -239,9 +243,13 @@ def check_context(options: SceneOptions) -> None:
 
 
 def check_targets(options: CompleteOptions) -> None:
-    """Refuse a completion for nothing."""
-    if not options.target:
-        raise InputError("--target names no frame; name at least one, as in --target 8.")
+    """Refuse targets that are named, and others that are to be found besides."""
+    if options.target and options.auto is not None:
+        raise InputError(
+            "Targets are named, and others are to be found besides; name them, or let them be "
+            "found, and complete the result for the others.",
+            "auto",
+        )
 
 
 def needed_views(options: SceneOptions) -> int:
@@ -252,7 +260,8 @@ def needed_views(options: SceneOptions) -> int:
 def chosen_context(
     options: CompleteOptions, given: Photographs, targets: Sequence[Target]
 ) -> tuple[int, ...]:
-    """Frames that matter to the targets; never a target itself, whose photograph is for scoring.
+    """Frames that matter to the targets, or where there are none, that show most of the scene;
+    never a target itself, whose photograph is for scoring.
 
     Raises:
         InputError: where too few photographs are left, or nothing tells how far away things are.
@@ -267,12 +276,16 @@ def chosen_context(
             f"Besides the targets there {there} that can be used, and at least {needed} needed; "
             "name fewer targets, or add photographs."
         )
+    frames, candidates = list(cameras), list(cameras.values())
+    wanted = [target.camera for target in targets] or overview(candidates)
     points = given.points()
     if points is None or len(points) == 0:
-        points = points_told(given, [target.camera for target in targets], cameras)
-    count = CHOSEN if options.scene is None else CHOSEN_WITH_SCENE
-    frames = list(cameras)
-    chosen = select_context([t.camera for t in targets], list(cameras.values()), points, count)
+        points = points_told(given, wanted, cameras)
+    if not targets:
+        chosen = select_overview(candidates, points, CHOSEN_FOR_ALL)
+    else:
+        count = CHOSEN if options.scene is None else CHOSEN_WITH_SCENE
+        chosen = select_context(wanted, candidates, points, count)
     return tuple(frames[index] for index in chosen)
 
 

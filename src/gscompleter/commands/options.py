@@ -24,6 +24,9 @@ Size = tuple[int, int] | int | Literal["full"]
 LONG_SIDE = 640
 """Most pixels of the longer side of a photograph, where nobody says."""
 
+FOUND = 4
+"""Cameras that are found at most, where nobody says how many."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Settings):
@@ -94,13 +97,22 @@ class CompleteOptions(SceneOptions, ModelOptions):
 
     context: tuple[Frame, ...] | None = None
     """Numbers of the frames to start from, in the order of the sorted file paths. If not given,
-    those that matter to the targets are chosen; a target's own photograph is none of them."""
-    target: tuple[str, ...]
+    those that matter to the targets are chosen, or without a target those that show most; a
+    target's own photograph is none of them."""
+    target: tuple[str, ...] = ()
     """Frames to complete the scene for, by number, or a file of cameras (transforms.json,
     cameras.json, COLMAP's images.txt, SuperSplat's poses). Several are
-    completed one after the other into one scene."""
+    completed one after the other into one scene. If not given, cameras are found that see holes,
+    and targets.json has them."""
+    auto: Annotated[int, Interval(ge=1, le=255)] | None = None
+    """How many cameras are found at most, where no target is given: 4 unless a number is named.
+    Fewer are taken where little is left to complete."""
+    dry_run: bool = False
+    """Only write targets.json, which can be edited and given to --target, and show what would be
+    done."""
     out: Path
-    """Folder for completed.ply, generated.ply, context.ply, images/ and summary.json."""
+    """Folder for completed.ply, generated.ply, context.ply, targets.json, images/ and
+    summary.json."""
     scene: Path | None = None
     """A file of Gaussians to complete, which is kept as it is. Without it the context is
     reconstructed from the photographs."""

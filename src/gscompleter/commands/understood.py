@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from gscompleter.commands.exploring import most
 from gscompleter.commands.opening import Opened, Task
 from gscompleter.commands.options import CompleteOptions, SceneOptions
 from gscompleter.data.formats import FORMATS
@@ -98,6 +99,7 @@ def plan_line(options: CompleteOptions, task: Task, device: str) -> str:
     others = len(task.targets) - len(frames)
     targets = [frames_line(frames)] if frames else []
     targets += [f"{others} cameras" if others > 1 else "a camera"] if others else []
+    targets = targets or [f"up to {most(options)} cameras that are found"]
     return (
         f"context from {frames_line([view.frame for view in task.views])}{chosen}, completed for "
         f"{' and '.join(targets)} by {options.reconstructor} and {options.synthesis.name} on "

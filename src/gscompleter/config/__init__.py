@@ -23,6 +23,9 @@ class AnchorConfig(Settings):
     """Largest turn away from the target, in degrees, that still leaves overlap."""
     selection: Literal["widest", "nearest"] = "widest"
     """`widest` baseline is the paper's rule; `nearest` view is its ablation without it."""
+    min_overlap: Share = 0.25
+    """Smallest share of what the target observes of the scene that an anchor must see too, where
+    any view does. The paper asks for none."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,32 @@ class HarmConfig(Settings):
 
 
 @dataclass(frozen=True)
+class ExplorationConfig(Settings):
+    """Where a scene is completed, where nobody names a target."""
+
+    bases: Annotated[int, Interval(ge=1, le=1000)] = 16
+    """Photographs, spread over all, around whose cameras targets are looked for."""
+    max_step: Annotated[float, Interval(gt=0, le=1)] = 0.2
+    """Longest move, as a share of the depth of what the camera sees. Where these photographs stand
+    closer together, it is as long as that."""
+    turn: Annotated[float, Interval(gt=0, le=0.5)] = 0.25
+    """Angle of a turn, as a share of the opening angle."""
+    side: Annotated[int, Interval(ge=16, le=4096)] = 96
+    """Pixels of the longer side of the images that candidates are judged by."""
+    reach: Share = 0.25
+    """How far from what was observed a pixel of a hole still counts, as a share of that side."""
+    clearance: Share = 0.5
+    """Share of the depth of the nearest twentieth of what a photograph sees, before which a surface
+    is close."""
+    max_close: Share = 0.1
+    """Largest share of the image that close surfaces may fill."""
+    min_gain: Share = 0.01
+    """Gain, as a share of the image, below which little is left to gain."""
+    enough: Annotated[float, Interval(gt=0, le=1)] = 0.7
+    """Share of the largest gain from which on a nearer camera comes first."""
+
+
+@dataclass(frozen=True)
 class CompleterConfig(Settings):
     """Settings of the four stages. The defaults are ours, wherever measurement shows better than
     the paper's; `docs/design.md` has the table."""
@@ -186,6 +215,8 @@ class CompleterConfig(Settings):
     """How what is added to a scene that is doubted is brought to agree with its photographs."""
     harm: HarmConfig = HarmConfig()
     """How much worse a photograph may be matched than before."""
+    exploration: ExplorationConfig = ExplorationConfig()
+    """Where targets are looked for, where nobody names any."""
 
     @staticmethod
     def paper() -> CompleterConfig:
@@ -193,6 +224,7 @@ class CompleterConfig(Settings):
         Gaussian slides, no occlusion mask in the stereo loss, nothing checked afterwards."""
         return CompleterConfig(
             margin=0.0,
+            anchor=AnchorConfig(min_overlap=0.0),
             registration=RegistrationConfig(
                 iterations=50,
                 learning_rate=0.01,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gscompleter.types import Gaussians
@@ -25,12 +25,22 @@ def thinned(scene: Gaussians, most: int = MAX_GAUSSIANS) -> Gaussians:
     """
     if len(scene) <= most:
         return scene
+    rows, growth = thinning(scene, most)
+    chosen = replace(scene, encoded=None)[rows]
+    return replace(chosen, scales=chosen.scales * growth[:, None])
+
+
+def thinning(
+    scene: Gaussians, most: int = MAX_GAUSSIANS
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
+    """Indices of the Gaussians that stay, and the factor by which each one's size grows."""
+    if len(scene) <= most:
+        return torch.arange(len(scene), device=scene.means.device), torch.ones_like(scene.opacities)
     chance = chances(scene, most)
     place = chance.double().cumsum(0).floor()
     stays = place > torch.nn.functional.pad(place[:-1], (1, 0))
-    growth = chance[stays].rsqrt()
-    chosen = replace(scene, encoded=None)[stays]
-    return replace(chosen, scales=chosen.scales * growth[:, None])
+    rows = torch.nonzero(stays)[:, 0]
+    return rows, chance[rows].rsqrt()
 
 
 def chances(scene: Gaussians, most: int) -> Float[Tensor, "n"]:

@@ -32,6 +32,8 @@ class Target:
     """Its number in the scene; None for a camera from elsewhere."""
     photograph: Float[Tensor, "h w 3"] | None = None
     """What the camera took, where it took anything. No stage sees it but `oracle`."""
+    near: int | None = None
+    """Number of the frame that a camera was derived from, where it was found and not named."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ def summarize(
         "targets": [
             {
                 "frame": target.frame,
+                "near": target.near,
                 "anchor": completion.views[result.anchor].frame,
                 "anchor_fallback": result.anchor_fallback,
                 "hole_fraction": result.hole_fraction,

@@ -36,13 +36,19 @@ def nearest_view(target: Camera, views: Sequence[View]) -> int:
 
 
 def select_anchor(
-    target: Camera, views: Sequence[View], config: AnchorConfig = AnchorConfig()
+    target: Camera,
+    views: Sequence[View],
+    config: AnchorConfig = AnchorConfig(),
+    overlaps: Sequence[float] | None = None,
 ) -> AnchorChoice:
     """Choose the observed view that makes the best stereo pair with `target`.
 
     Among views turned by less than `max_rotation`, the one farthest away wins, because a wide
     baseline makes triangulation precise. When every view is turned further than that, overlap
     matters more than precision, and the least-turned view wins (paper, Fig. 3).
+
+    Where it is known which share of what the target observes each view sees, those that see too
+    little are left out, unless all do: of a long path the widest baseline shows something else.
     """
     if not views:
         raise ValueError("select_anchor needs at least one observed view, got none")
@@ -52,6 +58,9 @@ def select_anchor(
     rotations = [rotation_between(target, view.camera) for view in views]
     baselines = [baseline_between(target, view.camera) for view in views]
     overlapping = [i for i in range(len(views)) if rotations[i] < config.max_rotation]
+    if overlaps is not None:
+        enough = [i for i in overlapping if overlaps[i] >= config.min_overlap]
+        overlapping = enough or overlapping
     if not overlapping:
         return AnchorChoice(min(range(len(views)), key=rotations.__getitem__), fallback=True)
     return AnchorChoice(max(overlapping, key=baselines.__getitem__), fallback=False)

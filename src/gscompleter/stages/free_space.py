@@ -64,7 +64,8 @@ def respect_free_space(
 def seen_through(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> Bool[Tensor, "n"]:
-    """Which points stand before what some camera sees of the scene."""
+    """Which points stand before what some camera sees of the scene, or where the camera itself
+    stood: nearer to its centre, in whatever direction, than anything it sees."""
     contradicted = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for camera, render in zip(cameras, renders, strict=True):
         pixels, z = project(points, camera)
@@ -75,4 +76,6 @@ def seen_through(
         scene = render.depth_map()
         before = z < (1 + CLEARANCE) * scene.depth[y, x]
         contradicted |= shows & scene.valid[y, x] & before
+        if camera.near is not None:
+            contradicted |= (points - camera.center).norm(dim=-1) < camera.near
     return contradicted

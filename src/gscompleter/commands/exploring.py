@@ -1,0 +1,158 @@
+"""Targets that nobody names: found, completed or only shown, and written down."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+from rich.table import Table
+
+from gscompleter.commands.opening import Opened, Task, usable_cameras
+from gscompleter.commands.options import FOUND, CompleteOptions, working_size
+from gscompleter.completer import check_numbers
+from gscompleter.data.origin import frame_from_photographs
+from gscompleter.data.scene import write_cameras
+from gscompleter.errors import quoted
+from gscompleter.explorer import Explorer
+from gscompleter.frames.similarity import moved_camera
+from gscompleter.metrics.coverage import coverage_of, held_out_cameras
+from gscompleter.reports.completion import Target
+from gscompleter.stages.exploration import Choice
+from gscompleter.types import Camera, Completion
+
+TARGETS = "targets.json"
+"""The file of the output with the cameras that are completed."""
+LIFTED_VIEWS = 4
+"""What completing a camera takes, in photographs of the context: its wider image and the anchor's
+are reconstructed, and the result is registered and fitted."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a completion would do."""
+
+    task: Task
+    """With the targets it would be done for."""
+    holes: tuple[float, ...]
+    """Share of the image of each target that is a hole, once those before are completed."""
+    seconds: float | None
+    """About what each takes; None where nothing tells."""
+
+
+def cameras_of(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:
+    """By their frames, the cameras of all photographs that can be used, in the frame of the result
+    and with the depth range that is worked in."""
+    given = opened.photographs
+    transform = task.frame @ frame_from_photographs(-given.origin)
+    known, device = task.views[0].camera, task.views[0].image.device
+    cameras = usable_cameras(given, range(len(given)), working_size(options.resolution))
+    moved = {f: moved_camera(camera, transform).to(device) for f, camera in cameras.items()}
+    return {f: replace(c, near=known.near, far=known.far) for f, c in moved.items()}
+
+
+def completed(
+    options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: Explorer
+) -> tuple[Completion, Task]:
+    """The scene completed for the targets of `task`; where it has none, for those that are found
+    among the moves of `cameras`, and `task` with them."""
+    completer = explorer.completer
+    if task.targets:
+        targets = [target.camera.to(task.views[0].image.device) for target in task.targets]
+        return completer(task.views, targets, task.scene, task.witnesses), task
+    check_numbers(task.scene, most(options))
+    begun = completer.begin(task.views, task.scene, task.witnesses)
+    completion, choices = explorer.explore(begun, list(cameras.values()), most(options))
+    return completion, replace(task, targets=targets_of(choices, list(cameras)))
+
+
+def planned(
+    options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: Explorer
+) -> Plan:
+    """What `completed` would do, about; nothing is completed."""
+    begun = explorer.completer.begin(task.views, task.scene, task.witnesses)
+    if task.targets:
+        targets = [target.camera.to(task.views[0].image.device) for target in task.targets]
+        holes = explorer.holes(begun, targets)
+    else:
+        choices = explorer.plan(begun, list(cameras.values()), most(options))
+        task = replace(task, targets=targets_of(choices, list(cameras)))
+        holes = [choice.hole for choice in choices]
+    return Plan(task, tuple(holes), seconds_of(options, begun))
+
+
+def seconds_of(options: CompleteOptions, begun: Completion) -> float | None:
+    """About how many seconds a target takes, judged by what Ψ took for the context; None where it
+    took nothing, or Φ may take any time."""
+    if options.scene is not None or options.synthesis.name != "warp-inpaint":
+        return None
+    return LIFTED_VIEWS * begun.seconds["context"] / len(begun.views)
+
+
+def tell_plan(options: CompleteOptions, plan: Plan) -> None:
+    """Show the cameras, their holes, and how long it takes to complete them."""
+    table = Table("camera", "hole", box=None)
+    for number, (target, hole) in enumerate(zip(plan.task.targets, plan.holes, strict=True)):
+        table.add_row(f"{number + 1}: {name_of(target.frame, target.near)}", f"{100 * hole:.1f} %")
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(sentence_of(plan, options.out), soft_wrap=True)
+
+
+def sentence_of(plan: Plan, out: Path) -> str:
+    """How many cameras are to be completed, how long that takes, and where they can be edited."""
+    number = len(plan.holes)
+    if number == 0:
+        return "No camera was found that has much to gain; nothing is to be completed."
+    said = "how long that takes shows only then"
+    if plan.seconds is not None:
+        said = f"which takes about {plan.seconds * number:.0f} s after the context"
+    counted = "1 camera" if number == 1 else f"{number} cameras"
+    return f"To complete: {counted}, {said}. Edit them in {quoted(out / TARGETS)}."
+
+
+def name_of(frame: int | None, near: int | None) -> str:
+    """What a table calls a target: by its own frame, or the one that it was derived from."""
+    if near is not None:
+        return f"target near {near}"
+    return "target" if frame is None else f"target {frame}"
+
+
+def most(options: CompleteOptions) -> int:
+    """How many targets are found."""
+    return FOUND if options.auto is None else options.auto
+
+
+def targets_of(choices: Iterable[Choice], frames: Sequence[int]) -> list[Target]:
+    """Cameras that were chosen, each with the frame that it was derived from."""
+    return [Target(c.camera, near=frames[c.candidate.base]) for c in choices]
+
+
+def write_targets(folder: Path, task: Task) -> None:
+    """Write the cameras of the targets, if any, as `--target` takes them: in the frame of the
+    photographs.
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    if not task.targets:
+        return
+    back = np.linalg.inv(task.frame)
+    write_cameras(folder / TARGETS, [as_given(target.camera, back) for target in task.targets])
+
+
+def coverage(
+    options: CompleteOptions, completion: Completion, cameras: Iterable[Camera], explorer: Explorer
+) -> dict[str, float]:
+    """How much is covered from around `cameras`, before and after, for `summary.json`."""
+    aside = held_out_cameras(list(cameras), options.seed)
+    renderer = explorer.completer.renderer
+    return coverage_of(completion.context, completion.scene, aside, renderer).as_summary()
+
+
+def as_given(camera: Camera, transform: Float[np.ndarray, "4 4"]) -> Camera:
+    """A camera in the frame that `transform` leads to, in float64: maps have large coordinates."""
+    return moved_camera(replace(camera, c2w=camera.c2w.double()), transform)

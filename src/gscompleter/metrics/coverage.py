@@ -1,0 +1,95 @@
+"""How much of what can be looked at a scene covers: the share of pixels with alpha of at least a
+half, over cameras around the path of the photographs that nothing was completed for.
+
+Such a camera lies at random between a photograph's camera and its nearest neighbour, moved aside by
+about as much as these stand apart, and turned by some degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import torch
+from scipy.spatial.transform import Rotation
+
+from gscompleter.coverage import COVERED
+from gscompleter.frames.thinning import thinned
+from gscompleter.geometry import baseline_between
+from gscompleter.render import Renderer
+from gscompleter.stages.candidates import moved, rotation, shrunk, spacing
+from gscompleter.types import Camera, Gaussians
+
+NUM_CAMERAS = 32
+SIDE = 96
+"""Pixels of the longer side of the images that are looked at."""
+MAX_GAUSSIANS = 100_000
+"""Several for each of their pixels."""
+TURN = 5.0
+"""Standard deviation, in degrees, of the turns to the side and up and down."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of the pixels that the scene covers, before and after it was completed."""
+
+    before: float
+    after: float
+    cameras: int
+    """How many cameras it was looked at from."""
+
+    def as_summary(self) -> dict[str, float]:
+        """As `summary.json` has it."""
+        return asdict(self)
+
+
+def coverage_of(
+    before: Gaussians, after: Gaussians, cameras: Sequence[Camera], renderer: Renderer
+) -> Coverage:
+    """How much two scenes cover, as `cameras` see them in small images."""
+    small = (thinned(scene, MAX_GAUSSIANS) for scene in (before, after))
+    first, last = (covered(scene, cameras, renderer) for scene in small)
+    return Coverage(first, last, len(cameras))
+
+
+def covered(scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer) -> float:
+    """Share of the pixels of all cameras that the scene covers."""
+    with torch.no_grad():
+        alphas = [renderer.render(scene, shrunk(camera, SIDE)).alpha for camera in cameras]
+    return torch.cat([alpha.flatten() >= COVERED for alpha in alphas]).float().mean().item()
+
+
+def held_out_cameras(
+    cameras: Sequence[Camera], seed: int, count: int = NUM_CAMERAS
+) -> list[Camera]:
+    """Cameras around the path of `cameras`, the same ones for the same seed."""
+    generator = torch.Generator().manual_seed(seed)
+    step = spacing(cameras)
+    return [held_out(cameras, step, generator) for _ in range(count)]
+
+
+def held_out(cameras: Sequence[Camera], step: float, generator: torch.Generator) -> Camera:
+    """A camera between one of `cameras` and its nearest neighbour, moved and turned at random."""
+    first = cameras[int(torch.randint(len(cameras), (), generator=generator))]
+    share = torch.rand((), generator=generator).item()
+    shift = step * torch.randn(3, generator=generator) / 3**0.5
+    right, down = (TURN * torch.randn(2, generator=generator)).tolist()
+    between = interpolated(first, neighbour(first, cameras), share)
+    turn = rotation(between.c2w[:3, 1], math.radians(right))
+    turn = rotation(between.c2w[:3, 0], math.radians(down)) @ turn
+    return moved(between, turn, shift.to(between.c2w))
+
+
+def neighbour(camera: Camera, cameras: Sequence[Camera]) -> Camera:
+    """The camera that stands nearest to `camera`; itself where there is no other."""
+    others = [other for other in cameras if other is not camera]
+    return min(others, key=lambda other: baseline_between(camera, other), default=camera)
+
+
+def interpolated(first: Camera, second: Camera, share: float) -> Camera:
+    """`first` on its way to where `second` stands and looks."""
+    turns = [Rotation.from_matrix(c.c2w[:3, :3].cpu().double().numpy()) for c in (first, second)]
+    vector = share * (turns[1] * turns[0].inv()).as_rotvec()
+    turn = torch.from_numpy(Rotation.from_rotvec(vector).as_matrix()).to(first.c2w)
+    return moved(first, turn, share * (second.center - first.center))

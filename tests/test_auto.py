@@ -1,0 +1,133 @@
+"""Targets that nobody names, on the command line."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from command import run
+from gscompleter import load_cameras
+from gscompleter.cli import auto_counted, parsed
+from gscompleter.data.formats import open_photographs
+from gscompleter.geometry import baseline_between
+from scenes import camera_at, photographed
+
+PLACES = ((-0.4, -4), (-0.2, 0), (0.0, 0), (0.3, 4), (0.5, 8))
+QUICK = ("--resolution", 48, "--near", 0.5, "--far", 20, "--config.exploration.side", 32, "--quiet")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    cameras = [camera_at(x, yaw=yaw, size=64) for x, yaw in PLACES]
+    return photographed(tmp_path_factory.mktemp("auto"), cameras)
+
+
+@pytest.fixture(scope="module")
+def completed(scene, tmp_path_factory) -> Path:
+    """The output where no target was named, and two were found at most."""
+    out = tmp_path_factory.mktemp("runs") / "out"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        assert run(monkeypatch, "complete", scene, "--out", out, "--auto", 2, *QUICK) == 0
+    return out
+
+
+def summary_of(out: Path) -> dict:
+    return json.loads((out / "summary.json").read_text())
+
+
+def test_without_a_target_cameras_are_found_and_completed(completed):
+    summary = summary_of(completed)
+    assert 1 <= len(summary["targets"]) <= 2
+    for target in summary["targets"]:
+        assert target["frame"] is None
+        assert target["near"] in range(len(PLACES))
+        assert target["hole_fraction"] > 0.01
+        assert target["psnr_after"] is None
+    assert summary["gaussians"]["added"] > 0
+    assert summary["settings"]["auto"] == 2
+    assert 0 < summary["seconds"]["explore"] < summary["seconds"]["total"]
+
+
+def test_the_scene_covers_more_from_around_the_photographs(completed):
+    coverage = summary_of(completed)["coverage"]
+    assert set(coverage) == {"before", "after", "cameras"}
+    assert coverage["cameras"] == 32
+    assert 0.5 < coverage["before"] < coverage["after"] <= 1
+    for row in summary_of(completed)["context"]:
+        assert row["psnr_after"] >= row["psnr_before"] - 0.05
+
+
+def test_the_cameras_stand_beside_the_photographs_they_were_derived_from(scene, completed):
+    photographs = open_photographs(scene)
+    found = load_cameras(completed / "targets.json", 48)
+    rows = summary_of(completed)["targets"]
+    assert len(found) == len(rows)
+    for camera, row in zip(found, rows, strict=True):
+        assert (camera.width, camera.height) == (48, 48)
+        assert baseline_between(camera, photographs.camera(row["near"], 48)) < 0.5
+
+
+def test_a_dry_run_writes_the_cameras_alone_and_shows_them(scene, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    said = [word for word in QUICK if word != "--quiet"]
+    assert run(monkeypatch, "complete", scene, "--out", out, "--auto", 2, "--dry-run", *said) == 0
+    assert [path.name for path in out.iterdir()] == ["targets.json"]
+    cameras = load_cameras(out / "targets.json")
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "1: target near " in shown
+    assert f"To complete: {len(cameras)} camera" in shown
+    assert ", which takes about " in shown
+
+
+def test_a_plan_begins_as_the_completion_and_can_be_given_back(
+    scene, completed, tmp_path, monkeypatch
+):
+    plan, out = tmp_path / "plan", tmp_path / "out"
+    assert run(monkeypatch, "complete", scene, "--out", plan, "--auto", 1, "--dry-run", *QUICK) == 0
+    targets = plan / "targets.json"
+    (planned,) = load_cameras(targets)
+    assert torch.equal(planned.c2w, load_cameras(completed / "targets.json")[0].c2w)
+    words = ("complete", scene, "--out", out, "--target", targets, *QUICK)
+    assert run(monkeypatch, *words) == 0
+    (taken,) = load_cameras(out / "targets.json")
+    assert torch.equal(planned.c2w, taken.c2w)
+    summary = summary_of(out)
+    assert summary["targets"][0]["near"] is None
+    assert summary["coverage"]["after"] > summary["coverage"]["before"]
+
+
+def test_a_scene_that_was_brought_is_explored_with_its_doubts(
+    scene, completed, tmp_path, monkeypatch, capsys
+):
+    """What the photographs support of it is told for the small images, too."""
+    out = tmp_path / "out"
+    given = ("--scene", completed / "context.ply", "--context", 0, 2, 4)
+    said = [word for word in QUICK if word != "--quiet"]
+    words = ("complete", scene, "--out", out, *given, "--auto", 1, "--dry-run", *said)
+    assert run(monkeypatch, *words) == 0
+    (camera,) = load_cameras(out / "targets.json")
+    near = min(
+        baseline_between(camera, open_photographs(scene).camera(number))
+        for number in range(len(PLACES))
+    )
+    assert near < 0.5
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "To complete: 1 camera, how long that takes shows only then." in shown
+
+
+def test_a_dry_run_shows_what_named_targets_would_cost(scene, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    words = ("complete", scene, "--out", out, "--target", 4, "--dry-run", *QUICK)
+    assert run(monkeypatch, *words) == 0
+    (camera,) = load_cameras(out / "targets.json", 48)
+    assert torch.allclose(camera.c2w, open_photographs(scene).camera(4, 48).c2w, atol=1e-6)
+
+
+def test_a_number_may_follow_auto_or_not():
+    words = ["complete", "SCENE", "--out", "OUT"]
+    assert parsed(words).auto is None
+    assert parsed([*words, "--auto", "7"]).auto == 7
+    assert parsed([*words, "--auto"]).auto == 4
+    assert parsed(["complete", "SCENE", "--auto", "--out", "OUT"]).auto == 4
+    assert auto_counted(["complete", "--auto", "x"]) == ["complete", "--auto", "4", "x"]

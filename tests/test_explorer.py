@@ -1,0 +1,162 @@
+"""Targets found by itself, on a room of which the right of it was never seen."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter import CompleterConfig, GSCompleter
+from gscompleter.config import AffineConfig, ExplorationConfig, RegistrationConfig
+from gscompleter.explorer import Explorer, with_bystanders
+from gscompleter.metrics.coverage import coverage_of, covered, held_out_cameras
+from gscompleter.render import load_renderer
+from gscompleter.stages.exploration import gain, miniature, overlap_of, stand_ins
+from gscompleter.types import Camera, Completion, Gaussians, Render, View
+from scenes import Room, camera_at, cast, gaussians_of, view_of
+from test_completer import KnowingGenerator, KnowingReconstructor, knowing
+
+SIZE = 64
+PLACES = (-0.3, 0.1)
+
+
+def photographs() -> list[View]:
+    return [view_of(Room(), camera_at(x, size=SIZE), i) for i, x in enumerate(PLACES)]
+
+
+def explorer(**changes: float) -> Explorer:
+    config = replace(CompleterConfig(), exploration=ExplorationConfig(side=48, **changes))
+    return Explorer(GSCompleter(KnowingReconstructor(), KnowingGenerator(), config=config))
+
+
+@pytest.fixture(scope="module")
+def begun() -> Completion:
+    return explorer().completer.begin(photographs())
+
+
+def cameras():
+    return [view.camera for view in photographs()]
+
+
+def test_holes_count_where_they_border_on_what_was_observed():
+    holes = torch.zeros(40, 40, dtype=torch.bool)
+    holes[:, 20:] = True
+    near = ExplorationConfig(reach=0.1)
+    assert gain(holes, 1.0, near) == pytest.approx(4 / 40)
+    assert gain(holes, 0.5, near) == pytest.approx(2 / 40)
+    assert gain(holes, 1.0, ExplorationConfig(reach=1.0)) == pytest.approx(0.5)
+    assert gain(torch.ones_like(holes), 1.0) == 0.0
+    assert gain(torch.zeros_like(holes), 1.0) == 0.0
+
+
+def test_overlap_is_what_the_anchor_sees_too():
+    def seen(camera):
+        image, depth = cast(Room(), camera)
+        return camera, Render(image, depth, torch.ones_like(depth))
+
+    here = seen(camera_at())
+    assert overlap_of(*here, *here) > 0.97
+    assert overlap_of(*here, *seen(camera_at(yaw=180))) == 0.0
+    aside = overlap_of(*here, *seen(camera_at(yaw=25)))
+    assert 0.2 < aside < 0.8
+    covered_by_a_wall = replace(here[1], depth=torch.full_like(here[1].depth, 0.5))
+    assert overlap_of(*here, here[0], covered_by_a_wall) < 0.02
+
+
+def test_cameras_are_found_until_little_is_left_and_the_scene_covers_more(begun):
+    completion, choices = explorer().explore(begun, cameras(), 3)
+    assert 1 <= len(choices) <= 3
+    assert len(completion.targets) == len(choices)
+    assert all(choice.gain >= 0.01 for choice in choices)
+    aside = held_out_cameras(cameras(), seed=0)
+    found = coverage_of(begun.context, completion.scene, aside, load_renderer("cpu"))
+    assert found.before < 0.95
+    assert found.after - found.before > 0.4 * (1 - found.before)
+
+
+def test_the_second_camera_is_chosen_in_the_scene_that_the_first_left(begun):
+    searching = explorer()
+    completion, (first,) = searching.explore(begun, cameras(), 1)
+    (before,), (after,) = (searching.judged(c, [first.candidate]) for c in (begun, completion))
+    assert before.gain == first.gain
+    assert after.gain < 0.5 * before.gain
+
+
+def test_nothing_is_found_where_nothing_is_left(begun):
+    completion, choices = explorer(min_gain=1.0).explore(begun, cameras(), 3)
+    assert choices == ()
+    assert completion.scene is begun.scene
+    assert completion.targets == ()
+
+
+def test_a_plan_takes_the_first_camera_that_is_completed_and_then_another(begun):
+    searching = explorer()
+    plan = searching.plan(begun, cameras(), 2)
+    _, (first,) = searching.explore(begun, cameras(), 1)
+    assert torch.equal(plan[0].camera.c2w, first.camera.c2w)
+    assert all(choice.camera is not plan[0].camera for choice in plan[1:])
+    assert searching.holes(begun, [first.camera] * 2)[1] < 0.1 * first.hole
+
+
+def test_a_camera_before_a_surface_gains_nothing(begun):
+    searching = explorer()
+    (found,) = searching.plan(begun, cameras(), 1)
+    (far,) = searching.judged(begun, [replace(found.candidate, nearest=1e-3)])
+    (near,) = searching.judged(begun, [replace(found.candidate, nearest=1e3)])
+    assert far.gain > 0
+    assert near.gain == 0
+
+
+def test_stand_ins_close_the_hole_and_hide_nothing():
+    target = camera_at(0.7, yaw=12, size=SIZE)
+    renderer, scene = load_renderer("cpu"), gaussians_of(photographs()[0])
+    render = renderer.render(scene, target)
+    holes = render.alpha < 0.5
+    added = stand_ins(render, holes, target)
+    assert len(added) == int(holes.sum()) > 0
+    assert (renderer.render(added, target).alpha[holes] > 0.5).float().mean() > 0.98
+    depth = renderer.render(added, target).depth[holes]
+    assert render.depth[~holes].min() * 0.9 < depth.min()
+    assert depth.max() < render.depth[~holes].max() * 1.1
+
+
+def test_a_miniature_covers_what_the_scene_covers(begun):
+    small = miniature(begun, 3000)
+    assert len(small.scene) <= 3000 < len(begun.scene)
+    renderer = load_renderer("cpu")
+    aside = held_out_cameras(cameras(), seed=3, count=8)
+    shares = [covered(completion.scene, aside, renderer) for completion in (begun, small)]
+    assert shares[1] == pytest.approx(shares[0], abs=0.02)
+
+
+def test_cameras_that_judge_coverage_are_the_same_for_the_same_seed():
+    given = [camera_at(x, yaw=30 * x) for x in (0.0, 0.4, 0.8, 1.2)]
+    one, same, other = (held_out_cameras(given, seed, 5) for seed in (0, 0, 1))
+    for first, second in zip(one, same, strict=True):
+        assert torch.equal(first.c2w, second.c2w)
+    assert not torch.equal(one[0].c2w, other[0].c2w)
+    centers = torch.stack([camera.center for camera in held_out_cameras(given, 0, 64)])
+    assert centers[:, 0].min() < 0.2
+    assert centers[:, 0].max() > 1.0
+    assert centers[:, 1:].abs().max() < 1.5
+
+
+def test_nothing_is_added_before_what_a_bystander_sees(begun):
+    """What is lifted stands a fifth too near, and nothing mends that but who looks through it."""
+    unmended = RegistrationConfig(affine=AffineConfig(bridge="none"), iterations=0)
+    completer = replace(knowing(), config=replace(CompleterConfig(), registration=unmended))
+    target = camera_at(0.7, yaw=12, size=SIZE)
+    aside = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((0.5, 4), (-0.6, -4))]
+    watched = with_bystanders(begun, [*cameras(), *aside])
+    assert len(watched.bystanders) == 2
+    hidden = []
+    for state in (begun, watched):
+        scene = completer.advance(state, target).scene
+        hidden.append(sum(nearer(scene, begun.scene, camera) for camera in aside))
+    assert hidden[1] < 0.5 * hidden[0]
+
+
+def nearer(scene: Gaussians, before: Gaussians, camera: Camera) -> float:
+    """Share of what a camera saw of a scene before that something new hides."""
+    renderer = load_renderer("cpu")
+    seen, now = renderer.render(before, camera).depth_map(), renderer.render(scene, camera)
+    return (seen.valid & (now.depth < 0.9 * seen.depth)).float().mean().item()
