@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gscompleter.config import HarmConfig, HoleConfig, RefineConfig
+from gscompleter.descent import Adam
 from gscompleter.geometry import inside, project
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, OpacityRender
@@ -73,7 +74,7 @@ def refine_opacities(
     logit = config.parametrization == "logit"
     start = added.opacities.logit(eps=1e-4) if logit else added.opacities
     parameters = start.clone().requires_grad_()
-    optimizer = torch.optim.Adam([parameters], lr=config.learning_rate)
+    optimizer = Adam([(parameters, config.learning_rate)])
 
     def opacities() -> Float[Tensor, "n"]:
         return parameters.sigmoid() if logit else parameters.clamp(0, 1)
@@ -83,9 +84,7 @@ def refine_opacities(
         current = opacities()
         terms = [w * (plan(current).image - image).abs().mean() for plan, image, w in plans]
         loss = torch.stack(terms).sum()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        optimizer.step(loss)
         losses.append(loss.item())
     return replace(added, opacities=opacities().detach(), encoded=None), tuple(losses)
 

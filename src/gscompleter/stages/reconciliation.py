@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gscompleter.config import ReconcileConfig
+from gscompleter.descent import Adam
 from gscompleter.progress import track
 from gscompleter.render import FrozenView
 from gscompleter.types import SH_C0, Gaussians, Render, View
@@ -104,8 +105,9 @@ class Fit:
         self._added = added
         self._sh = widened(added.sh, (config.sh_degree + 1) ** 2).requires_grad_()
         self._logits = (FAINT * added.opacities).logit(eps=1e-4).requires_grad_()
-        steps = [(self._logits, config.opacity_step), (self._sh, config.colour_step)]
-        self._optimizer = torch.optim.Adam([{"params": [part], "lr": lr} for part, lr in steps])
+        self._optimizer = Adam(
+            [(self._logits, config.opacity_step), (self._sh, config.colour_step)]
+        )
 
     def gaussians(self) -> Gaussians:
         """What is added, as it is now; differentiable."""
@@ -122,9 +124,7 @@ class Fit:
 
     def step(self, loss: Float[Tensor, ""]) -> None:
         """One step down the slope of `loss`; colours stay colours."""
-        self._optimizer.zero_grad()
-        loss.backward()
-        self._optimizer.step()
+        self._optimizer.step(loss)
         keep_colours(self._sh)
 
     def fitted(self) -> Gaussians:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gscompleter.config import RegistrationConfig
 from gscompleter.coverage import COVERED
+from gscompleter.descent import Adam
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, Renderer
@@ -150,19 +151,13 @@ def register_along_rays(
     parameters = torch.zeros(
         (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )
-    optimizer = torch.optim.Adam(
-        [parameters], lr=config.learning_rate, betas=(config.beta1, config.beta2)
-    )
+    optimizer = Adam([(parameters, config.learning_rate)], (config.beta1, config.beta2))
     losses = []
     for iteration in track(range(config.iterations), "Registering"):
-        if config.schedule == "falling":
-            left = 1 - iteration / config.iterations
-            optimizer.param_groups[0]["lr"] = left * config.learning_rate
+        left = 1 - iteration / config.iterations if config.schedule == "falling" else 1.0
         moved = displace(coarse, parameters, reference.camera, config)
         loss = objective(moved, frozen_target, reference.camera, anchor, renderer)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        optimizer.step(loss, left)
         losses.append(loss.item())
     with torch.no_grad():
         return displace(coarse, parameters.detach(), reference.camera, config), tuple(losses)

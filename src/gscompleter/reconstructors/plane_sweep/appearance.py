@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.descent import Adam
 from gscompleter.render import Renderer
 from gscompleter.types import SH_C0, Gaussians, View
 
@@ -37,16 +38,13 @@ def fit_opacities(gaussians: Gaussians, views: Sequence[View], renderer: Rendere
     nothing = gaussians[:0]
     plans = [(renderer.freeze(nothing, v.camera).plan(gaussians), v.image) for v in views]
     logits = gaussians.opacities.logit(eps=1e-4).requires_grad_()
-    optimizer = torch.optim.Adam([logits], lr=LEARNING_RATE)
+    optimizer = Adam([(logits, LEARNING_RATE)])
     weight = REMOVAL_PENALTY * len(views) / len(gaussians)
     for _ in range(OPACITY_STEPS):
         opacities = logits.sigmoid()
         removed = (gaussians.opacities - opacities).clamp_min(0).sum()
         terms = [(plan(opacities).image - image).abs().mean() for plan, image in plans]
-        loss = torch.stack([*terms, weight * removed]).sum()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        optimizer.step(torch.stack([*terms, weight * removed]).sum())
     return replace(gaussians, opacities=logits.detach().sigmoid())
 
 

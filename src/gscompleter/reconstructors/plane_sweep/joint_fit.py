@@ -13,6 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from gscompleter.descent import Adam
 from gscompleter.render import Renderer
 from gscompleter.types import Gaussians, View
 
@@ -30,14 +31,11 @@ FAINTEST = 0.02
 def fit_jointly(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
     """`gaussians` fitted to `views` by the squared difference."""
     unknown = unknowns(gaussians)
-    groups = [{"params": [unknown[name]], "lr": rate} for name, rate in RATES.items()]
-    optimizer = torch.optim.Adam(groups, betas=BETAS)
+    optimizer = Adam([(unknown[name], rate) for name, rate in RATES.items()], BETAS)
     for number in order_of(len(views)):
         view, fitted = views[number], moved_by(gaussians, unknown)
-        error = (renderer.render(fitted, view.camera).image - view.image).square().mean()
-        optimizer.zero_grad()
-        error.backward()
-        optimizer.step()
+        image = renderer.render(fitted, view.camera).image
+        optimizer.step((image - view.image).square().mean())
     return moved_by(gaussians, {name: value.detach() for name, value in unknown.items()})
 
 

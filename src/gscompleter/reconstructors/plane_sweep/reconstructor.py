@@ -27,7 +27,11 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
 )
 from gscompleter.reconstructors.plane_sweep.gaussians import discs, normals_of
 from gscompleter.reconstructors.plane_sweep.joint_fit import fit_jointly
-from gscompleter.reconstructors.plane_sweep.matching import cost_volume, inverse_depth_planes
+from gscompleter.reconstructors.plane_sweep.matching import (
+    Source,
+    cost_volume,
+    inverse_depth_planes,
+)
 from gscompleter.reconstructors.plane_sweep.occlusion import (
     UNKNOWN,
     Neighbour,
@@ -135,12 +139,18 @@ class PlaneSweep:
 
     def sweep(self, number: int, rig: Rig, near: float, far: float) -> Sweep:
         """The planes that match best in view `number`."""
-        image = rig.images[number]
-        sources = [(rig.images[i], rig.transforms[number, i]) for i in rig.neighbours.of[number]]
-        planes = inverse_depth_planes(image, sources, near, far)
-        costs = cost_volume(image, sources, planes)
-        index, margin = stereo.winners(aggregate(costs, image))
-        return Sweep(planes, index, margin)
+        chosen = rig.neighbours.of[number]
+        if len(rig.images) == 2:
+            (other,) = chosen
+            return swept(
+                rig.images[number], [(rig.images[other], rig.transforms[number, other])], near, far
+            )
+        sources = [(halved(rig.images[i]), at_half_size(rig.transforms[number, i])) for i in chosen]
+        coarse = swept(halved(rig.images[number]), sources, near, far)
+        size = rig.images[number].size
+        return replace(
+            coarse, index=doubled(coarse.index, size), margin=doubled(coarse.margin, size)
+        )
 
     def confidences(self, sweeps: Sequence[Sweep], rig: Rig) -> list[Map]:
         """How much each pixel's match counts: 0 where no other view agrees with it."""
@@ -198,6 +208,34 @@ class PlaneSweep:
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
         """A disc for every pixel of `view`."""
         return discs(view, depth.depth, normals_of(depth.depth, view), self.disc_sigma)
+
+
+def swept(image: StereoImage, sources: Sequence[Source], near: float, far: float) -> Sweep:
+    """The planes that match best in `image`, between depths in widest baselines."""
+    planes = inverse_depth_planes(image, sources, near, far)
+    costs = cost_volume(image, sources, planes)
+    index, margin = stereo.winners(aggregate(costs, image))
+    return Sweep(planes, index, margin)
+
+
+def halved(image: StereoImage) -> StereoImage:
+    """An image of half the size; the last row or column of an odd one is doubled before."""
+    h, w = image.size
+    even = np.pad(image.image, ((0, h % 2), (0, w % 2), (0, 0)), mode="edge")
+    pixels = even.reshape((h + 1) // 2, 2, (w + 1) // 2, 2, 3).mean(axis=(1, 3))
+    K = image.K * np.array([[0.5], [0.5], [1.0]])
+    return replace(image, image=pixels.astype(np.float32), K=K)
+
+
+def at_half_size(transform: Float32[np.ndarray, "3 4"]) -> Float32[np.ndarray, "3 4"]:
+    """A transform between the pixels of two views, once both are halved."""
+    half, twice = np.diag([0.5, 0.5, 1.0]), np.diag([2.0, 2.0, 1.0, 1.0])
+    return (half @ transform @ twice).astype(np.float32)
+
+
+def doubled(values: Map, size: tuple[int, int]) -> Map:
+    """Each value four times, cut to `size`."""
+    return np.ascontiguousarray(values.repeat(2, axis=0).repeat(2, axis=1)[: size[0], : size[1]])
 
 
 def rig_of(views: Sequence[View]) -> Rig:
