@@ -14,11 +14,12 @@ from gscompleter import (
     load_renderer,
 )
 from gscompleter.completer import STAGES
+from gscompleter.config import HarmConfig
 from gscompleter.generators import Synthesis
 from gscompleter.geometry import project
 from gscompleter.metrics.image import psnr
 from gscompleter.stages.anchor import lift
-from gscompleter.stages.integration import hole_mask
+from gscompleter.stages.integration import hole_mask, is_undone
 from gscompleter.stages.registration import apply_affine
 from gscompleter.types import Camera, Completion, Gaussians, View, merge
 from parity import assert_close
@@ -313,3 +314,39 @@ def test_the_reference_is_the_one_that_a_step_takes():
     reference = knowing().reference(begun, target)
     taken = knowing().advance(begun, target).targets[0].reference
     assert torch.equal(reference.image, taken.image)
+
+
+class Mistaken(KnowingTogether):
+    """Φ that shows something else, and is told so."""
+
+    def synthesize(self, requests):
+        said = "It is another room."
+        return [
+            Synthesis(1 - answer.image, (said,), disagrees=True)
+            for answer in super().synthesize(requests)
+        ]
+
+
+def test_what_the_photographs_contradict_is_reported_and_not_added():
+    context, target = photographs(), cameras()[1]
+    completer = GSCompleter(KnowingReconstructor(), Mistaken())
+    refused = completer(context, target)
+    (result,) = refused.targets
+    assert len(refused.added) == len(result.added) == 0
+    assert result.notes == ("It is another room.", "Nothing of it was added.")
+    assert result.reference is not None
+    assert torch.equal(result.after.image, result.before.image)
+    literal = replace(completer, config=CompleterConfig.paper())(context, target)
+    assert len(literal.added) > 0
+
+
+def test_what_photographs_make_fade_is_not_added():
+    added = gaussians_of(photographs()[0])
+
+    def left(share: float) -> Gaussians:
+        return replace(added, opacities=share * added.opacities)
+
+    assert is_undone(added, left(0.2))
+    assert not is_undone(added, left(0.3))
+    assert not is_undone(added[:0], added[:0])
+    assert not is_undone(added, left(0.0), HarmConfig(max_loss=None))

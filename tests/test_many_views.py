@@ -15,7 +15,7 @@ from gscompleter.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.fusion import Layer, finest_pixels, free_pixels
 from gscompleter.reconstructors.plane_sweep.joint_fit import PASSES, fit_jointly, order_of
-from gscompleter.reconstructors.plane_sweep.reconstructor import rig_of
+from gscompleter.reconstructors.plane_sweep.reconstructor import at_half_size, halved, rig_of
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 64
@@ -77,6 +77,19 @@ def test_the_work_grows_with_the_number_of_views_and_not_with_its_square(monkeyp
         compared.append(len(order_of(count)))
         swept.clear()
     assert compared == [PASSES * 5, PASSES * 10]
+
+
+def test_a_pixel_of_a_halved_image_meets_the_same_place_in_the_other():
+    rig = rig_of(row_of_views(3, size=33))
+    small = halved(rig.images[0])
+    assert small.size == (17, 17)
+    np.testing.assert_allclose(
+        small.image[3, 5], rig.images[0].image[6:8, 10:12].mean(axis=(0, 1)), rtol=1e-5
+    )
+    pixel, inverse = np.array([10.0, 6.0, 1.0]), 0.3
+    whole = rig.transforms[0, 1] @ [*pixel, inverse]
+    half = at_half_size(rig.transforms[0, 1]) @ [*(pixel[:2] / 2), 1.0, inverse]
+    np.testing.assert_allclose(half[:2] / half[2], whole[:2] / whole[2] / 2, rtol=1e-4)
 
 
 def test_what_another_view_sees_through_is_left_out():

@@ -35,6 +35,7 @@ from gscompleter.stages.integration import (
     do_no_harm,
     error_with_loss,
     hole_mask,
+    is_undone,
     keep_in_holes,
     keep_near_holes,
     refine_opacities,
@@ -76,6 +77,9 @@ ROUNDING = 1e-4
 """Decibels that a photograph may lose where it may lose nothing."""
 MIN_COVER = 0.5
 """Pixels of a hole that a Gaussian has to cover to stand in the way."""
+
+MADE_WORSE = "Most of what was synthesized here made photographs worse."
+NOTHING_ADDED = "Nothing of it was added."
 
 STAGES = ("context", "generate", "lift", "register", "integrate")
 """What a completion spends its time on."""
@@ -240,6 +244,9 @@ class GSCompleter:
             ]
             if reference is None:
                 (reference,) = self.synthesize([sight], contexts_of(frozen_views))
+        result = replace(result, reference=View(sight.window.crop(reference.image), target))
+        if reference.disagrees and self.config.harm.max_loss is not None:
+            return replace(result, notes=(*reference.notes, NOTHING_ADDED))
         with clock("lift"):
             lifted = self.lift(sight, reference)
         with clock("register"):
@@ -251,11 +258,14 @@ class GSCompleter:
         return replace(
             result,
             after=after,
-            reference=View(sight.window.crop(reference.image), target),
             affine=registration.affine,
             added=added,
             losses={"register": registration.losses, "refine": losses},
-            notes=(*reference.notes, *notes_of(sight.anchor.fallback, registration.affine)),
+            notes=(
+                *reference.notes,
+                *notes_of(sight.anchor.fallback, registration.affine),
+                *((MADE_WORSE, NOTHING_ADDED) if len(added) < len(kept) else ()),
+            ),
         )
 
     def advance_together(self, completion: Completion, targets: Sequence[Camera]) -> Completion:
@@ -408,7 +418,8 @@ class GSCompleter:
             refined, losses = reconcile(
                 kept, sight.frozen, reference, holes, frozen, watching, allowed, settings
             )
-        return do_no_harm(refined, frozen, watching, allowed, config.harm), losses
+        harmless = do_no_harm(refined, frozen, watching, allowed, config.harm)
+        return (refined[:0] if is_undone(refined, harmless, config.harm) else harmless), losses
 
     def sight(self, completion: Completion, target: Camera) -> Sight:
         """The scene as it stands, frozen at the target's wider camera, and the target's anchor."""

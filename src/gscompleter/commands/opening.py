@@ -50,7 +50,7 @@ MAX_DIGITS = 9
 """Characters of the longest number of a frame."""
 CHOSEN, CHOSEN_WITH_SCENE = 3, 8
 """Photographs that are chosen where none are named: to reconstruct the context, whose cost grows
-with the square of their number, and to keep an eye on a scene that was brought."""
+with their number, and to keep an eye on a scene that was brought."""
 CHOSEN_FOR_ALL = 8
 """Photographs that are chosen where no target is named either, and all of the scene matters."""
 WITNESSES, WITNESS_SIDE = 6, 320

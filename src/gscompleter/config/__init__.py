@@ -162,6 +162,10 @@ class HarmConfig(Settings):
     tolerance: Annotated[float, Interval(ge=0, le=100)] | None = 0.045
     """Largest loss of PSNR, in dB, that any context view may suffer; None checks nothing, as in
     the paper. Photographs of a scene that is doubted lose nothing, whatever it is."""
+    max_loss: Share | None = 0.75
+    """Largest share of its opacity that what is added may lose by that. If it is more, or if the
+    photographs show something else than the synthesized image, nothing is added; None adds whatever
+    there is, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -242,7 +246,7 @@ class CompleterConfig(Settings):
             free_space=FreeSpaceConfig(num_steps=0),
             refine=RefineConfig(iterations=30, learning_rate=0.08),
             holes=HoleConfig(neighbourhood=None),
-            harm=HarmConfig(tolerance=None),
+            harm=HarmConfig(tolerance=None, max_loss=None),
             support=SupportConfig(doubts=False),
         )
 

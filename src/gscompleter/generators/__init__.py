@@ -45,6 +45,8 @@ class Synthesis:
     """In [0, 1], of the size of the target."""
     notes: tuple[str, ...] = ()
     """What a reader of the results should know of it, a sentence each."""
+    disagrees: bool = False
+    """Whether the photographs say that it shows something else."""
 
 
 @runtime_checkable

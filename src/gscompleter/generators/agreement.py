@@ -90,7 +90,7 @@ def checked(
             f"The generator painted no finite image ({len(found)} seed(s) tried); see that its "
             "weights are sound, or choose another generator."
         )
-    return Synthesis(best.image, notes_on(best, len(found)))
+    return Synthesis(best.image, notes_on(best, len(found)), not best.agrees)
 
 
 def compare(
@@ -139,7 +139,7 @@ def notes_on(found: Agreement, tried: int) -> tuple[str, ...]:
             limit = "that is no shift of colours"
         return (
             f"The synthesized image disagrees with the photographs: over the {found.share:.0%} of "
-            f"it that they show, {reason}{seeds}, and {limit}. It was used as it is.",
+            f"it that they show, {reason}{seeds}, and {limit}.",
         )
     notes = []
     if found.shift > 0.5 / 255:

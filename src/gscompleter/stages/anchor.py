@@ -72,6 +72,8 @@ class Synthesized(View):
 
     notes: tuple[str, ...] = ()
     """A sentence each; empty for a generator that tells nothing."""
+    disagrees: bool = False
+    """Whether the photographs say that it shows something else."""
 
 
 def synthesize(
@@ -101,7 +103,7 @@ def as_view(answer: Synthesis, target: Camera) -> Synthesized:
             f"the generator must return a finite image of shape {expected}, "
             f"got {tuple(answer.image.shape)}"
         )
-    return Synthesized(answer.image, target, notes=answer.notes)
+    return Synthesized(answer.image, target, notes=answer.notes, disagrees=answer.disagrees)
 
 
 def lift(reconstructor: Reconstructor, reference: View, anchor: View) -> Lift:

@@ -135,6 +135,15 @@ def do_no_harm(
     return replace(added, opacities=opacities, encoded=None)
 
 
+def is_undone(added: Gaussians, harmless: Gaussians, config: HarmConfig = HarmConfig()) -> bool:
+    """Whether so much of the opacity of what is `added` had to go, until it was `harmless`, that
+    the photographs contradict all of it."""
+    if config.max_loss is None:
+        return False
+    left = harmless.opacities.sum() / added.opacities.sum().clamp_min(1e-12)
+    return len(added) > 0 and 1 - left.item() > config.max_loss
+
+
 def most_harmful(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
     """The fewest entries whose `relief` adds up to `needed`, or to half of all relief there is.
 

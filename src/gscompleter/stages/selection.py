@@ -1,7 +1,7 @@
 """Which photographs the context is made of, where nobody says: those that matter to the targets.
 
 The paper is given its two views. Of a whole capture most photographs show something else, and Ψ
-takes a time that grows with the square of their number. A photograph matters by what it shows of
+takes a time that grows with their number. A photograph matters by what it shows of
 what the targets see, from a direction like theirs; and depth comes of pairs, whose rays have to
 meet at an angle: of two that stand in one place no depth can be told, and two that look from far
 apart show different surfaces. So a set is worth, at each point that a target sees, what its best

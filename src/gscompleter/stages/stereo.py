@@ -25,7 +25,7 @@ from gscompleter.stages.support import believed_alpha, gather_evidence, support
 from gscompleter.types import Camera, Render, SceneContext, View
 
 NUM_VIEWS = 3
-"""Photographs that stereo is made of: its time grows with the square of their number."""
+"""Photographs that stereo is made of: its time grows with their number."""
 BETTER = 0.1
 """By how much more the photographs have to support it, so that it takes the place of the scene."""
 

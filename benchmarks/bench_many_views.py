@@ -1,0 +1,96 @@
+"""The embedded Ψ on more and more photographs of a scene, beside pairs of them merged, in one run.
+
+    python benchmarks/bench_many_views.py ../shared/data/fox --views 4 8 16 32
+
+Photographs are spread evenly over the scene, and scored at 256 x 256: those that were given, and
+those halfway between two of them. Time grows with the number of photographs if the seconds for each
+stay the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+import gscompleter as gsc
+from gscompleter.matching.depth_range import depth_range_of
+from gscompleter.metrics.image import psnr
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.types import Gaussians, View, merge
+
+SIZE = 256, 256
+
+
+def jointly(views: Sequence[View]) -> Gaussians:
+    """All photographs at once."""
+    return PlaneSweep()(views).gaussians
+
+
+def by_pairs(views: Sequence[View]) -> Gaussians:
+    """Each photograph with the next one, merged: what two-view models offer."""
+    pairs = [views[i : i + 2] for i in range(0, len(views) - 1, 2)]
+    return merge([PlaneSweep()(pair).gaussians for pair in pairs])
+
+
+def spread(scene: Path, count: int) -> tuple[list[View], list[View]]:
+    """`count` photographs spread over a scene, and those halfway between them, with one depth
+    range."""
+    last = len(gsc.load_views(scene, resolution=(16, 16))) - 1
+    given = np.linspace(0, last, count).round().astype(int).tolist()
+    middle = {(a + b) // 2 for a, b in pairwise(given)} - set(given)
+    views, between = (
+        gsc.load_views(scene, frames=frames, resolution=SIZE) for frames in (given, sorted(middle))
+    )
+    near, far = depth_range_of(views)
+    return ranged(views, near, far), ranged(between, near, far)
+
+
+def ranged(views: Sequence[View], near: float, far: float) -> list[View]:
+    """`views` with a depth range."""
+    return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
+
+
+def scores(gaussians: Gaussians, views: Sequence[View]) -> list[float]:
+    """PSNR (dB) at each of `views`."""
+    renderer = gsc.load_renderer("cpu")
+    return [psnr(renderer.render(gaussians, v.camera).image, v.image) for v in views]
+
+
+def row(name: str, make: Callable[[Sequence[View]], Gaussians], scene: Path, count: int) -> None:
+    """One row of the table."""
+    views, between = spread(scene, count)
+    start = time.perf_counter()
+    made = make(views)
+    seconds = time.perf_counter() - start
+    given, others = scores(made, views), scores(made, between) or [float("nan")]
+    print(
+        f"| {scene.name} | {name} | {count} | {seconds:.1f} | {seconds / count:.2f} | "
+        f"{len(made) / 1000:.0f} | {np.mean(given):.2f} ({min(given):.2f}) | "
+        f"{np.mean(others):.2f} ({min(others):.2f}) |",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="Photographs to Gaussians, of many views.")
+    parser.add_argument("scenes", nargs="*", type=Path, default=[Path("../shared/data/fox")])
+    parser.add_argument("--views", nargs="+", type=int, default=[4, 8, 16])
+    given = parser.parse_args()
+    columns = ("scene", "", "views", "s", "s a view", "1000 Gaussians")
+    print(f"| {' | '.join(columns)} | given, dB (worst) | between (worst) |")
+    print("| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |")
+    for scene in given.scenes:
+        for count in given.views:
+            row("jointly", jointly, scene, count)
+            row("by pairs", by_pairs, scene, count)
+
+
+if __name__ == "__main__":
+    main()
