@@ -19,6 +19,7 @@ from gscompleter.generators import Synthesis
 from gscompleter.geometry import project
 from gscompleter.metrics.image import psnr
 from gscompleter.stages.anchor import lift
+from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import hole_mask, is_undone
 from gscompleter.stages.registration import apply_affine
 from gscompleter.types import Camera, Completion, Gaussians, View, merge
@@ -350,3 +351,17 @@ def test_what_photographs_make_fade_is_not_added():
     assert not is_undone(added, left(0.3))
     assert not is_undone(added[:0], added[:0])
     assert not is_undone(added, left(0.0), HarmConfig(max_loss=None))
+
+
+def test_nothing_is_added_before_what_an_earlier_target_sees(monkeypatch):
+    asked = []
+
+    def told(candidates, target, cameras, *rest):
+        asked.append([camera.center for camera in cameras])
+        return respect_free_space(candidates, target, cameras, *rest)
+
+    monkeypatch.setattr("gscompleter.completer.respect_free_space", told)
+    first, second = cameras()[1], camera_at(-0.9, yaw=-12, size=SIZE)
+    knowing()(photographs(), [first, second])
+    assert [len(centers) for centers in asked] == [2, 3]
+    assert torch.equal(asked[1][2], first.center)

@@ -353,11 +353,13 @@ class GSCompleter:
         registration: Registration,
         frozen_views: Sequence[FrozenView],
     ) -> Gaussians:
-        """Stage 4: what lies in the holes, where no photograph saw through it."""
+        """Stage 4: what lies in the holes, where no photograph and no earlier target sees through
+        it."""
         mask = dilate(self.holes(sight), self.config.holes.dilation)
         wide, views = sight.window.wide, sight.completion.views
-        side = self.config.exploration.side
-        aside = [shrunk(camera, side) for camera in sight.completion.bystanders]
+        side, earlier = self.config.exploration.side, sight.completion.targets
+        completed = [result.target for result in earlier if len(result.added)]
+        aside = [shrunk(camera, side) for camera in (*sight.completion.bystanders, *completed)]
         kept, placed = respect_free_space(
             self.before_doubted(
                 keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide), sight
