@@ -175,3 +175,21 @@ def test_the_joint_fit_brings_every_photograph_nearer_and_repeats_itself():
 
 def test_each_view_has_its_turn_as_often_as_the_others():
     assert torch.bincount(torch.tensor(order_of(7))).tolist() == [PASSES] * 7
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "swept_at"), [(3, 192, 96), (3, 190, 190), (2, 192, 192)]
+)
+def test_many_large_images_are_matched_at_half_their_size(monkeypatch, count, size, swept_at):
+    sizes = []
+
+    def noted(image, *_):
+        sizes.append(image.size)
+        return np.zeros((*image.size, 3), np.uint8)
+
+    module = "gscompleter.reconstructors.plane_sweep.reconstructor"
+    monkeypatch.setattr(f"{module}.cost_volume", noted)
+    views = row_of_views(count, size=size)
+    swept = PlaneSweep().sweep(0, rig_of(views), 1.0, 10.0)
+    assert sizes == [(swept_at, swept_at)]
+    assert swept.index.shape == swept.margin.shape == (size, size)

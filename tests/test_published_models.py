@@ -90,4 +90,4 @@ def test_a_completion_with_random_weights_runs_end_to_end(mvsplat_file, tmp_path
     assert summary["settings"]["reconstructor"] == "mvsplat-re10k"
     assert summary["settings"]["weights"] == str(mvsplat_file)
     assert summary["gaussians"]["context"] == 2 * SIZE * SIZE
-    assert summary["targets"][0]["anchor"] == 0
+    assert summary["targets"][0]["anchor"] in (0, 1)

@@ -42,6 +42,8 @@ from gscompleter.render import Renderer, load_renderer
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
 
 Map = Float32[np.ndarray, "_ _"]
+HALVED_FROM = 192
+"""Pixels of the shortest side from which images of many views are matched at half their size."""
 MIN_ALPHA = 0.7
 """Alpha below which a surface that no view was to show is shown by the view that meets the gap."""
 BACKGROUND_WEIGHT = np.float32(0.3)
@@ -75,6 +77,12 @@ class Rig:
     """The widest baseline, in scene units; lengths of stereo are multiples of it."""
     neighbours: Neighbours
     transforms: Transforms
+
+    @property
+    def is_halved(self) -> bool:
+        """Whether images of half the size are matched."""
+        smallest = min(min(image.size) for image in self.images)
+        return len(self.images) > 2 and smallest >= HALVED_FROM
 
 
 @dataclass(frozen=True)
@@ -138,19 +146,19 @@ class PlaneSweep:
         return layers
 
     def sweep(self, number: int, rig: Rig, near: float, far: float) -> Sweep:
-        """The planes that match best in view `number`."""
-        chosen = rig.neighbours.of[number]
-        if len(rig.images) == 2:
-            (other,) = chosen
-            return swept(
-                rig.images[number], [(rig.images[other], rig.transforms[number, other])], near, far
-            )
-        sources = [(halved(rig.images[i]), at_half_size(rig.transforms[number, i])) for i in chosen]
-        coarse = swept(halved(rig.images[number]), sources, near, far)
-        size = rig.images[number].size
-        return replace(
-            coarse, index=doubled(coarse.index, size), margin=doubled(coarse.margin, size)
-        )
+        """The planes that match best in view `number`.
+
+        Of more views than two, unless they are small, images of half the size are matched: surfaces
+        and the joint fit find what that leaves out, in an eighth of the time.
+        """
+        image, chosen = rig.images[number], rig.neighbours.of[number]
+        sources = [(rig.images[i], rig.transforms[number, i]) for i in chosen]
+        if not rig.is_halved:
+            return swept(image, sources, near, far)
+        half = [(halved(other), at_half_size(transform)) for other, transform in sources]
+        coarse = swept(halved(image), half, near, far)
+        index, margin = (doubled(values, image.size) for values in (coarse.index, coarse.margin))
+        return replace(coarse, index=index, margin=margin)
 
     def confidences(self, sweeps: Sequence[Sweep], rig: Rig) -> list[Map]:
         """How much each pixel's match counts: 0 where no other view agrees with it."""
