@@ -15,17 +15,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gscompleter.coverage import COVERED
-from gscompleter.frames.thinning import thinned
 from gscompleter.geometry import baseline_between
 from gscompleter.render import Renderer
 from gscompleter.stages.candidates import moved, rotation, shrunk, spacing
+from gscompleter.stages.exploration import small_renders
 from gscompleter.types import Camera, Gaussians
 
 NUM_CAMERAS = 32
 SIDE = 96
 """Pixels of the longer side of the images that are looked at."""
-MAX_GAUSSIANS = 100_000
-"""Several for each of their pixels."""
 TURN = 5.0
 """Standard deviation, in degrees, of the turns to the side and up and down."""
 
@@ -48,16 +46,15 @@ def coverage_of(
     before: Gaussians, after: Gaussians, cameras: Sequence[Camera], renderer: Renderer
 ) -> Coverage:
     """How much two scenes cover, as `cameras` see them in small images."""
-    small = (thinned(scene, MAX_GAUSSIANS) for scene in (before, after))
-    first, last = (covered(scene, cameras, renderer) for scene in small)
+    first, last = (covered(scene, cameras, renderer) for scene in (before, after))
     return Coverage(first, last, len(cameras))
 
 
 def covered(scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer) -> float:
     """Share of the pixels of all cameras that the scene covers."""
     with torch.no_grad():
-        alphas = [renderer.render(scene, shrunk(camera, SIDE)).alpha for camera in cameras]
-    return torch.cat([alpha.flatten() >= COVERED for alpha in alphas]).float().mean().item()
+        renders = small_renders(scene, [shrunk(camera, SIDE) for camera in cameras], renderer)
+    return torch.cat([r.alpha.flatten() >= COVERED for r in renders]).float().mean().item()
 
 
 def held_out_cameras(
