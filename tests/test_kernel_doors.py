@@ -56,19 +56,21 @@ SWEEP = """
 import sys
 import numpy as np
 from gscompleter.kernels import stereo
+from gscompleter.reconstructors.plane_sweep.bands import every_plane
 image = np.random.default_rng(0).random((24, 20, 3)).astype(np.float32)
 planes = np.linspace(0, 1, 6).astype(np.float32)
+bands = every_plane((24, 20), 6)
 ran, noise, detail = 0, np.float32(0.01), np.float32(0.4)
 for odd in map(float, sys.argv[1:]):
     for row in range(3):
         for column in range(4):
             transform = np.eye(3, 4, dtype=np.float32)
             transform[row, column] = odd
-            stereo.matching_costs(image, image, transform, planes, 2, noise, detail)
+            stereo.matching_costs(image, image, transform, planes, bands, 2, noise, detail)
             stereo.reproject(image[..., 0], image[..., 1], transform, transform)
             ran += 1
     odd_planes = np.full(6, odd, np.float32)
-    stereo.matching_costs(image, image, transform, odd_planes, 2, noise, detail)
+    stereo.matching_costs(image, image, transform, odd_planes, bands, 2, noise, detail)
 print(ran)
 """
 
@@ -98,7 +100,7 @@ def test_whatever_becomes_an_index_lies_within_the_image(odd):
 
 
 def test_a_share_of_more_than_all_sources_is_all_of_them():
-    costs = np.random.default_rng(0).integers(0, 255, (3, 4, 5, 6)).astype(np.uint8)
+    costs = np.random.default_rng(0).integers(0, 255, (3, 120)).astype(np.uint8)
     assert (stereo.best_mean(costs, 9.0, 140) == stereo.best_mean(costs, 1.0, 140)).all()
 
 

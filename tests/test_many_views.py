@@ -15,7 +15,7 @@ from gscompleter.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.fusion import Layer, finest_pixels, free_pixels
 from gscompleter.reconstructors.plane_sweep.joint_fit import PASSES, fit_jointly, order_of
-from gscompleter.reconstructors.plane_sweep.reconstructor import at_half_size, halved, rig_of
+from gscompleter.reconstructors.plane_sweep.rig import at_half_size, halved, rig_of
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 64
@@ -69,9 +69,12 @@ def test_the_work_grows_with_the_number_of_views_and_not_with_its_square(monkeyp
     costs = stereo.matching_costs
     monkeypatch.setattr(stereo, "matching_costs", lambda *a: swept.append(1) or costs(*a))
     for count in (5, 10):
-        views = row_of_views(count, size=16)
+        views = [
+            replace(v, camera=replace(v.camera, near=1.0, far=10.0))
+            for v in row_of_views(count, size=16)
+        ]
         rig = rig_of(views)
-        PlaneSweep().layers(rig, 1.0, 10.0)
+        PlaneSweep().layers(rig, views)
         assert len(swept) == COUNT * count
         assert len(rig.neighbours.matches) <= CANDIDATES * count
         compared.append(len(order_of(count)))
@@ -178,18 +181,13 @@ def test_each_view_has_its_turn_as_often_as_the_others():
 
 
 @pytest.mark.parametrize(
-    ("count", "size", "swept_at"), [(3, 192, 96), (3, 190, 190), (2, 192, 192)]
+    ("count", "size", "expected"), [(3, 192, {96}), (3, 190, {190}), (2, 192, {96, 192})]
 )
-def test_many_large_images_are_matched_at_half_their_size(monkeypatch, count, size, swept_at):
-    sizes = []
-
-    def noted(image, *_):
-        sizes.append(image.size)
-        return np.zeros((*image.size, 3), np.uint8)
-
-    module = "gscompleter.reconstructors.plane_sweep.reconstructor"
-    monkeypatch.setattr(f"{module}.cost_volume", noted)
-    views = row_of_views(count, size=size)
-    swept = PlaneSweep().sweep(0, rig_of(views), 1.0, 10.0)
-    assert sizes == [(swept_at, swept_at)]
-    assert swept.index.shape == swept.margin.shape == (size, size)
+def test_large_images_are_matched_at_half_their_size_first(monkeypatch, count, size, expected):
+    matched, costs = set(), stereo.matching_costs
+    monkeypatch.setattr(
+        stereo, "matching_costs", lambda image, *a: matched.add(len(image)) or costs(image, *a)
+    )
+    depths = PlaneSweep().depths(row_of_views(count, size=size))
+    assert matched == expected
+    assert {tuple(depth.depth.shape) for depth in depths} == {(size, size)}

@@ -37,7 +37,6 @@ from gscompleter.stages.integration import (
     hole_mask,
     is_undone,
     keep_in_holes,
-    keep_near_holes,
     refine_opacities,
     squared_error,
 )
@@ -320,11 +319,9 @@ class GSCompleter:
 
     def lift(self, sight: Sight, reference: Synthesized) -> Lift:
         """Stage 2: the image as Gaussians, those that lie near a hole."""
-        lifted = lift(self.reconstructor, reference, sight.anchor_view)
         radius = self.config.holes.neighbourhood
-        if radius is None:
-            return lifted
-        return keep_near_holes(lifted, dilate(self.holes(sight), radius))
+        wanted = None if radius is None else dilate(self.holes(sight), radius)
+        return lift(self.reconstructor, reference, sight.anchor_view, wanted)
 
     def register(
         self,

@@ -5,13 +5,43 @@ at inverse depth w to the homogeneous pixel A (x, y, 1) + b w of another, whose 
 ratio of the two z-depths.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
 UNSEEN = 255
 """Cost of a plane at which the pixel falls outside of the other image."""
-BLOCK = 16
-"""Rows that are swept together, so that their part of the cost volume stays in the cache."""
+TILE_ROWS, TILE_COLUMNS = 16, 64
+"""Pixels that are matched together: so few that what is known of them stays in the cache."""
+FAR = np.float32(1e9)
+"""Cost of what cannot be."""
+
+
+class Bands(NamedTuple):
+    """The planes that each tile of an image is matched at.
+
+    Costs lie one after the other: tile by tile, in a tile row by row, in a row pixel by pixel, and
+    of a pixel plane by plane.
+    """
+
+    low: np.ndarray
+    """The first plane of each tile [rows, columns] int32."""
+    high: np.ndarray
+    """The one behind the last [rows, columns] int32."""
+    start: np.ndarray
+    """Where the costs of each tile begin, row by row, and the end of all [tiles + 1] int64."""
+
+
+@njit(cache=True, inline="always")
+def _first_cost(bands, y, x, width):
+    """Where the costs of pixel (y, x) begin, in an image of that width."""
+    row, column = y // TILE_ROWS, x // TILE_COLUMNS
+    left = column * TILE_COLUMNS
+    wide = min(TILE_COLUMNS, width - left)
+    within = (y - row * TILE_ROWS) * wide + x - left
+    planes = bands.high[row, column] - bands.low[row, column]
+    return bands.start[row * bands.low.shape[1] + column] + within * planes
 
 
 @njit(cache=True, fastmath={"contract"}, inline="always")
@@ -42,8 +72,8 @@ def _box_sums(values, sums, column, rows, width, radius):
 
 
 @njit(cache=True, parallel=True, fastmath={"contract"})
-def matching_costs(reference, source, transform, inverse_depths, radius, noise, detail):
-    """Dissimilarity of every reference pixel to the source at every plane.
+def matching_costs(reference, source, transform, inverse_depths, bands, radius, noise, detail):
+    """Dissimilarity of every reference pixel to the source at the planes of its tile.
 
     The windows' normalised cross-correlation over all three colours, which a change of exposure
     does not touch, mixed with the difference of the two pixels from their windows' means, which
@@ -53,63 +83,65 @@ def matching_costs(reference, source, transform, inverse_depths, radius, noise, 
         reference, source: Images [h, w, 3] and [H, W, 3].
         transform: From reference to source [3, 4].
         inverse_depths: Of the planes [d].
+        bands: Which of the planes.
         radius: Of the windows, in pixels.
         noise: Standard deviation of the images' noise: weaker texture correlates with nothing.
         detail: Share of the second term.
 
     Returns:
-        Costs in 0 .. 254, UNSEEN where a plane leaves the source [h, w, d].
+        Costs in 0 .. 254, UNSEEN where a plane leaves the source, in the order of `bands`.
     """
     h, w = reference.shape[:2]
     H, W = source.shape[:2]
-    planes = inverse_depths.shape[0]
-    costs = np.empty((h, w, planes), np.uint8)
+    columns = bands.low.shape[1]
+    costs = np.empty(bands.start[-1], np.uint8)
     area = np.float32((2 * radius + 1) ** 2)
     floor = np.float32(3) * area * noise * noise
-    blocks = (h + BLOCK - 1) // BLOCK
-    wide = w + 2 * radius
-    for block in prange(blocks):
-        top = block * BLOCK
-        rows = min(BLOCK, h - top)
-        tall = rows + 2 * radius
+    for tile in prange(bands.low.size):
+        top, left = tile // columns * TILE_ROWS, tile % columns * TILE_COLUMNS
+        low = bands.low[tile // columns, tile % columns]
+        count = bands.high[tile // columns, tile % columns] - low
+        rows, cols = min(TILE_ROWS, h - top), min(TILE_COLUMNS, w - left)
+        tall, wide = rows + 2 * radius, cols + 2 * radius
         own = np.empty((3, tall, wide), np.float32)
         other = np.empty((3, tall, wide), np.float32)
         product = np.empty((tall, wide), np.float32)
-        own_mean = np.empty((3, rows, w), np.float32)
-        other_mean = np.empty((3, rows, w), np.float32)
-        own_square = np.empty((rows, w), np.float32)
-        other_square = np.empty((rows, w), np.float32)
-        cross = np.empty((rows, w), np.float32)
+        own_mean = np.empty((3, rows, cols), np.float32)
+        other_mean = np.empty((3, rows, cols), np.float32)
+        own_square = np.empty((rows, cols), np.float32)
+        other_square = np.empty((rows, cols), np.float32)
+        cross = np.empty((rows, cols), np.float32)
         seen = np.empty((tall, wide), np.bool_)
         column = np.empty(wide, np.float32)
         line = np.empty((2, wide), np.float32)
         for y in range(tall):
             for x in range(wide):
                 yy = _clip(top + y - radius, 0, h - 1)
-                xx = _clip(x - radius, 0, w - 1)
+                xx = _clip(left + x - radius, 0, w - 1)
                 total = np.float32(0)
                 for c in range(3):
                     own[c, y, x] = reference[yy, xx, c]
                     total += own[c, y, x] * own[c, y, x]
                 product[y, x] = total
         for c in range(3):
-            _box_sums(own[c], own_mean[c], column, rows, w, radius)
-        _box_sums(product, own_square, column, rows, w, radius)
+            _box_sums(own[c], own_mean[c], column, rows, cols, radius)
+        _box_sums(product, own_square, column, rows, cols, radius)
         for y in range(rows):
-            for x in range(w):
+            for x in range(cols):
                 for c in range(3):
                     own_mean[c, y, x] /= area
                     own_square[y, x] -= area * own_mean[c, y, x] * own_mean[c, y, x]
 
-        for plane in range(planes):
-            depth = inverse_depths[plane]
+        first = bands.start[tile]
+        for plane in range(count):
+            depth = inverse_depths[low + plane]
             for y in range(tall):
                 py = np.float32(top + y - radius) + np.float32(0.5)
                 q0 = transform[0, 1] * py + transform[0, 2] + transform[0, 3] * depth
                 q1 = transform[1, 1] * py + transform[1, 2] + transform[1, 3] * depth
                 q2 = transform[2, 1] * py + transform[2, 2] + transform[2, 3] * depth
                 for x in range(wide):
-                    px = np.float32(x - radius) + np.float32(0.5)
+                    px = np.float32(left + x - radius) + np.float32(0.5)
                     ratio = q2 + transform[2, 0] * px
                     inverse = np.float32(1) / max(ratio, np.float32(1e-3))
                     sx = (q0 + transform[0, 0] * px) * inverse - np.float32(0.5)
@@ -141,12 +173,12 @@ def matching_costs(reference, source, transform, inverse_depths, radius, noise, 
                             + w11 * source[iy + 1, ix + 1, c]
                         )
             for c in range(3):
-                _box_sums(other[c], other_mean[c], column, rows, w, radius)
+                _box_sums(other[c], other_mean[c], column, rows, cols, radius)
             for y in range(tall):
                 for x in range(wide):
                     a, b, c = other[0, y, x], other[1, y, x], other[2, y, x]
                     product[y, x] = a * a + b * b + c * c
-            _box_sums(product, other_square, column, rows, w, radius)
+            _box_sums(product, other_square, column, rows, cols, radius)
             for y in range(tall):
                 for x in range(wide):
                     product[y, x] = (
@@ -154,9 +186,9 @@ def matching_costs(reference, source, transform, inverse_depths, radius, noise, 
                         + other[1, y, x] * own[1, y, x]
                         + other[2, y, x] * own[2, y, x]
                     )
-            _box_sums(product, cross, column, rows, w, radius)
+            _box_sums(product, cross, column, rows, cols, radius)
             for y in range(rows):
-                for x in range(w):
+                for x in range(cols):
                     square = other_square[y, x]
                     covariance = cross[y, x]
                     difference = np.float32(0)
@@ -177,42 +209,42 @@ def matching_costs(reference, source, transform, inverse_depths, radius, noise, 
                     value = np.uint8(min(cost * np.float32(254), np.float32(254)))
                     if not seen[y + radius, x + radius]:
                         value = np.uint8(UNSEEN)
-                    costs[top + y, x, plane] = value
+                    costs[first + (y * cols + x) * count + plane] = value
     return costs
 
 
 @njit(cache=True, parallel=True)
 def best_mean(costs, share, unseen_cost):
-    """The mean of the best `share` of the sources' costs [n, h, w, d], per pixel and plane.
+    """The mean of the best `share` of the sources' costs [n, cells], for each cell.
 
     A surface that is hidden from some of the views costs there whatever hides it; the views that
     see it decide. Where no source sees the plane, it costs `unseen_cost`.
     """
-    n, h, w, d = costs.shape
-    merged = np.empty((h, w, d), np.uint8)
-    for y in prange(h):
+    n, cells = costs.shape
+    merged = np.empty(cells, np.uint8)
+    pieces = 64
+    for piece in prange(pieces):
         ranked = np.empty(n, np.int32)
-        for x in range(w):
-            for k in range(d):
-                seen = 0
-                for i in range(n):
-                    value = np.int32(costs[i, y, x, k])
-                    if value == UNSEEN:
-                        continue
-                    at = seen
-                    while at > 0 and ranked[at - 1] > value:
-                        ranked[at] = ranked[at - 1]
-                        at -= 1
-                    ranked[at] = value
-                    seen += 1
-                if seen == 0:
-                    merged[y, x, k] = unseen_cost
+        for k in range(cells * piece // pieces, cells * (piece + 1) // pieces):
+            seen = 0
+            for i in range(n):
+                value = np.int32(costs[i, k])
+                if value == UNSEEN:
                     continue
-                count = max(1, min(seen, np.int32(np.ceil(seen * share))))
-                total = 0
-                for i in range(count):
-                    total += ranked[i]
-                merged[y, x, k] = np.uint8(total // count)
+                at = seen
+                while at > 0 and ranked[at - 1] > value:
+                    ranked[at] = ranked[at - 1]
+                    at -= 1
+                ranked[at] = value
+                seen += 1
+            if seen == 0:
+                merged[k] = unseen_cost
+                continue
+            count = max(1, min(seen, np.int32(np.ceil(seen * share))))
+            total = 0
+            for i in range(count):
+                total += ranked[i]
+            merged[k] = np.uint8(total // count)
     return merged
 
 
@@ -221,7 +253,7 @@ def _step(cost, before, lowest, after, total, small, large):
     """One step of a path: returns the lowest cost at the new pixel."""
     planes = cost.shape[0]
     ceiling = lowest + large
-    best = np.float32(1e9)
+    best = FAR
     for k in range(planes):
         # `before` has a border of one plane on either side.
         reached = min(min(before[k], before[k + 2]) + small, min(before[k + 1], ceiling))
@@ -229,96 +261,131 @@ def _step(cost, before, lowest, after, total, small, large):
         after[k + 1] = value
         total[k] += value
         best = min(best, value)
+    after[0] = FAR
+    after[planes + 1] = FAR
     return best
 
 
+@njit(cache=True, inline="always")
+def _aligned(before, band_before, band, scratch):
+    """The costs at a pixel of another band, by the planes of this one; FAR where it has none."""
+    if band_before[0] == band[0] and band_before[1] == band[1]:
+        return before
+    for plane in range(band[0] - 1, band[1] + 1):
+        known = band_before[0] <= plane < band_before[1]
+        scratch[plane - band[0] + 1] = before[plane - band_before[0] + 1] if known else FAR
+    return scratch
+
+
 @njit(cache=True, fastmath={"contract"})
-def _sweep_half(costs, large_x, large_y, large_d, large_u, small, down, total):
+def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, total):
     """Four of the eight paths: along the row, and from the three neighbours of the row before."""
-    h, w, planes = costs.shape
-    far = np.float32(1e9)
-    rows = np.full((2, 3, w + 2, planes + 2), far, np.float32)
-    lows = np.zeros((2, 3, w + 2), np.float32)
-    rows[:, :, :, 1 : planes + 1] = 0
-    along = np.full((2, planes + 2), far, np.float32)
+    h, w = large_y.shape[0] + 1, large_x.shape[1] + 1
+    widest = (bands.high - bands.low).max() + 2
+    rows = np.zeros((2, 3, w, widest), np.float32)
+    lows = np.zeros((2, 3, w), np.float32)
+    along = np.zeros((2, widest), np.float32)
+    nothing, scratch = np.zeros(widest, np.float32), np.empty(widest, np.float32)
     for step in range(h):
         y = step if down else h - 1 - step
         now, then = step % 2, 1 - step % 2
-        along[:, 1 : planes + 1] = 0
-        low = np.float32(0)
+        row, row_before = y // TILE_ROWS, (y - 1 if down else min(y + 1, h - 1)) // TILE_ROWS
+        # The row before lies at y - 1 on the way down and at y + 1 on the way up.
+        upper = max(y - 1, 0) if down else min(y, h - 2)
+        of_left, of_right = (large_d, large_u) if down else (large_u, large_d)
+        low_along = np.float32(0)
         for s in range(w):
             x = s if down else w - 1 - s
-            back = x - 1 if down else x + 1
-            cost = costs[y, x]
-            out = total[y, x]
-            edge = min(x, back) if s > 0 else 0
-            low = _step(cost, along[s % 2], low, along[1 - s % 2], out, small, large_x[y, edge])
-            # The row before lies at y - 1 on the way down and at y + 1 on the way up.
-            upper = max(y - 1, 0) if down else min(y, h - 2)
-            of_left, of_right = (large_d, large_u) if down else (large_u, large_d)
+            column = x // TILE_COLUMNS
+            low, high = bands.low[row, column], bands.high[row, column]
+            first = _first_cost(bands, y, x, w)
+            end = first + high - low
+            cost, out = costs[first:end], total[first:end]
+            before, edge = nothing, 0
+            if s > 0:
+                back = x - 1 if down else x + 1
+                edge, tile = min(x, back), back // TILE_COLUMNS
+                band = bands.low[row, tile], bands.high[row, tile]
+                before = _aligned(along[s % 2], band, (low, high), scratch)
+            low_along = _step(
+                cost, before, low_along, along[1 - s % 2], out, small, large_x[y, edge]
+            )
             from_left, from_right = of_left[upper, max(x - 1, 0)], of_right[upper, min(x, w - 2)]
             larges = (from_left, large_y[upper, x], from_right)
             for path in range(3):
-                before, lowest = rows[then, path, x + path], lows[then, path, x + path]
-                lows[now, path, x + 1] = _step(
-                    cost, before, lowest, rows[now, path, x + 1], out, small, larges[path]
+                before, lowest, other = nothing, np.float32(0), x + path - 1
+                if step > 0 and 0 <= other < w:
+                    tile = other // TILE_COLUMNS
+                    band = bands.low[row_before, tile], bands.high[row_before, tile]
+                    lowest, states = lows[then, path, other], rows[then, path, other]
+                    before = _aligned(states, band, (low, high), scratch)
+                lows[now, path, x] = _step(
+                    cost, before, lowest, rows[now, path, x], out, small, larges[path]
                 )
 
 
 @njit(cache=True, parallel=True, fastmath={"contract"})
-def semi_global(costs, large_x, large_y, large_d, large_u, small):
+def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
     """Costs aggregated along eight paths (Hirschmüller 2008).
 
     Args:
-        costs: [h, w, d], 0 .. 254.
+        costs: 0 .. 254, in the order of `bands`.
+        bands: The planes of each tile. Where a path enters another tile, planes that were not
+            looked at there are reached by a jump.
         large_x, large_y, large_d, large_u: Penalty of a jump between a pixel and its right
             neighbour [h, w - 1], the one below [h - 1, w], the one below to the right
             [h - 1, w - 1], and between (y, x + 1) and (y + 1, x) [h - 1, w - 1].
         small: Penalty of a step by one plane.
 
     Returns:
-        The sum over the paths [h, w, d], as a mean per path.
+        The sum over the paths, as a mean per path, in the order of `bands`.
     """
-    h, w, planes = costs.shape
+    cells = costs.shape[0]
     # Each half has its own sum, so that two threads can work and order does not matter.
-    total = np.zeros((2, h, w, planes), np.float32)
+    total = np.zeros((2, cells), np.float32)
     for half in prange(2):
-        _sweep_half(costs, large_x, large_y, large_d, large_u, small, half == 0, total[half])
-    for y in prange(h):
-        for x in range(w):
-            for k in range(planes):
-                total[0, y, x, k] = (total[0, y, x, k] + total[1, y, x, k]) * np.float32(0.125)
+        _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, half == 0, total[half])
+    for k in prange(cells):
+        total[0, k] = (total[0, k] + total[1, k]) * np.float32(0.125)
     return total[0]
 
 
 @njit(cache=True, parallel=True, fastmath={"contract"})
-def winners(total):
+def winners(totals, bands, h, w):
     """The best plane of every pixel, to a fraction, and how much the second best costs more.
 
     The second best is the cheapest plane that is no neighbour of the best.
 
+    Args:
+        totals: In the order of `bands`.
+        bands: The planes of each tile.
+        h, w: Size of the image.
+
     Returns:
         Plane indices [h, w] and margins [h, w] in the unit of the costs.
     """
-    h, w, planes = total.shape
     index = np.empty((h, w), np.float32)
     margin = np.empty((h, w), np.float32)
     for y in prange(h):
         for x in range(w):
+            row, column = y // TILE_ROWS, x // TILE_COLUMNS
+            first = _first_cost(bands, y, x, w)
+            planes = bands.high[row, column] - bands.low[row, column]
+            total = totals[first : first + planes]
             best = 0
             for k in range(planes):
-                if total[y, x, k] < total[y, x, best]:
+                if total[k] < total[best]:
                     best = k
-            second = np.float32(1e9)
+            second = FAR
             for k in range(planes):
                 if abs(k - best) > 2:
-                    second = min(second, total[y, x, k])
-            margin[y, x] = second - total[y, x, best]
-            at = np.float32(best)
+                    second = min(second, total[k])
+            margin[y, x] = second - total[best]
+            at = np.float32(bands.low[row, column] + best)
             if 0 < best < planes - 1:
                 # Two lines of equal and opposite slope: less drawn to whole planes than a parabola.
-                before = total[y, x, best - 1] - total[y, x, best]
-                after = total[y, x, best + 1] - total[y, x, best]
+                before = total[best - 1] - total[best]
+                after = total[best + 1] - total[best]
                 steeper = max(before, after)
                 if steeper > 0:
                     at += np.float32(0.5) * (before - after) / steeper

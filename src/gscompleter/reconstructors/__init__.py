@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.errors import InputError, quoted
@@ -30,13 +31,35 @@ class Reconstructor(Protocol):
     def __call__(self, views: Sequence[View]) -> Reconstruction: ...
 
 
-def reconstructed(reconstructor: Reconstructor, views: Sequence[View]) -> Reconstruction:
+@runtime_checkable
+class Lifter(Protocol):
+    """A Ψ that spares itself what a completion does not keep."""
+
+    def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
+        """As a call, but of the Gaussians only those of the pixels `wanted` of the first view, a
+        synthesized image."""
+
+
+def reconstructed(
+    reconstructor: Reconstructor,
+    views: Sequence[View],
+    wanted: Bool[Tensor, "h w"] | None = None,
+) -> Reconstruction:
     """What Ψ makes of `views`, once all of it is seen to lie on the device of their images.
+
+    Args:
+        reconstructor: Ψ.
+        views: Photographs, or a synthesized image and its anchor.
+        wanted: Pixels of the first view whose Gaussians are enough; a Ψ may give all of them.
 
     Raises:
         ValueError: where a tensor lies elsewhere; the sentence names it.
     """
-    found, device = reconstructor(views), views[0].image.device
+    if wanted is not None and isinstance(reconstructor, Lifter):
+        found = reconstructor.lift(views, wanted)
+    else:
+        found = reconstructor(views)
+    device = views[0].image.device
     for name, tensor in tensors_in(found, "the reconstruction"):
         if tensor.device != device:
             raise ValueError(

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from gscompleter.config import AnchorConfig
 from gscompleter.generators import Generator, ImageFunction, Request, Synthesis, as_generator
@@ -106,16 +108,24 @@ def as_view(answer: Synthesis, target: Camera) -> Synthesized:
     return Synthesized(answer.image, target, notes=answer.notes, disagrees=answer.disagrees)
 
 
-def lift(reconstructor: Reconstructor, reference: View, anchor: View) -> Lift:
+def lift(
+    reconstructor: Reconstructor,
+    reference: View,
+    anchor: View,
+    wanted: Bool[Tensor, "h w"] | None = None,
+) -> Lift:
     """`Ψ((Ĩ_t, P_t), (I_s, P_s))`, of which the target's Gaussians are kept (paper, Eq. 7).
 
     A pixel-aligned Ψ says which Gaussians are the reference's. Of another Ψ all those are taken
-    that the target camera sees.
+    that the target camera sees. Where pixels of the reference are `wanted`, those of others are
+    left out if their pixels are known.
     """
-    pair = reconstructed(reconstructor, [reference, anchor])
+    pair = reconstructed(reconstructor, [reference, anchor], wanted)
     reference_depth, anchor_depth = pair.depths
     if pair.view_index is None or pair.pixel_index is None:
         seen = inside(*project(pair.gaussians.means, reference.camera), reference.camera)
         return Lift(pair.gaussians[seen], reference_depth, anchor_depth, None)
     own = pair.view_index == 0
+    if wanted is not None:
+        own &= wanted.flatten()[pair.pixel_index.where(own, 0)]
     return Lift(pair.gaussians[own], reference_depth, anchor_depth, pair.pixel_index[own])

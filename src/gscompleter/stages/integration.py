@@ -15,7 +15,7 @@ from gscompleter.descent import Adam
 from gscompleter.geometry import inside, project
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, OpacityRender
-from gscompleter.types import Camera, Gaussians, Lift, View
+from gscompleter.types import Camera, Gaussians, View
 
 MAX_TRIALS = 16
 """How often harmful Gaussians lose half of their opacity before a view that still does not hold
@@ -42,14 +42,6 @@ def keep_in_holes(
     seen = inside(pixels, z, target)
     x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
     return registered[seen & mask[y, x]]
-
-
-def keep_near_holes(lift: Lift, near_holes: Bool[Tensor, "h w"]) -> Lift:
-    """The candidates of pixels in `near_holes`; all of them where their pixels are not known."""
-    if lift.pixel_index is None:
-        return lift
-    kept = near_holes.flatten()[lift.pixel_index]
-    return replace(lift, gaussians=lift.gaussians[kept], pixel_index=lift.pixel_index[kept])
 
 
 def refine_opacities(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from gscompleter.kernels import stereo
+from gscompleter.kernels.stereo import Bands
 from gscompleter.matching.stereo_image import StereoImage
 
 SMALL_PENALTY = 25.0
@@ -17,8 +18,8 @@ EDGE_CONTRAST = 0.06
 
 
 def aggregate(
-    costs: UInt8[np.ndarray, "h w d"], reference: StereoImage
-) -> Float[np.ndarray, "h w d"]:
+    costs: UInt8[np.ndarray, "cells"], bands: Bands, reference: StereoImage
+) -> Float32[np.ndarray, "cells"]:
     """Costs summed along eight paths through the image; jumps are cheap at its edges."""
     image = reference.image
 
@@ -29,6 +30,7 @@ def aggregate(
 
     return stereo.semi_global(
         costs,
+        bands,
         jump(image[:, 1:], image[:, :-1]),
         jump(image[1:], image[:-1]),
         jump(image[1:, 1:], image[:-1, :-1]),

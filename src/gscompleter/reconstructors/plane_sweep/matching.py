@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from gscompleter.kernels import stereo
+from gscompleter.kernels.stereo import Bands
 from gscompleter.matching.stereo_image import StereoImage
 
 Source = tuple[StereoImage, Float[np.ndarray, "3 4"]]
@@ -62,13 +63,17 @@ def inverse_depth_planes(
     return np.linspace(samples[0], samples[last], planes).astype(np.float32)
 
 
-def cost_volume(
-    reference: StereoImage, sources: Sequence[Source], inverse_depths: Float[np.ndarray, "d"]
-) -> UInt8[np.ndarray, "h w d"]:
-    """Costs of the planes in 0 to 254; of several sources the best ones count."""
+def matched_costs(
+    reference: StereoImage,
+    sources: Sequence[Source],
+    inverse_depths: Float[np.ndarray, "d"],
+    bands: Bands,
+) -> UInt8[np.ndarray, "cells"]:
+    """Costs in 0 to 254 of the planes that `bands` names; of several sources the best count."""
     settings = (RADIUS, np.float32(NOISE), np.float32(DETAIL))
+    planes = (inverse_depths, bands)
     costs = [
-        stereo.matching_costs(reference.image, source.image, transform, inverse_depths, *settings)
+        stereo.matching_costs(reference.image, source.image, transform, *planes, *settings)
         for source, transform in sources
     ]
     return stereo.best_mean(np.stack(costs), BEST_SHARE, np.uint8(UNSEEN_COST))

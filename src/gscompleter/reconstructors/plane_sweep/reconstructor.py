@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.kernels import stereo
 from gscompleter.matching.depth_range import depth_range_of
-from gscompleter.matching.neighbours import Neighbours, neighbours_among
-from gscompleter.matching.stereo_image import StereoImage, source_from_reference, stereo_images
-from gscompleter.reconstructors.plane_sweep.aggregation import aggregate
+from gscompleter.matching.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance
-from gscompleter.reconstructors.plane_sweep.confidence import Mask, confidence_of, consistent
-from gscompleter.reconstructors.plane_sweep.epipolar import rotated_to_matches
+from gscompleter.reconstructors.plane_sweep.confidence import Mask
 from gscompleter.reconstructors.plane_sweep.fusion import (
     Layer,
     Transforms,
@@ -27,62 +22,17 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
 )
 from gscompleter.reconstructors.plane_sweep.gaussians import discs, normals_of
 from gscompleter.reconstructors.plane_sweep.joint_fit import fit_jointly
-from gscompleter.reconstructors.plane_sweep.matching import (
-    Source,
-    cost_volume,
-    inverse_depth_planes,
-)
-from gscompleter.reconstructors.plane_sweep.occlusion import (
-    UNKNOWN,
-    Neighbour,
-    hidden_from_others,
-)
+from gscompleter.reconstructors.plane_sweep.measuring import Measured, inverse_at, measured
+from gscompleter.reconstructors.plane_sweep.rig import Rig, rig_of
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
 
-Map = Float32[np.ndarray, "_ _"]
 HALVED_FROM = 192
-"""Pixels of the shortest side from which images of many views are matched at half their size."""
+"""Pixels of the shortest side from which images are matched at half their size, but for two
+photographs."""
 MIN_ALPHA = 0.7
 """Alpha below which a surface that no view was to show is shown by the view that meets the gap."""
-BACKGROUND_WEIGHT = np.float32(0.3)
-"""How much the background's depth counts where an object hides it from the other views."""
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """What matching says of one view."""
-
-    planes: Float32[np.ndarray, "d"]
-    """Inverse depths from far to near, evenly spaced."""
-    index: Map
-    """The best plane of each pixel, to a fraction."""
-    margin: Map
-    """How much more the second best costs."""
-
-    def inverse(self, index: Map) -> Map:
-        """Inverse depths at fractions of planes, none farther than twice the farthest plane."""
-        step = self.planes[1] - self.planes[0]
-        within = index.clip(-0.5, len(self.planes) - 0.5)
-        return np.maximum(self.planes[0] + within * step, self.planes[0] / 2).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Rig:
-    """How the views stand to each other."""
-
-    images: list[StereoImage]
-    unit: float
-    """The widest baseline, in scene units; lengths of stereo are multiples of it."""
-    neighbours: Neighbours
-    transforms: Transforms
-
-    @property
-    def is_halved(self) -> bool:
-        """Whether images of half the size are matched."""
-        smallest = min(min(image.size) for image in self.images)
-        return len(self.images) > 2 and smallest >= HALVED_FROM
 
 
 @dataclass(frozen=True)
@@ -98,15 +48,16 @@ class PlaneSweep:
         """Gaussians of what `views` show, and the depths of all of their pixels.
 
         Two views keep all of their pixels. Of more views each surface is kept once, by the view
-        that sees it best, and nothing where another view sees through it.
+        that sees it best, and nothing where another view sees through it; and unless they are
+        small they are matched at half their size: surfaces and the joint fit find what that leaves
+        out, in an eighth of the time.
 
         Raises:
             InputError: fewer than two views, no baseline between them, an empty depth range.
         """
-        near, far = depth_range_of(views)
-        views = [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
+        views = ranged(views)
         rig = rig_of(views)
-        layers = self.layers(rig, near, far)
+        layers = self.layers(rig, views)
         depths = depth_maps(layers, rig.unit, views)
         parts = [self.splat(view, depth) for view, depth in zip(views, depths, strict=True)]
         every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
@@ -123,54 +74,35 @@ class PlaneSweep:
             torch.cat(rows)[chosen].to(device),
         )
 
+    def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
+        """The Gaussians of the pixels `wanted` of the first view, a synthesized image, as they are.
+
+        What fills a hole is seen by no photograph that it could be fitted to; and its depth is that
+        of the surfaces around it, which half the size tells. Other views' depths are those that
+        were measured.
+
+        Raises:
+            InputError: as a call.
+        """
+        views = ranged(views)
+        rig = rig_of(views)
+        first, *others = matched(rig, views, halves=True)
+        layers = surfaces_of(rig.images[0], first), *map(as_measured, rig.images[1:], others)
+        depths = depth_maps(layers, rig.unit, views)
+        rows = torch.nonzero(wanted.reshape(-1))[:, 0]
+        gaussians = self.splat(views[0], depths[0])[rows]
+        return Reconstruction(gaussians, tuple(depths), torch.zeros_like(rows), rows)
+
     def depths(self, views: Sequence[View]) -> list[DepthMap]:
         """z-depth of all pixels of `views`, valid where it was measured, and how sure of it."""
+        views = ranged(views)
         rig = rig_of(views)
-        return depth_maps(self.layers(rig, *depth_range_of(views)), rig.unit, views)
+        return depth_maps(self.layers(rig, views), rig.unit, views)
 
-    def layers(self, rig: Rig, near: float, far: float) -> list[Layer]:
-        """What stereo says of each view; `near` and `far` are z-depths in scene units."""
-        sweeps = [
-            self.sweep(i, rig, near / rig.unit, far / rig.unit) for i in range(len(rig.images))
-        ]
-        confidences = self.confidences(sweeps, rig)
-        sure = [
-            np.where(confidence > 0, sweep.inverse(sweep.index), UNKNOWN)
-            for sweep, confidence in zip(sweeps, confidences, strict=True)
-        ]
-        layers = []
-        for i, (sweep, confidence) in enumerate(zip(sweeps, confidences, strict=True)):
-            measured, weight = self.with_background(i, sweep, confidence, sure, rig)
-            heights = fit_surfaces(measured, weight, rig.images[i].image)
-            layers.append(Layer(rig.images[i], sweep.inverse(heights), confidence))
-        return layers
-
-    def sweep(self, number: int, rig: Rig, near: float, far: float) -> Sweep:
-        """The planes that match best in view `number`.
-
-        Of more views than two, unless they are small, images of half the size are matched: surfaces
-        and the joint fit find what that leaves out, in an eighth of the time.
-        """
-        image, chosen = rig.images[number], rig.neighbours.of[number]
-        sources = [(rig.images[i], rig.transforms[number, i]) for i in chosen]
-        if not rig.is_halved:
-            return swept(image, sources, near, far)
-        half = [(halved(other), at_half_size(transform)) for other, transform in sources]
-        coarse = swept(halved(image), half, near, far)
-        index, margin = (doubled(values, image.size) for values in (coarse.index, coarse.margin))
-        return replace(coarse, index=index, margin=margin)
-
-    def confidences(self, sweeps: Sequence[Sweep], rig: Rig) -> list[Map]:
-        """How much each pixel's match counts: 0 where no other view agrees with it."""
-        inverses = [sweep.inverse(sweep.index) for sweep in sweeps]
-        confidences = []
-        for i, sweep in enumerate(sweeps):
-            agrees = np.zeros(inverses[i].shape, bool)
-            for j in rig.neighbours.either_way(i):
-                there, back = rig.transforms[i, j], rig.transforms[j, i]
-                agrees |= consistent(inverses[i], inverses[j], there, back)
-            confidences.append(confidence_of(sweep.index, sweep.margin, agrees))
-        return confidences
+    def layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
+        """What stereo says of each view."""
+        found = matched(rig, views, halves=len(views) > 2)
+        return list(map(surfaces_of, rig.images, found))
 
     def chosen(
         self,
@@ -192,76 +124,41 @@ class PlaneSweep:
             start += gap.numel()
         return kept
 
-    def with_background(
-        self,
-        number: int,
-        sweep: Sweep,
-        confidence: Map,
-        sure: Sequence[Map],
-        rig: Rig,
-    ) -> tuple[Map, Map]:
-        """The planes of view `number` and how much each counts, those of occluded pixels too.
-
-        `sure` are the inverse depths of all views, next to 0 where a view is not sure of them.
-        """
-        background = stereo.background(sweep.index, confidence > 0)
-        neighbours = [
-            Neighbour(sure[i], rig.transforms[number, i], rig.transforms[i, number])
-            for i in rig.neighbours.either_way(number)
-        ]
-        occluded = (confidence == 0) & hidden_from_others(sweep.inverse(background), neighbours)
-        weight = np.where(occluded, BACKGROUND_WEIGHT, confidence)
-        return np.where(occluded, background, sweep.index), weight
-
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
         """A disc for every pixel of `view`."""
         return discs(view, depth.depth, normals_of(depth.depth, view), self.disc_sigma)
 
 
-def swept(image: StereoImage, sources: Sequence[Source], near: float, far: float) -> Sweep:
-    """The planes that match best in `image`, between depths in widest baselines."""
-    planes = inverse_depth_planes(image, sources, near, far)
-    costs = cost_volume(image, sources, planes)
-    index, margin = stereo.winners(aggregate(costs, image))
-    return Sweep(planes, index, margin)
-
-
-def halved(image: StereoImage) -> StereoImage:
-    """An image of half the size; the last row or column of an odd one is doubled before."""
-    h, w = image.size
-    even = np.pad(image.image, ((0, h % 2), (0, w % 2), (0, 0)), mode="edge")
-    pixels = even.reshape((h + 1) // 2, 2, (w + 1) // 2, 2, 3).mean(axis=(1, 3))
-    K = image.K * np.array([[0.5], [0.5], [1.0]])
-    return replace(image, image=pixels.astype(np.float32), K=K)
-
-
-def at_half_size(transform: Float32[np.ndarray, "3 4"]) -> Float32[np.ndarray, "3 4"]:
-    """A transform between the pixels of two views, once both are halved."""
-    half, twice = np.diag([0.5, 0.5, 1.0]), np.diag([2.0, 2.0, 1.0, 1.0])
-    return (half @ transform @ twice).astype(np.float32)
-
-
-def doubled(values: Map, size: tuple[int, int]) -> Map:
-    """Each value four times, cut to `size`."""
-    return np.ascontiguousarray(values.repeat(2, axis=0).repeat(2, axis=1)[: size[0], : size[1]])
-
-
-def rig_of(views: Sequence[View]) -> Rig:
-    """Where `views` stand, through poses that agree with the matched features.
+def ranged(views: Sequence[View]) -> list[View]:
+    """`views` with one depth range.
 
     Raises:
-        InputError: fewer than two views, no baseline between them.
+        InputError: where it is empty, or photographs that were given none do not tell it.
     """
-    images, unit = stereo_images(views)
-    neighbours = neighbours_among(images)
-    transforms = {}
-    for i, j in combinations(range(len(images)), 2):
-        source = images[j]
-        if (i, j) in neighbours.matches:
-            source = rotated_to_matches(images[i], source, *neighbours.matches[i, j])
-        transforms[i, j] = source_from_reference(images[i], source)
-        transforms[j, i] = source_from_reference(source, images[i])
-    return Rig(images, unit, neighbours, transforms)
+    near, far = depth_range_of(views)
+    return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
+
+
+def matched(rig: Rig, views: Sequence[View], halves: bool) -> list[Measured]:
+    """What stereo measures in each of `views`. Large ones are matched at half their size first, and
+    with `halves` no further."""
+    near, far = depth_range_of(views)
+    if min(min(image.size) for image in rig.images) < HALVED_FROM:
+        return measured(rig, near, far)
+    return measured(rig.halved(), near, far) if halves else measured(rig, near, far, True)
+
+
+def surfaces_of(image: StereoImage, found: Measured) -> Layer:
+    """The surfaces of a view through what was measured there."""
+    full = found.at_size(image.size)
+    heights = fit_surfaces(full.index, full.weight, image.image)
+    return Layer(image, inverse_at(full.planes, heights), full.confidence)
+
+
+def as_measured(image: StereoImage, found: Measured) -> Layer:
+    """What was measured in a view, without surfaces."""
+    full = found.at_size(image.size)
+    return Layer(image, inverse_at(full.planes, full.index), full.confidence)
 
 
 def depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> list[DepthMap]:

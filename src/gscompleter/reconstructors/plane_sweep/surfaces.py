@@ -19,8 +19,8 @@ from gscompleter.kernels import variation
 Image = Float32[np.ndarray, "h w 3"]
 Map = Float32[np.ndarray, "h w"]
 AnyMap = Float32[np.ndarray, "_ _"]
-Level = tuple[AnyMap, AnyMap, AnyMap, Float32[np.ndarray, "_ _ 3"]]
-"""Where to begin, measurements, their weights, and the image, all of one size."""
+Level = tuple[AnyMap, AnyMap, Float32[np.ndarray, "_ _ 3"]]
+"""Measurements, their weights, and the image, all of one size."""
 
 # Heights are inverse depths, in steps between the planes of the sweep.
 STEP_PENALTY = 3.0
@@ -36,8 +36,8 @@ TOLERANCE = 0.15
 """Planes by which a measurement may be off as a matter of course."""
 LEVELS = 5
 """Levels of the pyramid, each of half the size; planes travel far on the coarse ones."""
-ITERATIONS = 250
-"""Steps on each level."""
+ITERATIONS = 100
+"""Steps on the finest level, and twice as many on each coarser one, where they cost little."""
 
 
 def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
@@ -45,25 +45,29 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
 
     Where nothing at all is measured, the result is `measured`.
     """
-    known = confidence > 0
-    if not known.any():
+    if not (confidence > 0).any():
         return measured
-    start = fill_smoothly(torch.from_numpy(measured), torch.from_numpy(known)).numpy()
-    levels: list[Level] = [(start, measured, confidence, image)]
+    levels: list[Level] = [(measured, confidence, image)]
     while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
         levels.append(halved(*levels[-1]))
-    heights = levels[-1][0].copy()
+    heights = beginning(*levels[-1][:2])
     slopes = np.zeros((2, *heights.shape), np.float32)
-    for number, (start, data, weight, colours) in reversed(list(enumerate(levels))):
-        if heights.shape != start.shape:
-            heights = doubled(heights, start.shape)
-            slopes = np.stack([doubled(slope, start.shape) / 2 for slope in slopes])
+    for number, (data, weight, colours) in reversed(list(enumerate(levels))):
+        if heights.shape != data.shape:
+            heights = doubled(heights, data.shape)
+            slopes = np.stack([doubled(slope, data.shape) / 2 for slope in slopes])
         # A coarse pixel holds 4 ** number fine ones; its steps are 2 ** number times as high.
         scale = 2.0**number
         across, down = (cost / np.float32(scale) for cost in step_costs(colours))
         bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
-        variation.fit(heights, slopes, data, weight, across, down, bend, tolerance, ITERATIONS)
+        steps = ITERATIONS * 2**number
+        variation.fit(heights, slopes, data, weight, across, down, bend, tolerance, steps)
     return heights
+
+
+def beginning(data: AnyMap, weight: AnyMap) -> AnyMap:
+    """What was measured, continued smoothly."""
+    return fill_smoothly(torch.from_numpy(data), torch.from_numpy(weight > 0)).numpy().copy()
 
 
 def step_costs(image: Image) -> tuple[Map, Map]:
@@ -78,9 +82,9 @@ def step_costs(image: Image) -> tuple[Map, Map]:
     return cost(across), cost(down)
 
 
-def halved(start: Map, data: Map, weight: Map, image: Image) -> Level:
+def halved(data: Map, weight: Map, image: Image) -> Level:
     """A level of half the size; measurements are averaged by their weights."""
-    h, w = start.shape
+    h, w = data.shape
     size = (h + 1) // 2, (w + 1) // 2
 
     def sums(values: Map) -> AnyMap:
@@ -89,9 +93,9 @@ def halved(start: Map, data: Map, weight: Map, image: Image) -> Level:
 
     total = sums(weight)
     mean = sums(weight * data) / np.maximum(total, np.float32(1e-9))
-    area = sums(np.ones_like(start))
+    area = sums(np.ones_like(data))
     smaller = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
-    return sums(start) / area, mean, total / area, smaller
+    return mean, total / area, smaller
 
 
 def doubled(values: AnyMap, shape: tuple[int, ...]) -> AnyMap:

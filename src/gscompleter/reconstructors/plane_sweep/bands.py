@@ -1,0 +1,69 @@
+"""Which planes each tile of an image is matched at: all of them, or those around a first guess."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Int
+
+from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS, Bands
+
+Map = Float32[np.ndarray, "h w"]
+MEDIAN = 5
+"""Side of the square whose median stands for a first guess, so that outliers widen no band."""
+REACH = 1
+"""Tiles meet what lies so many pixels beside them, in the image that the guess was made in."""
+SPARE = 3
+"""Planes on either side of those that were guessed."""
+
+
+def every_plane(size: tuple[int, int], planes: int) -> Bands:
+    """The band of all planes, for an image of that height and width."""
+    shape = tiles_of(size)
+    return bands_of(np.zeros(shape, int), np.full(shape, planes), size)
+
+
+def around(guess: Map, shrinkage: int, size: tuple[int, int], planes: int) -> Bands:
+    """Bands around the planes that were guessed in a smaller image.
+
+    Args:
+        guess: Fractions of planes, of an image of `1 / shrinkage` the size.
+        shrinkage: How many pixels one of its pixels stands for, across and down.
+        size: Height and width of the image that is to be matched.
+        planes: How many there are.
+    """
+    likely = cv2.medianBlur(guess, MEDIAN)
+    window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    lowest = over_tiles(np.minimum, cv2.erode(likely, window), shrinkage, size)
+    highest = over_tiles(np.maximum, cv2.dilate(likely, window), shrinkage, size)
+    low = (np.floor(lowest).astype(int) - SPARE).clip(0, planes - 1)
+    high = (np.ceil(highest).astype(int) + SPARE + 1).clip(1, planes)
+    return bands_of(low, high, size)
+
+
+def over_tiles(
+    extreme: np.ufunc, values: Map, shrinkage: int, size: tuple[int, int]
+) -> Float32[np.ndarray, "r c"]:
+    """The extreme of the values of each tile."""
+    tops, lefts = (
+        np.arange(count) * side // shrinkage
+        for count, side in zip(tiles_of(size), (TILE_ROWS, TILE_COLUMNS), strict=True)
+    )
+    return extreme.reduceat(extreme.reduceat(values, tops, axis=0), lefts, axis=1)
+
+
+def tiles_of(size: tuple[int, int]) -> tuple[int, int]:
+    """Rows and columns of tiles."""
+    return -(-size[0] // TILE_ROWS), -(-size[1] // TILE_COLUMNS)
+
+
+def bands_of(
+    low: Int[np.ndarray, "r c"], high: Int[np.ndarray, "r c"], size: tuple[int, int]
+) -> Bands:
+    """Bands from plane `low` up to `high`, which is excluded, one for each tile."""
+    rows, columns = tiles_of(size)
+    heights = np.diff(np.append(np.arange(rows) * TILE_ROWS, size[0]))
+    widths = np.diff(np.append(np.arange(columns) * TILE_COLUMNS, size[1]))
+    costs = heights[:, None] * widths * (high - low)
+    start = np.append(0, np.cumsum(costs, dtype=np.int64))
+    return Bands(low.astype(np.int32), high.astype(np.int32), start)

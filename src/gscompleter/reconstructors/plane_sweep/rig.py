@@ -1,0 +1,65 @@
+"""How the views stand to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float32
+
+from gscompleter.matching.neighbours import Neighbours, neighbours_among
+from gscompleter.matching.stereo_image import StereoImage, source_from_reference, stereo_images
+from gscompleter.reconstructors.plane_sweep.epipolar import rotated_to_matches
+from gscompleter.reconstructors.plane_sweep.fusion import Transforms
+from gscompleter.types import View
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Images, and the way from the pixels of each to those of the others."""
+
+    images: list[StereoImage]
+    unit: float
+    """The widest baseline, in scene units; lengths of stereo are multiples of it."""
+    neighbours: Neighbours
+    transforms: Transforms
+
+    def halved(self) -> Rig:
+        """The same with images of half the size."""
+        transforms = {pair: at_half_size(t) for pair, t in self.transforms.items()}
+        return replace(self, images=[halved(i) for i in self.images], transforms=transforms)
+
+
+def rig_of(views: Sequence[View]) -> Rig:
+    """Where `views` stand, through poses that agree with the matched features.
+
+    Raises:
+        InputError: fewer than two views, no baseline between them.
+    """
+    images, unit = stereo_images(views)
+    neighbours = neighbours_among(images)
+    transforms = {}
+    for i, j in combinations(range(len(images)), 2):
+        source = images[j]
+        if (i, j) in neighbours.matches:
+            source = rotated_to_matches(images[i], source, *neighbours.matches[i, j])
+        transforms[i, j] = source_from_reference(images[i], source)
+        transforms[j, i] = source_from_reference(source, images[i])
+    return Rig(images, unit, neighbours, transforms)
+
+
+def halved(image: StereoImage) -> StereoImage:
+    """An image of half the size; the last row or column of an odd one is doubled before."""
+    h, w = image.size
+    even = np.pad(image.image, ((0, h % 2), (0, w % 2), (0, 0)), mode="edge")
+    pixels = even.reshape((h + 1) // 2, 2, (w + 1) // 2, 2, 3).mean(axis=(1, 3))
+    K = image.K * np.array([[0.5], [0.5], [1.0]])
+    return replace(image, image=pixels.astype(np.float32), K=K)
+
+
+def at_half_size(transform: Float32[np.ndarray, "3 4"]) -> Float32[np.ndarray, "3 4"]:
+    """A transform between the pixels of two views, once both are halved."""
+    half, twice = np.diag([0.5, 0.5, 1.0]), np.diag([2.0, 2.0, 1.0, 1.0])
+    return (half @ transform @ twice).astype(np.float32)

@@ -1,0 +1,146 @@
+"""Matching at the planes that a first guess leaves: the same costs and paths, at fewer planes."""
+
+import numpy as np
+import pytest
+import torch
+
+from gscompleter.kernels import stereo
+from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.bands import around, bands_of, every_plane, tiles_of
+from gscompleter.reconstructors.plane_sweep.matching import inverse_depth_planes, matched_costs
+from gscompleter.reconstructors.plane_sweep.measuring import fractions, swept
+from gscompleter.reconstructors.plane_sweep.rig import rig_of
+from scenes import Room, camera_at, view_of
+
+SIZE = 200
+NEAR, FAR = 1.0, 10.0
+
+
+def volume(costs, bands, size, planes, missing):
+    """Costs [h, w, d], `missing` at the planes outside of the band of their tile."""
+    dense = np.full((*size, planes), missing, np.float32)
+    for row, top in enumerate(range(0, size[0], TILE_ROWS)):
+        for column, left in enumerate(range(0, size[1], TILE_COLUMNS)):
+            block = np.s_[top : top + TILE_ROWS, left : left + TILE_COLUMNS]
+            low, high = bands.low[row, column], bands.high[row, column]
+            start, end = bands.start[row * bands.low.shape[1] + column :][:2]
+            part = costs[start:end].reshape(*dense[block].shape[:2], high - low)
+            dense[block][..., low:high] = part
+    return dense
+
+
+def one_path(costs, dy, dx, small, large):
+    """Costs along the paths that arrive from (-dy, -dx), plane by plane and pixel by pixel."""
+    h, w = costs.shape[:2]
+    reached = np.zeros_like(costs)
+    rows = range(h) if dy > 0 or (dy == 0 and dx > 0) else range(h - 1, -1, -1)
+    columns = range(w) if dx > 0 or (dx == 0 and dy > 0) else range(w - 1, -1, -1)
+    for y in rows:
+        for x in columns:
+            reached[y, x] = costs[y, x]
+            if 0 <= y - dy < h and 0 <= x - dx < w:
+                before = reached[y - dy, x - dx]
+                beside = np.pad(before, 1, constant_values=1e9)
+                steps = np.minimum(beside[:-2], beside[2:]) + small
+                cheapest = np.minimum(np.minimum(steps, before), before.min() + large)
+                reached[y, x] += cheapest - before.min()
+    return reached
+
+
+@pytest.fixture(scope="module")
+def rig():
+    """Two photographs of a room, large enough to be matched at half their size first."""
+    views = [view_of(Room(), camera_at(x, size=SIZE)) for x in (-0.2, 0.2)]
+    return rig_of(views), views
+
+
+def test_costs_lie_without_gaps_in_the_order_of_the_tiles():
+    size = (2 * TILE_ROWS + 3, TILE_COLUMNS + 5)
+    high = np.arange(6).reshape(tiles_of(size)) + 1
+    bands = bands_of(np.zeros_like(high), high, size)
+    pixels = np.outer([TILE_ROWS, TILE_ROWS, 3], [TILE_COLUMNS, 5])
+    np.testing.assert_array_equal(np.diff(bands.start), (pixels * high).flatten())
+
+
+def test_a_band_holds_the_very_costs_of_all_planes(rig):
+    (image, other), transform = rig[0].images, rig[0].transforms[0, 1]
+    planes = inverse_depth_planes(image, [(other, transform)], NEAR, FAR)
+    everything = every_plane(image.size, len(planes))
+    low = np.random.default_rng(0).integers(0, len(planes) - 9, everything.low.shape)
+    bands = bands_of(low, low + 9, image.size)
+    dense, banded = (
+        volume(
+            matched_costs(image, [(other, transform)], planes, b), b, image.size, len(planes), -1
+        )
+        for b in (everything, bands)
+    )
+    within = banded >= 0
+    assert within.sum() == 9 * SIZE**2
+    np.testing.assert_array_equal(banded[within], dense[within])
+
+
+def test_paths_cross_from_band_to_band():
+    size, planes = (2 * TILE_ROWS, TILE_COLUMNS + 9), 12
+    rng = np.random.default_rng(0)
+    low = np.array([[0, 3], [5, 7]])
+    bands = bands_of(low, low + np.array([[6, 4], [7, 5]]), size)
+    costs = rng.integers(0, 254, bands.start[-1]).astype(np.uint8)
+    h, w = size
+    small, large = np.float32(25), np.float32(90)
+    penalties = [
+        np.full(s, large) for s in ((h, w - 1), (h - 1, w), (h - 1, w - 1), (h - 1, w - 1))
+    ]
+    total = stereo.semi_global(costs, bands, *penalties, small)
+    dense = volume(costs, bands, size, planes, 1e9)
+    steps = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
+    expected = sum(one_path(dense, dy, dx, small, large) for dy, dx in steps) / 8
+    found = volume(total, bands, size, planes, -1)
+    within = found >= 0
+    np.testing.assert_allclose(found[within], expected[within], atol=1e-3 * expected[within].max())
+    index, margin = stereo.winners(total, bands, h, w)
+    best = np.where(within, expected, 1e9).argmin(-1)
+    assert (np.abs(index - best) <= 0.5).all()
+    assert (margin >= 0).all()
+
+
+def test_bands_around_a_guess_hold_the_truth_at_a_fraction_of_the_planes(rig):
+    stereo_rig, views = rig
+    guess = swept(0, stereo_rig.halved(), NEAR / stereo_rig.unit, FAR / stereo_rig.unit)
+    image = stereo_rig.images[0]
+    sources = [(stereo_rig.images[1], stereo_rig.transforms[0, 1])]
+    planes = inverse_depth_planes(image, sources, NEAR / stereo_rig.unit, FAR / stereo_rig.unit)
+    bands = around(fractions(planes, guess.inverse), 2, image.size, len(planes))
+    true = fractions(planes, stereo_rig.unit / views[0].depth.numpy())
+    rows, columns = np.indices(image.size) // np.array([TILE_ROWS, TILE_COLUMNS])[:, None, None]
+    low, high = bands.low[rows, columns], bands.high[rows, columns]
+    assert ((true >= low) & (true <= high - 1)).mean() > 0.96
+    assert (high - low).mean() < 0.5 * len(planes)
+
+
+def test_two_large_photographs_are_measured_as_well_as_at_all_planes(rig, monkeypatch):
+    views, truth = rig[1], rig[1][0].depth
+    guided = PlaneSweep().depths(views)[0]
+    monkeypatch.setattr(
+        "gscompleter.reconstructors.plane_sweep.reconstructor.HALVED_FROM", SIZE + 1
+    )
+    plain = PlaneSweep().depths(views)[0]
+
+    def off(found):
+        return ((found.depth - truth).abs() / truth).median().item()
+
+    assert off(guided) < 1.1 * off(plain)
+    assert guided.valid.float().mean() > 0.95 * plain.valid.float().mean()
+
+
+def test_of_a_synthesized_image_only_what_is_wanted_is_lifted(rig):
+    views = rig[1]
+    wanted = torch.zeros(views[0].image.shape[:2], dtype=torch.bool)
+    wanted[50:90, 120:] = True
+    found = PlaneSweep().lift(views, wanted)
+    assert (found.view_index == 0).all()
+    assert found.pixel_index.tolist() == torch.nonzero(wanted.flatten())[:, 0].tolist()
+    z = (found.gaussians.means - views[0].camera.center) @ views[0].camera.forward
+    truth = views[0].depth.flatten()[found.pixel_index]
+    assert ((z - truth).abs() / truth).median() < 0.02
+    assert len(found.depths) == 2
