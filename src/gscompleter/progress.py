@@ -9,7 +9,6 @@ from contextvars import ContextVar
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import track as rich_track
 
 T = TypeVar("T")
 
@@ -31,4 +30,7 @@ def track(items: Sequence[T], description: str) -> Iterable[T]:
     console = _console.get()
     if console is None:
         return items
+    # Here, so that what shows no bars does not wait for it.
+    from rich.progress import track as rich_track
+
     return rich_track(items, description, console=console, transient=True)
