@@ -23,6 +23,7 @@ from gscompleter.commands.options import (
     FOUND,
     CleanOptions,
     CompleteOptions,
+    ComputeOptions,
     DemoOptions,
     EvaluateOptions,
     IndexOptions,
@@ -35,6 +36,7 @@ from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError, quoted
 from gscompleter.interrupts import treat_stops_alike
+from gscompleter.threads import bound_threads
 
 # Where each command lives. Its module is imported once the arguments are known to be right, so
 # that `--help` does not wait for torch.
@@ -69,6 +71,8 @@ def main() -> None:
     warnings.filterwarnings("ignore", module="PIL")
     try:
         options = checked(parsed(words))
+        if isinstance(options, ComputeOptions):
+            bound_threads(options.threads)
         _, module, function = COMMANDS[words[0]]
         getattr(import_module(module), function)(options)
     except InputError as error:
