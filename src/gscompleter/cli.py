@@ -32,6 +32,7 @@ from gscompleter.commands.options import (
 )
 from gscompleter.commands.poses import PosesOptions
 from gscompleter.commands.strip import StripOptions
+from gscompleter.commands.warmup import WarmupOptions
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError, quoted
@@ -51,6 +52,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "convert": (ConvertOptions, "gscompleter.commands.convert", "run_convert"),
     "poses": (PosesOptions, "gscompleter.commands.poses", "run_poses"),
     "strip": (StripOptions, "gscompleter.commands.strip", "run_strip"),
+    "warmup": (WarmupOptions, "gscompleter.commands.warmup", "run_warmup"),
 }
 
 Command: Any = Union[  # noqa: UP007  (of as many as there are)

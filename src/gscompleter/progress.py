@@ -1,5 +1,5 @@
-"""Progress bars, shown where somebody watches: the command line turns them on, a library call
-stays silent."""
+"""Progress bars and sentences, shown where somebody watches: the command line turns them on, a
+library call stays silent."""
 
 from __future__ import annotations
 
@@ -17,12 +17,19 @@ _console: ContextVar[Console | None] = ContextVar("console", default=None)
 
 @contextmanager
 def shown_on(console: Console | None) -> Iterator[None]:
-    """Show the bars of everything called inside on `console`; None keeps them hidden."""
+    """Show the bars and sentences of everything called inside on `console`; None hides them."""
     token = _console.set(console)
     try:
         yield
     finally:
         _console.reset(token)
+
+
+def tell(sentence: str) -> None:
+    """Print a sentence where bars are shown."""
+    console = _console.get()
+    if console is not None:
+        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
 
 def track(items: Sequence[T], description: str) -> Iterable[T]:
