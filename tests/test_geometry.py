@@ -1,7 +1,10 @@
 """Rays and projection undo each other, and cameras know how they lie to each other."""
 
+import math
+
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from gscompleter.geometry import (
     baseline_between,
@@ -10,10 +13,12 @@ from gscompleter.geometry import (
     project,
     quats_from,
     quats_product,
+    rotation_about,
     rotation_between,
     rotations_from,
     same_camera,
     sample,
+    share_of_turn,
     unproject,
 )
 from scenes import Room, camera_at, cast
@@ -98,3 +103,26 @@ def test_a_product_of_quaternions_turns_by_the_second_and_then_by_the_first():
     assert torch.allclose(turned, rotations_from(first) @ rotations_from(second), atol=1e-6)
     one_after_all = quats_product(first[0], second)
     assert torch.allclose(one_after_all, quats_product(first[:1].expand(5, 4), second))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, -2.0, math.pi])
+def test_a_turn_about_an_axis_is_its_rotation_vector(angle):
+    axis = torch.tensor([2.0, -3.0, 6.0], dtype=torch.float64) / 7
+    expected = torch.from_numpy(Rotation.from_rotvec(angle * axis.numpy()).as_matrix())
+    assert torch.allclose(rotation_about(axis, angle), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 2.0, 3.1])
+def test_two_shares_of_a_turn_are_the_turn(angle):
+    axis = torch.tensor([2.0, -3.0, 6.0], dtype=torch.float64) / 7
+    turn = rotation_about(axis, angle)
+    assert torch.allclose(share_of_turn(turn, 0.25), rotation_about(axis, angle / 4), atol=1e-14)
+    both = share_of_turn(turn, 0.25) @ share_of_turn(turn, 0.75)
+    assert torch.allclose(both, turn, atol=1e-14)
+
+
+def test_of_the_two_ways_to_turn_the_shorter_one_is_shared():
+    down = torch.tensor([0.0, 1.0, 0.0])
+    turn = rotation_about(down, math.radians(270))
+    expected = rotation_about(down, -math.radians(45))
+    assert torch.allclose(share_of_turn(turn, 0.5), expected, atol=1e-6)

@@ -23,6 +23,7 @@ from gscompleter.commands.options import (
     FOUND,
     CleanOptions,
     CompleteOptions,
+    ComputeOptions,
     DemoOptions,
     EvaluateOptions,
     IndexOptions,
@@ -31,10 +32,12 @@ from gscompleter.commands.options import (
 )
 from gscompleter.commands.poses import PosesOptions
 from gscompleter.commands.strip import StripOptions
+from gscompleter.commands.warmup import WarmupOptions
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError, quoted
 from gscompleter.interrupts import treat_stops_alike
+from gscompleter.threads import bound_threads
 
 # Where each command lives. Its module is imported once the arguments are known to be right, so
 # that `--help` does not wait for torch.
@@ -49,6 +52,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "convert": (ConvertOptions, "gscompleter.commands.convert", "run_convert"),
     "poses": (PosesOptions, "gscompleter.commands.poses", "run_poses"),
     "strip": (StripOptions, "gscompleter.commands.strip", "run_strip"),
+    "warmup": (WarmupOptions, "gscompleter.commands.warmup", "run_warmup"),
 }
 
 Command: Any = Union[  # noqa: UP007  (of as many as there are)
@@ -69,6 +73,8 @@ def main() -> None:
     warnings.filterwarnings("ignore", module="PIL")
     try:
         options = checked(parsed(words))
+        if isinstance(options, ComputeOptions):
+            bound_threads(options.threads)
         _, module, function = COMMANDS[words[0]]
         getattr(import_module(module), function)(options)
     except InputError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -124,6 +125,21 @@ def quats_product(
     w, x, y, z = after.unbind(-1)
     left = matrices([w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w])
     return (left @ before[..., None])[..., 0]
+
+
+def rotation_about(axis: Float[Tensor, "3"], angle: float) -> Float[Tensor, "3 3"]:
+    """The turn by `angle` radians about a direction of length 1."""
+    real = torch.tensor([math.cos(angle / 2)], dtype=torch.float64, device=axis.device)
+    return rotations_from(torch.cat([real, math.sin(angle / 2) * axis.double()])).to(axis)
+
+
+def share_of_turn(turn: Float[Tensor, "3 3"], share: float) -> Float[Tensor, "3 3"]:
+    """`share` of a turn, about the same axis; of its two ways the shorter one."""
+    quat = quats_from(turn.double())
+    real, imaginary = (quat if quat[0] >= 0 else -quat).split([1, 3])
+    length = imaginary.norm()
+    axis = imaginary / length.clamp_min(torch.finfo(length.dtype).tiny)
+    return rotation_about(axis, share * 2 * torch.atan2(length, real[0]).item()).to(turn)
 
 
 def matrices(*rows: list[Float[Tensor, "*n"]]) -> Float[Tensor, "*n r c"]:

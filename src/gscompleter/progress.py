@@ -1,5 +1,5 @@
-"""Progress bars, shown where somebody watches: the command line turns them on, a library call
-stays silent."""
+"""Progress bars and sentences, shown where somebody watches: the command line turns them on, a
+library call stays silent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from contextvars import ContextVar
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import track as rich_track
 
 T = TypeVar("T")
 
@@ -18,7 +17,7 @@ _console: ContextVar[Console | None] = ContextVar("console", default=None)
 
 @contextmanager
 def shown_on(console: Console | None) -> Iterator[None]:
-    """Show the bars of everything called inside on `console`; None keeps them hidden."""
+    """Show the bars and sentences of everything called inside on `console`; None hides them."""
     token = _console.set(console)
     try:
         yield
@@ -26,9 +25,19 @@ def shown_on(console: Console | None) -> Iterator[None]:
         _console.reset(token)
 
 
+def tell(sentence: str) -> None:
+    """Print a sentence where bars are shown."""
+    console = _console.get()
+    if console is not None:
+        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+
+
 def track(items: Sequence[T], description: str) -> Iterable[T]:
     """`items`, one after the other, with a bar where bars are shown."""
     console = _console.get()
     if console is None:
         return items
+    # Here, so that what shows no bars does not wait for it.
+    from rich.progress import track as rich_track
+
     return rich_track(items, description, console=console, transient=True)

@@ -35,6 +35,7 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import SUMMARY, check_output, output_folder
 from gscompleter.metrics.image import psnr
 from gscompleter.progress import shown_on
+from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import Renderer, choose_device, load_renderer
 from gscompleter.reports.completion import save_brought
 from gscompleter.stages.cleaning import superfluous
@@ -63,6 +64,8 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
     renderer, clock = load_renderer(device), Clock(())
     opened = open_scene(options, console)
     task = read_photographs(options, opened, device)
+    with shown_on(None if options.quiet else console):
+        compile_kernels([device])
     task = in_frame_of_splat(task, options.scene, options, opened)
     task = with_working_range(task, renderer)
     plan = f"judged by {len(task.views)} photographs on {device}, written to {quoted(options.out)}"

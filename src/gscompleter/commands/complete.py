@@ -47,6 +47,7 @@ from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
+from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.completion import Target, write_report
 from gscompleter.types import Completion, View
@@ -116,6 +117,8 @@ def prepared(
     device = choose_device(options.device)
     opened = open_scene(options, console)
     task = read_task(options, opened, device)
+    with shown_on(None if options.quiet else console):
+        compile_kernels((device, options.reconstructor, options.synthesis.name))
     if options.scene is not None:
         task = with_witnesses(task, opened.photographs)
         task = in_frame_of_splat(task, options.scene, options, opened)

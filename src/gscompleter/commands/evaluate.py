@@ -27,6 +27,7 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.framing import check_resolution
 from gscompleter.errors import InputError, quoted
 from gscompleter.progress import shown_on
+from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import choose_device
 from gscompleter.reports.plots import PlotsNotAvailable, plots
 from gscompleter.reports.summary import Summary
@@ -63,6 +64,7 @@ def run_evaluation(options: EvaluateOptions) -> None:
         source=source_of(options),
     )
     with shown_on(None if options.quiet else console):
+        compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.again)
     console.print(f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}.")
     # An empty shard, where there are more shards than cases, has nothing to show.

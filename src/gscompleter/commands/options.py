@@ -37,7 +37,16 @@ class Options(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(Options):
+class ComputeOptions(Options):
+    """What every command can be told that computes for long."""
+
+    threads: Annotated[int, Interval(ge=1, le=1024)] | None = None
+    """How many threads compute; as many as there are usable cores if not given. A completion on a
+    CPU does not depend on it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(ComputeOptions):
     """What every command can be told that completes something."""
 
     device: Device = "auto"
@@ -60,7 +69,7 @@ class ModelOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions(Options):
+class SceneOptions(ComputeOptions):
     """What every command can be told that opens posed photographs, and may bring a splat."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]

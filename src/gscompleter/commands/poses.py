@@ -8,11 +8,11 @@ from typing import Annotated
 
 import tyro
 
-from gscompleter.config.settings import Settings
+from gscompleter.commands.options import ComputeOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class PosesOptions(Settings):
+class PosesOptions(ComputeOptions):
     """Find the cameras of photographs, and write them as a COLMAP folder (images and sparse/0).
 
     Run again with the same photographs, it keeps what it found.
@@ -24,8 +24,6 @@ class PosesOptions(Settings):
     """The folder to write: upright copies in images, cameras and points in sparse/0."""
     overwrite: bool = False
     """Replace what an earlier run left in the output folder."""
-    quiet: bool = False
-    """Say nothing but errors."""
 
 
 def run_poses(options: PosesOptions) -> None:

@@ -26,6 +26,7 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import SUMMARY, output_folder
 from gscompleter.io.json_file import read_json
 from gscompleter.progress import track
+from gscompleter.threads import threads
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Of photographs, in any case."""
@@ -206,7 +207,7 @@ def _mapped(copies: Sequence[Upright], folder: Path) -> dict[str, Any]:
             "work": work,
             "model": str(folder / "sparse" / "0"),
             "photographs": [asdict(copy) for copy in copies],
-            "threads": min(MAX_THREADS, os.cpu_count() or 1),
+            "threads": min(MAX_THREADS, threads()),
         }
         (Path(work) / "job.json").write_text(json.dumps(job), encoding="utf-8")
         with (Path(work) / "complaints.txt").open("w+", errors="replace") as complaints:

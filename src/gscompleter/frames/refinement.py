@@ -6,8 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from gscompleter.frames.matching import MAX_ERROR, Located, Photograph, located
 from gscompleter.frames.similarity import (
@@ -63,6 +61,10 @@ def reprojected(found: Sequence[Located], start: Matrix) -> Matrix:
     The seven unknowns change the splat's points, seen from the photographs' frame: the logarithm
     of the scale, a rotation vector, and a shift in units of the points' spread.
     """
+    # Here, for they take half a second to import and few splats need them.
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
     back = np.linalg.inv(start)
     points = [place.points @ back[:3, :3].T + back[:3, 3] for place in found]
     center = np.median(np.concatenate(points), axis=0)

@@ -22,6 +22,10 @@ FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
 MAX_PIXELS = 178_956_970
 """Of an image: where Pillow too takes a small file for a bomb."""
 
+COMPRESSION = 3
+"""Of the PNGs that are written: of a photograph 6 % more bytes than zlib's own 6, in a third of its
+time."""
+
 _ORIENTATION = 0x0112
 """The EXIF tag of how a photograph is to be turned; 1 for not at all."""
 
@@ -48,7 +52,7 @@ def write_image(
     values = image.detach().cpu().double().nan_to_num(nan=0.0).clamp(0, 1)
     pixels = (values * 255 + 0.5).floor().to(torch.uint8).numpy()
     with replacing(path) as file:
-        Image.fromarray(pixels).save(file, format="PNG")
+        Image.fromarray(pixels).save(file, format="PNG", compress_level=COMPRESSION)
 
 
 def as_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:

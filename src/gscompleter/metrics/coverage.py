@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import torch
-from scipy.spatial.transform import Rotation
 
 from gscompleter.coverage import COVERED
-from gscompleter.geometry import baseline_between
+from gscompleter.geometry import baseline_between, rotation_about, share_of_turn
 from gscompleter.render import Renderer
-from gscompleter.stages.candidates import moved, rotation, shrunk, spacing
+from gscompleter.stages.candidates import moved, shrunk, spacing
 from gscompleter.stages.exploration import small_renders
 from gscompleter.types import Camera, Gaussians
 
@@ -73,8 +72,8 @@ def held_out(cameras: Sequence[Camera], step: float, generator: torch.Generator)
     shift = step * torch.randn(3, generator=generator) / 3**0.5
     right, down = (TURN * torch.randn(2, generator=generator)).tolist()
     between = interpolated(first, neighbour(first, cameras), share)
-    turn = rotation(between.c2w[:3, 1], math.radians(right))
-    turn = rotation(between.c2w[:3, 0], math.radians(down)) @ turn
+    turn = rotation_about(between.c2w[:3, 1], math.radians(right))
+    turn = rotation_about(between.c2w[:3, 0], math.radians(down)) @ turn
     return moved(between, turn, shift.to(between.c2w))
 
 
@@ -86,7 +85,7 @@ def neighbour(camera: Camera, cameras: Sequence[Camera]) -> Camera:
 
 def interpolated(first: Camera, second: Camera, share: float) -> Camera:
     """`first` on its way to where `second` stands and looks."""
-    turns = [Rotation.from_matrix(c.c2w[:3, :3].cpu().double().numpy()) for c in (first, second)]
-    vector = share * (turns[1] * turns[0].inv()).as_rotvec()
-    turn = torch.from_numpy(Rotation.from_rotvec(vector).as_matrix()).to(first.c2w)
-    return moved(first, turn, share * (second.center - first.center))
+    turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
+    return moved(
+        first, share_of_turn(turn, share).to(first.c2w), share * (second.center - first.center)
+    )

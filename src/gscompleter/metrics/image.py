@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 from jaxtyping import Bool, Float
-from skimage.metrics import structural_similarity
 from torch import Tensor
 
 MAX_PSNR = 100.0
@@ -34,6 +33,9 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     scikit-image with an 11-pixel Gaussian window, colour channels averaged, range 1. Both sides
     of the image must be at least 11 pixels long.
     """
+    # Here, so that what is to be scored need not wait for scikit-image and SciPy.
+    from skimage.metrics import structural_similarity
+
     return float(
         structural_similarity(
             image.clamp(0, 1).cpu().numpy(),

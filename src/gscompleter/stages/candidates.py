@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter.config import ExplorationConfig
-from gscompleter.geometry import project
+from gscompleter.geometry import project, rotation_about
 from gscompleter.types import Camera, Render
 
 MARGIN = 0.1
@@ -95,7 +94,7 @@ def swung(
     axes = (up, camera.c2w[:3, 0])
     arm = camera.center - pivot
     turns = [
-        rotation(axis, sign * angle)
+        rotation_about(axis, sign * angle)
         for axis, angle in zip(axes, angles, strict=True)
         for sign in (1, -1)
     ]
@@ -108,12 +107,6 @@ def moved(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"])
     c2w[:3, :3] = turn @ camera.c2w[:3, :3]
     c2w[:3, 3] += shift
     return replace(camera, c2w=c2w)
-
-
-def rotation(axis: Float[Tensor, "3"], angle: float) -> Float[Tensor, "3 3"]:
-    """The turn by `angle` radians about a direction of length 1."""
-    vector = angle * axis.detach().cpu().double().numpy()
-    return torch.from_numpy(Rotation.from_rotvec(vector).as_matrix()).to(axis)
 
 
 def opening(camera: Camera) -> tuple[float, float]:

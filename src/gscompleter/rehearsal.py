@@ -1,0 +1,144 @@
+"""The kernels compiled before they are needed: each part that has some works once on a tiny scene.
+
+numba compiles one kernel at a time in a process, and a completion would meet them one after the
+other. Parts are rehearsed in several processes, and find in the cache what another compiled.
+The scene is a textured wall, parallel to the images of cameras that stand side by side.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+
+import torch
+
+from gscompleter.generators import Request, load_generator
+from gscompleter.interpolation import smoothed
+from gscompleter.kernels.compiled import is_compiled, note_compiled
+from gscompleter.progress import tell
+from gscompleter.reconstructors import load_reconstructor
+from gscompleter.render import load_renderer
+from gscompleter.threads import threads
+from gscompleter.types import Camera, Gaussians, Render, SceneContext, View, observed, sh_from_rgb
+
+SIDE = 64
+"""Pixels of an image."""
+SHIFT = 6
+"""Pixels by which the wall moves from one image to the next."""
+DEPTH = 2.0
+"""Of the wall, in baselines."""
+
+
+def photographs() -> list[View]:
+    """The wall as two cameras see it."""
+    noise = torch.rand(SIDE, SIDE + SHIFT, 3, generator=torch.Generator().manual_seed(0))
+    wall = smoothed(noise, torch.ones(noise.shape[:2], dtype=torch.bool), 1)
+    return [View(wall[:, SHIFT * i :][:, :SIDE].contiguous(), camera_at(i)) for i in range(2)]
+
+
+def camera_at(place: int) -> Camera:
+    """A camera so many baselines to the right."""
+    c2w = torch.eye(4)
+    c2w[0, 3] = place
+    focal = SHIFT * DEPTH
+    K = torch.tensor([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1]])
+    return Camera(c2w, K, SIDE, SIDE, near=DEPTH / 2, far=DEPTH * 4)
+
+
+def render_with(renderer: str) -> None:
+    """Draw some Gaussians in all the ways there are, and ask for gradients."""
+    drawing, camera, gaussians = load_renderer(renderer), camera_at(0), some_gaussians()
+    frozen = drawing.freeze(gaussians, camera)
+    opacities = gaussians.opacities.clone().requires_grad_()
+    means = gaussians.means.clone().requires_grad_()
+    moved = observed(means, gaussians.quats, gaussians.scales, opacities, gaussians.sh)
+    frozen.composite(moved).image.sum().backward()
+    frozen.plan(gaussians)(opacities).image.sum().backward()
+
+
+def some_gaussians() -> Gaussians:
+    """Four Gaussians on the wall."""
+    means = torch.tensor([[x, y, DEPTH] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    quats, grey = torch.tensor([[1.0, 0, 0, 0]] * 4), sh_from_rgb(torch.full((4, 3), 0.5))
+    return observed(means, quats, torch.full((4, 3), 0.1), torch.full((4,), 0.5), grey)
+
+
+def reconstruct_with(reconstructor: str) -> None:
+    """Make Gaussians of the two photographs."""
+    load_reconstructor(reconstructor)(photographs())
+
+
+def synthesize_with(generator: str) -> None:
+    """Paint what a third camera sees, half of which is a hole."""
+    views = photographs()
+    depth, seen = torch.full((SIDE, SIDE), DEPTH), torch.ones(SIDE, SIDE)
+    half = (torch.arange(SIDE) < SIDE // 2).expand(SIDE, SIDE).float()
+    at_views = tuple(Render(view.image, depth, seen) for view in views)
+    at_target = Render(views[1].image * half[..., None], depth * half, half)
+    context = SceneContext(tuple(views), at_views, at_target)
+    load_generator(generator).synthesize([Request(views[1], camera_at(2), context)])
+
+
+PARTS: dict[str, Callable[[str], None]] = {
+    "cpu": render_with,
+    "plane-sweep": reconstruct_with,
+    "warp-inpaint": synthesize_with,
+}
+"""The parts that have kernels, and how each is rehearsed. Of two processes the one that has the
+second to do takes about as long as the other with the first and the third."""
+
+SECONDS = 30
+"""About what all of them take together on one core."""
+
+
+def compile_kernels(names: Sequence[str]) -> float | None:
+    """Compile what the parts of these names need, where it is not there yet.
+
+    Returns:
+        The seconds that it took, or None where nothing was to be done.
+
+    Raises:
+        subprocess.CalledProcessError: where a process fails; it has said why.
+    """
+    missing = [name for name in PARTS if name in names and not is_compiled(name)]
+    if not missing:
+        return None
+    count = min(len(missing), threads())
+    expected = SECONDS * len(missing) / len(PARTS) / count
+    tell(f"Compiling kernels for this machine, once; about {expected:.0f} s.")
+    start = time.perf_counter()
+    own, *others = (missing[i::count] for i in range(count))
+    with rehearsed_apart(others):
+        for name in own:
+            rehearse(name)
+    return time.perf_counter() - start
+
+
+@contextmanager
+def rehearsed_apart(shares: Sequence[Sequence[str]]) -> Iterator[None]:
+    """Rehearse each share of parts in a process of its own, meanwhile."""
+    commands = [[sys.executable, "-m", __name__, *share] for share in shares]
+    with ExitStack() as stack:
+        processes = []
+        for command in commands:
+            processes.append(subprocess.Popen(command, stdin=subprocess.DEVNULL))
+            stack.callback(processes[-1].wait)
+            stack.callback(processes[-1].kill)
+        yield
+        for process in processes:
+            if process.wait() != 0:
+                raise subprocess.CalledProcessError(process.returncode, process.args)
+
+
+def rehearse(name: str) -> None:
+    """Rehearse a part in this process, and remember that its kernels are compiled."""
+    PARTS[name](name)
+    note_compiled(name)
+
+
+if __name__ == "__main__":
+    for part in sys.argv[1:]:
+        rehearse(part)

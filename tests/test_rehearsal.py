@@ -1,0 +1,130 @@
+"""Kernels are compiled in advance: all of them, once, and nobody is left in the dark about it."""
+
+import io
+import os
+import subprocess
+import sys
+from importlib import import_module
+from pkgutil import iter_modules
+
+import pytest
+from numba.core.registry import CPUDispatcher
+from rich.console import Console
+
+from command import run
+from gscompleter import GSCompleter, kernels, rehearsal
+from gscompleter.kernels import compiled
+from gscompleter.progress import shown_on
+from scenes import Room, camera_at, view_of
+
+COMPLETE = """
+import sys
+import numba.core.event
+sys.path.insert(0, sys.argv[1])
+from test_rehearsal import complete
+with numba.core.event.install_recorder("numba:compile") as found:
+    complete()
+print(len(found.buffer))
+"""
+
+
+def complete() -> None:
+    """Complete a room for what lies beside two and three photographs, reconstructed and given."""
+    target = camera_at(0.7, yaw=12, size=64)
+    for places in ((-0.3, 0.1), (-0.3, 0.1, 0.3)):
+        views = [view_of(Room(), camera_at(x, size=64)) for x in places]
+        completion = GSCompleter()(views, target)
+    GSCompleter()(views, target, completion.scene)
+
+
+def signatures() -> set[tuple[str, str]]:
+    """Names and argument types of all kernels that ran in this process."""
+    return {
+        (f"{module.name}.{name}", str(types))
+        for module in iter_modules(kernels.__path__)
+        for name, value in vars(import_module(f"gscompleter.kernels.{module.name}")).items()
+        if isinstance(value, CPUDispatcher)
+        for types in value.signatures
+    }
+
+
+@pytest.fixture
+def marked(monkeypatch, tmp_path) -> list[str]:
+    """Marks stand in an empty folder, and parts are rehearsed by writing their names down."""
+    done: list[str] = []
+    monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(rehearsal, "PARTS", dict.fromkeys(("cpu", "plane-sweep"), done.append))
+    monkeypatch.setattr(rehearsal, "threads", lambda: 1)
+    return done
+
+
+def test_a_rehearsal_meets_every_kernel_of_a_completion():
+    """In a process of its own, for kernels that ran here before would prove nothing."""
+    said = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from test_rehearsal import complete, rehearsal, signatures
+for name, rehearse in rehearsal.PARTS.items():
+    rehearse(name)
+rehearsed = signatures()
+complete()
+print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
+"""
+    command = [sys.executable, "-c", said, os.path.dirname(__file__)]
+    life = subprocess.run(command, capture_output=True, text=True, check=True)
+    number, *others = life.stdout.splitlines()
+    assert int(number) > 15
+    assert others == []
+
+
+def test_what_is_compiled_is_compiled_once(marked):
+    assert rehearsal.compile_kernels(["cpu", "mvsplat"]) > 0
+    assert marked == ["cpu"]
+    assert rehearsal.compile_kernels(["cpu"]) is None
+    assert rehearsal.compile_kernels(["plane-sweep", "cpu"]) > 0
+    assert marked == ["cpu", "plane-sweep"]
+
+
+def test_kernels_are_compiled_anew_for_another_processor(marked, monkeypatch):
+    rehearsal.compile_kernels(["cpu"])
+    monkeypatch.setattr(compiled, "get_host_cpu_name", lambda: "another")
+    rehearsal.compile_kernels(["cpu"])
+    assert marked == ["cpu", "cpu"]
+
+
+def test_one_line_says_so_before_it_happens(marked):
+    console = Console(record=True, file=io.StringIO(), width=200)
+    with shown_on(console):
+        rehearsal.compile_kernels(["cpu"])
+        rehearsal.compile_kernels(["cpu"])
+    said = console.export_text()
+    assert said.startswith("Compiling kernels for this machine, once; about ")
+    assert said.count("\n") == 1
+
+
+def test_warmup_says_what_it_did(marked, monkeypatch, capsys):
+    assert run(monkeypatch, "warmup") == 0
+    assert capsys.readouterr().out.startswith("All kernels are compiled, in ")
+    assert run(monkeypatch, "warmup") == 0
+    assert capsys.readouterr().out.startswith("All kernels are compiled already: ")
+    assert run(monkeypatch, "warmup", "--quiet") == 0
+    assert capsys.readouterr() == ("", "")
+    assert marked == ["cpu", "plane-sweep"]
+
+
+def test_a_part_that_fails_in_its_process_is_no_success(monkeypatch):
+    with (
+        pytest.raises(subprocess.CalledProcessError),
+        rehearsal.rehearsed_apart([["no such part"]]),
+    ):
+        pass
+
+
+@pytest.mark.slow
+def test_after_a_warmup_a_completion_compiles_nothing(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    warm = [sys.executable, "-c", "from gscompleter.cli import main; main()", "warmup"]
+    subprocess.run(warm, env=environment, check=True)
+    command = [sys.executable, "-c", COMPLETE, os.path.dirname(__file__)]
+    life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert life.stdout == "0\n"

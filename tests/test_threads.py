@@ -1,0 +1,71 @@
+"""All libraries share the cores they are given, and the result does not depend on how many."""
+
+import hashlib
+import os
+import subprocess
+import sys
+
+import pytest
+
+from gscompleter import threads
+from scenes import camera_at, photographed
+
+COUNTS = """
+import sys
+from gscompleter.threads import bound_threads
+bound_threads(int(sys.argv[1]) if sys.argv[1:] else None)
+import cv2, numba, torch
+print(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS, cv2.getNumThreads())
+"""
+
+
+def counted(*arguments: str, **told: str) -> list[int]:
+    """Threads of torch, numba and OpenCV in a process to which the environment says only `told`."""
+    environment = {k: v for k, v in os.environ.items() if k not in threads.LIBRARIES} | told
+    command = [sys.executable, "-c", COUNTS, *arguments]
+    life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return [int(word) for word in life.stdout.split()]
+
+
+def test_every_library_takes_as_many_as_it_is_told():
+    assert counted("1") == [1, 1, 1]
+    assert counted("3")[1:] == [3, 3]  # torch takes no more than there are cores
+
+
+def test_what_the_environment_says_gives_way_to_what_is_told_and_to_nothing_else():
+    cores = threads.usable_cores()
+    assert counted() == [cores, cores, cores]
+    assert counted(OPENCV_FOR_THREADS_NUM="3") == [cores, cores, 3]
+    assert counted("1", OPENCV_FOR_THREADS_NUM="3") == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("said", "cores"), [("150000 100000", 1.5), ("max 100000", float("inf")), ("", float("inf"))]
+)
+def test_a_container_is_granted_a_share_of_the_cores(tmp_path, said, cores):
+    quota = tmp_path / "cpu.max"
+    quota.write_text(said)
+    assert threads.granted(quota) == cores
+    assert threads.granted(tmp_path / "missing") == float("inf")
+
+
+def test_a_share_of_a_core_is_one_thread(tmp_path, monkeypatch):
+    quota = tmp_path / "cpu.max"
+    quota.write_text("20000 100000")
+    monkeypatch.setattr(threads, "QUOTA", quota)
+    assert threads.usable_cores() == 1
+
+
+def test_the_bytes_of_a_completion_do_not_depend_on_the_threads(tmp_path):
+    cameras = [camera_at(x, yaw=yaw, size=96) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
+    scene = photographed(tmp_path / "room", cameras)
+    found = set()
+    for count in ("1", "2"):
+        out = tmp_path / count
+        words = ["complete", scene, "--context", "0", "1", "--target", "2", "--out", out, "--quiet"]
+        main = "from gscompleter.cli import main; main()"
+        command = [sys.executable, "-c", main, *map(str, words), "--threads", count]
+        subprocess.run(command, check=True)
+        found.add(hashlib.sha256((out / "completed.ply").read_bytes()).hexdigest())
+        assert (out / "generated.ply").stat().st_size > 2000
+    assert len(found) == 1
