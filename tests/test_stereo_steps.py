@@ -183,16 +183,12 @@ def test_without_any_measurement_nothing_is_made_up():
     assert np.array_equal(found, measured)
 
 
-def test_surfaces_do_not_depend_on_the_number_of_threads():
-    truth = slanted()
-    noisy = truth + np.random.default_rng(1).normal(size=truth.shape).astype(np.float32)
-    found = fit_surfaces(noisy, np.ones_like(truth), blank(truth))
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        assert np.array_equal(fit_surfaces(noisy, np.ones_like(truth), blank(truth)), found)
-    finally:
-        numba.set_num_threads(threads)
+def test_stereo_does_not_depend_on_the_number_of_threads(monkeypatch):
+    views, depths = [view_of(Room(), camera_at(x)) for x in (-0.2, 0.2)], []
+    for threads in (1, 3):
+        monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", threads)
+        depths.append(PlaneSweep().depths(views)[0].depth)
+    assert torch.equal(*depths)
 
 
 def test_a_blank_wall_is_completed_as_a_plane():

@@ -5,7 +5,9 @@ hash, so that the result does not depend on the number of threads.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from gscompleter.kernels.sharing import share
 
 
 @njit(cache=True, inline="always")
@@ -60,7 +62,6 @@ def _prior(nearer, dy, dx, diagonal, depth_penalty, distance_penalty):
     )
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
 def search(
     image,
     weight,
@@ -97,91 +98,167 @@ def search(
     Returns:
         The cost of every match [q] and its shift of colour [q, 3].
     """
-    n = queries.shape[0]
-    num_sources, H, W = usable.shape
-    h, w = query_at.shape
-    penalties = (np.float32(np.sqrt(H * H + W * W)), depth_penalty, distance_penalty)
-    cost = np.empty(n, np.float32)
-    shift = np.empty((n, 3), np.float32)
-    for i in prange(n):
-        bias = np.empty(3, np.float32)
+    H, W = usable.shape[1:]
+    diagonal = np.float32(np.sqrt(H * H + W * W))
+    given = (image, weight, queries, query_at, expected, sources, log_depth)
+    costs_of = (radius, max_bias, bias_penalty, diagonal, depth_penalty, distance_penalty)
+    cost, shift = np.empty(len(queries), np.float32), np.empty((len(queries), 3), np.float32)
+    share(_rate, len(queries), *given, field, *costs_of, cost, shift)
+    for number in range(rounds):
+        chance = (number, max_reach, seed)
+        found = (field.copy(), field, cost, shift)
+        share(_improve, len(queries), *given, usable, *costs_of, *chance, *found)
+    return cost, shift
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _rate(
+    begin,
+    end,
+    image,
+    weight,
+    queries,
+    query_at,
+    expected,
+    sources,
+    log_depth,
+    field,
+    radius,
+    max_bias,
+    bias_penalty,
+    diagonal,
+    depth_penalty,
+    distance_penalty,
+    cost,
+    shift,
+):
+    """Fill in what the matches of the queries from `begin` to `end` cost."""
+    bias = np.empty(3, np.float32)
+    for i in range(begin, end):
         y, x = queries[i, 0], queries[i, 1]
         s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
         cost[i] = _patch_cost(
             image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias
-        ) + _prior(expected[i] - log_depth[s, sy, sx], sy - y, sx - x, *penalties)
-        shift[i] = bias
+        ) + _prior(
+            expected[i] - log_depth[s, sy, sx],
+            sy - y,
+            sx - x,
+            diagonal,
+            depth_penalty,
+            distance_penalty,
+        )
+        for c in range(3):
+            shift[i, c] = bias[c]
 
-    for pass_number in range(rounds):
-        before = field.copy()
-        for i in prange(n):
-            bias = np.empty(3, np.float32)
-            y, x = queries[i, 0], queries[i, 1]
-            best = cost[i]
-            state = _hash(
-                np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15)
-                + np.uint64(pass_number * 1000003)
-                + np.uint64(y * 65537 + x)
-            )
-            reach = max_reach
-            for trial in range(24):
-                if trial < 8:
-                    # Neighbours one and four pixels away propose their own offset.
-                    step = 1 if trial < 4 else 4
-                    side = trial % 4
-                    ny = y + (step if side == 0 else (-step if side == 1 else 0))
-                    nx = x + (step if side == 2 else (-step if side == 3 else 0))
-                    if ny < 0 or ny >= h or nx < 0 or nx >= w or query_at[ny, nx] < 0:
-                        continue
-                    j = query_at[ny, nx]
-                    s = before[j, 0]
-                    sy = before[j, 1] + y - ny
-                    sx = before[j, 2] + x - nx
-                else:
-                    # Random search around the best match so far, in shrinking windows.
-                    if reach < 1:
-                        break
-                    state = _hash(state + np.uint64(0x9E3779B97F4A7C15))
-                    s = field[i, 0]
-                    if trial % 3 == 0:
-                        s = np.int64((state >> np.uint64(48)) % np.uint64(num_sources))
-                    span = np.uint64(2 * reach + 1)
-                    sy = field[i, 1] + np.int64((state & np.uint64(0xFFFFFF)) % span) - reach
-                    sx = (
-                        field[i, 2]
-                        + np.int64(((state >> np.uint64(24)) & np.uint64(0xFFFFFF)) % span)
-                        - reach
-                    )
-                    reach = reach * 6 // 10
-                if sy < 0 or sy >= H or sx < 0 or sx >= W or not usable[s, sy, sx]:
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _improve(
+    begin,
+    end,
+    image,
+    weight,
+    queries,
+    query_at,
+    expected,
+    sources,
+    log_depth,
+    usable,
+    radius,
+    max_bias,
+    bias_penalty,
+    diagonal,
+    depth_penalty,
+    distance_penalty,
+    number,
+    max_reach,
+    seed,
+    before,
+    field,
+    cost,
+    shift,
+):
+    """Pass `number` over the queries from `begin` to `end`; `before` is the field of the one
+    before."""
+    num_sources, H, W = usable.shape
+    h, w = query_at.shape
+    penalties = (diagonal, depth_penalty, distance_penalty)
+    bias = np.empty(3, np.float32)
+    for i in range(begin, end):
+        y, x = queries[i, 0], queries[i, 1]
+        best = cost[i]
+        state = _hash(
+            np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15)
+            + np.uint64(number * 1000003)
+            + np.uint64(y * 65537 + x)
+        )
+        reach = max_reach
+        for trial in range(24):
+            if trial < 8:
+                # Neighbours one and four pixels away propose their own offset.
+                step = 1 if trial < 4 else 4
+                side = trial % 4
+                ny = y + (step if side == 0 else (-step if side == 1 else 0))
+                nx = x + (step if side == 2 else (-step if side == 3 else 0))
+                if ny < 0 or ny >= h or nx < 0 or nx >= w or query_at[ny, nx] < 0:
                     continue
-                if s == field[i, 0] and sy == field[i, 1] and sx == field[i, 2]:
-                    continue
-                prior = _prior(expected[i] - log_depth[s, sy, sx], sy - y, sx - x, *penalties)
-                if prior >= best:
-                    continue
-                proposed = prior + _patch_cost(
-                    image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias
+                j = query_at[ny, nx]
+                s = before[j, 0]
+                sy = before[j, 1] + y - ny
+                sx = before[j, 2] + x - nx
+            else:
+                # Random search around the best match so far, in shrinking windows.
+                if reach < 1:
+                    break
+                state = _hash(state + np.uint64(0x9E3779B97F4A7C15))
+                s = field[i, 0]
+                if trial % 3 == 0:
+                    s = np.int64((state >> np.uint64(48)) % np.uint64(num_sources))
+                span = np.uint64(2 * reach + 1)
+                sy = field[i, 1] + np.int64((state & np.uint64(0xFFFFFF)) % span) - reach
+                sx = (
+                    field[i, 2]
+                    + np.int64(((state >> np.uint64(24)) & np.uint64(0xFFFFFF)) % span)
+                    - reach
                 )
-                if proposed < best:
-                    best = proposed
-                    field[i, 0], field[i, 1], field[i, 2] = s, sy, sx
-                    cost[i] = proposed
-                    shift[i] = bias
-    return cost, shift
+                reach = reach * 6 // 10
+            if sy < 0 or sy >= H or sx < 0 or sx >= W or not usable[s, sy, sx]:
+                continue
+            if s == field[i, 0] and sy == field[i, 1] and sx == field[i, 2]:
+                continue
+            prior = _prior(expected[i] - log_depth[s, sy, sx], sy - y, sx - x, *penalties)
+            if prior >= best:
+                continue
+            proposed = prior + _patch_cost(
+                image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias
+            )
+            if proposed < best:
+                best = proposed
+                field[i, 0], field[i, 1], field[i, 2] = s, sy, sx
+                cost[i] = proposed
+                for c in range(3):
+                    shift[i, c] = bias[c]
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
-def vote(shape, pixels, query_at, vote_weight, sources, field, shift, radius):
+def vote(pixels, query_at, vote_weight, sources, field, shift, radius):
     """Weighted mean of what all patches over a pixel say about it, for `pixels` [p, 2].
 
     Returns:
         Colours [p, 3] and the sum of their weights [p].
     """
-    h, w = shape
-    colours = np.zeros((pixels.shape[0], 3), np.float32)
-    totals = np.zeros(pixels.shape[0], np.float32)
-    for p in prange(pixels.shape[0]):
+    colours = np.zeros((len(pixels), 3), np.float32)
+    totals = np.zeros(len(pixels), np.float32)
+    given = (pixels, query_at, vote_weight, sources, field, shift, radius)
+    share(_vote, len(pixels), *given, colours, totals)
+    return colours, totals
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _vote(
+    begin, end, pixels, query_at, vote_weight, sources, field, shift, radius, colours, totals
+):
+    """Fill in the pixels from `begin` to `end`."""
+    h, w = query_at.shape
+    for p in range(begin, end):
         y, x = pixels[p, 0], pixels[p, 1]
         total = r = g = b = np.float32(0)
         for dy in range(max(-radius, -y), min(radius, h - 1 - y) + 1):
@@ -198,4 +275,3 @@ def vote(shape, pixels, query_at, vote_weight, sources, field, shift, radius):
         if total > 0:
             colours[p, 0], colours[p, 1], colours[p, 2] = r / total, g / total, b / total
         totals[p] = total
-    return colours, totals

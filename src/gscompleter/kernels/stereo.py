@@ -8,7 +8,9 @@ ratio of the two z-depths.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from gscompleter.kernels.sharing import run, share
 
 UNSEEN = 255
 """Cost of a plane at which the pixel falls outside of the other image."""
@@ -71,7 +73,6 @@ def _box_sums(values, sums, column, rows, width, radius):
             column[x] -= values[y, x]
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
 def matching_costs(reference, source, transform, inverse_depths, bands, radius, noise, detail):
     """Dissimilarity of every reference pixel to the source at the planes of its tile.
 
@@ -91,13 +92,24 @@ def matching_costs(reference, source, transform, inverse_depths, bands, radius, 
     Returns:
         Costs in 0 .. 254, UNSEEN where a plane leaves the source, in the order of `bands`.
     """
+    costs = np.empty(bands.start[-1], np.uint8)
+    settings = (radius, noise, detail)
+    images = (reference, source, transform, inverse_depths)
+    share(_match_tiles, bands.low.size, *images, bands, *settings, costs)
+    return costs
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _match_tiles(
+    begin, end, reference, source, transform, inverse_depths, bands, radius, noise, detail, costs
+):
+    """Fill in the costs of the tiles from `begin` to `end`."""
     h, w = reference.shape[:2]
     H, W = source.shape[:2]
     columns = bands.low.shape[1]
-    costs = np.empty(bands.start[-1], np.uint8)
     area = np.float32((2 * radius + 1) ** 2)
     floor = np.float32(3) * area * noise * noise
-    for tile in prange(bands.low.size):
+    for tile in range(begin, end):
         top, left = tile // columns * TILE_ROWS, tile % columns * TILE_COLUMNS
         low = bands.low[tile // columns, tile % columns]
         count = bands.high[tile // columns, tile % columns] - low
@@ -210,42 +222,44 @@ def matching_costs(reference, source, transform, inverse_depths, bands, radius, 
                     if not seen[y + radius, x + radius]:
                         value = np.uint8(UNSEEN)
                     costs[first + (y * cols + x) * count + plane] = value
-    return costs
 
 
-@njit(cache=True, parallel=True)
-def best_mean(costs, share, unseen_cost):
-    """The mean of the best `share` of the sources' costs [n, cells], for each cell.
+def best_mean(costs, fraction, unseen_cost):
+    """The mean of the best `fraction` of the sources' costs [n, cells], for each cell.
 
     A surface that is hidden from some of the views costs there whatever hides it; the views that
     see it decide. Where no source sees the plane, it costs `unseen_cost`.
     """
-    n, cells = costs.shape
-    merged = np.empty(cells, np.uint8)
-    pieces = 64
-    for piece in prange(pieces):
-        ranked = np.empty(n, np.int32)
-        for k in range(cells * piece // pieces, cells * (piece + 1) // pieces):
-            seen = 0
-            for i in range(n):
-                value = np.int32(costs[i, k])
-                if value == UNSEEN:
-                    continue
-                at = seen
-                while at > 0 and ranked[at - 1] > value:
-                    ranked[at] = ranked[at - 1]
-                    at -= 1
-                ranked[at] = value
-                seen += 1
-            if seen == 0:
-                merged[k] = unseen_cost
-                continue
-            count = max(1, min(seen, np.int32(np.ceil(seen * share))))
-            total = 0
-            for i in range(count):
-                total += ranked[i]
-            merged[k] = np.uint8(total // count)
+    merged = np.empty(costs.shape[1], np.uint8)
+    share(_merge_cells, len(merged), costs, fraction, unseen_cost, merged)
     return merged
+
+
+@njit(cache=True, nogil=True)
+def _merge_cells(begin, end, costs, fraction, unseen_cost, merged):
+    """Fill in the means of the cells from `begin` to `end`."""
+    n = costs.shape[0]
+    ranked = np.empty(n, np.int32)
+    for k in range(begin, end):
+        seen = 0
+        for i in range(n):
+            value = np.int32(costs[i, k])
+            if value == UNSEEN:
+                continue
+            at = seen
+            while at > 0 and ranked[at - 1] > value:
+                ranked[at] = ranked[at - 1]
+                at -= 1
+            ranked[at] = value
+            seen += 1
+        if seen == 0:
+            merged[k] = unseen_cost
+            continue
+        count = max(1, min(seen, np.int32(np.ceil(seen * fraction))))
+        total = 0
+        for i in range(count):
+            total += ranked[i]
+        merged[k] = np.uint8(total // count)
 
 
 @njit(cache=True, fastmath={"contract"}, inline="always")
@@ -277,7 +291,7 @@ def _aligned(before, band_before, band, scratch):
     return scratch
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, total):
     """Four of the eight paths: along the row, and from the three neighbours of the row before."""
     h, w = large_y.shape[0] + 1, large_x.shape[1] + 1
@@ -324,7 +338,6 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
                 )
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
 def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
     """Costs aggregated along eight paths (Hirschmüller 2008).
 
@@ -340,17 +353,16 @@ def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
     Returns:
         The sum over the paths, as a mean per path, in the order of `bands`.
     """
-    cells = costs.shape[0]
     # Each half has its own sum, so that two threads can work and order does not matter.
-    total = np.zeros((2, cells), np.float32)
-    for half in prange(2):
-        _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, half == 0, total[half])
-    for k in prange(cells):
-        total[0, k] = (total[0, k] + total[1, k]) * np.float32(0.125)
-    return total[0]
+    totals = np.zeros((2, len(costs)), np.float32)
+    jumps = (large_x, large_y, large_d, large_u)
+    halves = [(costs, bands, *jumps, small, half == 0, totals[half]) for half in range(2)]
+    run(_sweep_half, halves)
+    totals[0] += totals[1]
+    totals[0] *= np.float32(0.125)
+    return totals[0]
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
 def winners(totals, bands, h, w):
     """The best plane of every pixel, to a fraction, and how much the second best costs more.
 
@@ -366,7 +378,15 @@ def winners(totals, bands, h, w):
     """
     index = np.empty((h, w), np.float32)
     margin = np.empty((h, w), np.float32)
-    for y in prange(h):
+    share(_choose, h, totals, bands, index, margin)
+    return index, margin
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _choose(begin, end, totals, bands, index, margin):
+    """Fill in the rows from `begin` to `end`."""
+    w = index.shape[1]
+    for y in range(begin, end):
         for x in range(w):
             row, column = y // TILE_ROWS, x // TILE_COLUMNS
             first = _first_cost(bands, y, x, w)
@@ -390,10 +410,8 @@ def winners(totals, bands, h, w):
                 if steeper > 0:
                     at += np.float32(0.5) * (before - after) / steeper
             index[y, x] = at
-    return index, margin
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
 def reproject(depth, other, b_from_a, a_from_b):
     """Carry every pixel to another view and back by the two views' inverse depths.
 
@@ -405,11 +423,18 @@ def reproject(depth, other, b_from_a, a_from_b):
         How far from itself each pixel comes back, in pixels, negative where it falls outside of
         the other image [h, w]; and its z-depth in the other view over the other's own [h, w].
     """
-    h, w = depth.shape
+    error = np.full(depth.shape, np.float32(-1), np.float32)
+    ratio = np.ones(depth.shape, np.float32)
+    share(_carry, len(depth), depth, other, b_from_a, a_from_b, error, ratio)
+    return error, ratio
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
+    """Fill in the rows from `begin` to `end`."""
+    w = depth.shape[1]
     H, W = other.shape
-    error = np.full((h, w), np.float32(-1), np.float32)
-    ratio = np.ones((h, w), np.float32)
-    for y in prange(h):
+    for y in range(begin, end):
         for x in range(w):
             px, py, own = np.float32(x + 0.5), np.float32(y + 0.5), depth[y, x]
             q2 = b_from_a[2, 0] * px + b_from_a[2, 1] * py + b_from_a[2, 2] + b_from_a[2, 3] * own
@@ -441,10 +466,8 @@ def reproject(depth, other, b_from_a, a_from_b):
             ry = ry / r2 - py
             error[y, x] = np.sqrt(rx * rx + ry * ry)
             ratio[y, x] = value / max(expected, np.float32(1e-12))
-    return error, ratio
 
 
-@njit(cache=True, parallel=True)
 def background(values, known):
     """For each unknown pixel the second lowest of the known values met first in eight directions.
 
@@ -453,9 +476,16 @@ def background(values, known):
     Returns:
         `values`, filled [h, w]; where fewer than two directions meet anything they stay.
     """
-    h, w = values.shape
     filled = values.copy()
-    for y in prange(h):
+    share(_fill, len(values), values, known, filled)
+    return filled
+
+
+@njit(cache=True, nogil=True)
+def _fill(begin, end, values, known, filled):
+    """Fill in the rows from `begin` to `end`."""
+    h, w = values.shape
+    for y in range(begin, end):
         for x in range(w):
             if known[y, x]:
                 continue
@@ -476,4 +506,3 @@ def background(values, known):
                         second = value
             if second < np.inf:
                 filled[y, x] = second
-    return filled

@@ -1,14 +1,14 @@
 """Total generalized variation of second order: surfaces that are plane wherever they can be."""
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 PRIMAL_STEP, SLOPE_STEP = np.float32(0.25), np.float32(0.2)
 DUAL_STEP, SLOPE_DUAL_STEP = np.float32(1 / 3), np.float32(0.5)
 """Steps of the four variables: inverse row sums of the operator, as in Pock and Chambolle 2011."""
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations):
     """Heights u and slopes v that minimise, by the first-order primal-dual algorithm,
 
@@ -30,7 +30,7 @@ def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations
     steps = np.zeros((2, h, w), np.float32)
     bends = np.zeros((4, h, w), np.float32)
     for _ in range(iterations):
-        for y in prange(h):
+        for y in range(h):
             for x in range(w):
                 b0, b1, b2, b3 = bends[0, y, x], bends[1, y, x], bends[2, y, x], bends[3, y, x]
                 if x < w - 1:
@@ -49,7 +49,7 @@ def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations
                 shorter = one / max(one, length / bend)
                 bends[0, y, x], bends[1, y, x] = b0 * shorter, b1 * shorter
                 bends[2, y, x], bends[3, y, x] = b2 * shorter, b3 * shorter
-        for y in prange(h):
+        for y in range(h):
             for x in range(w):
                 push = steps[0, y, x] + steps[1, y, x]
                 turn0 = bends[0, y, x] + bends[1, y, x]

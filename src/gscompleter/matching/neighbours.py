@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.kernels.sharing import side_by_side
 from gscompleter.matching.depth_range import inverse_depths
 from gscompleter.matching.features import Pixels, features_of, matches
 from gscompleter.matching.stereo_image import StereoImage
@@ -53,7 +54,7 @@ class Neighbours:
 
 def neighbours_among(images: Sequence[StereoImage], count: int = COUNT) -> Neighbours:
     """Up to `count` photographs to match each of `images` with."""
-    features = [features_of(image) for image in images]
+    features = side_by_side(features_of, images)
     found = {(i, j): matches(features[i], features[j]) for i, j in close_pairs(images)}
     worth = np.zeros((len(images), len(images)))
     for (i, j), pixels in found.items():

@@ -139,7 +139,7 @@ def solve(
     expected = level.expected.numpy()[near_hole]
 
     def voted() -> Float32[ndarray, "p 3"]:
-        return patchmatch.vote((h, w), hole, query_at, votes, images, matches, shift, RADIUS)[0]
+        return patchmatch.vote(hole, query_at, votes, images, matches, shift, RADIUS)[0]
 
     current = level.image.numpy().copy()
     if coarse_field is not None:

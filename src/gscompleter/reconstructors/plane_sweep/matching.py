@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import Bands
@@ -51,16 +51,26 @@ def inverse_depth_planes(
         H, W = source.size
         seen = (ratio > 1e-3) & (at >= 0).all(-1) & (at[..., 0] < W) & (at[..., 1] < H)
         steps = np.linalg.norm(np.diff(at, axis=0), axis=-1)
-        for k in range(256):
-            both = seen[k] & seen[k + 1]
-            if both.any():
-                motion[k] = max(motion[k], float(np.quantile(steps[k, both], 0.8)))
+        motion = np.maximum(motion, quantiles(steps, seen[1:] & seen[:-1], 0.8))
         overlap = np.maximum(overlap, seen.mean(axis=1))
     useful = np.flatnonzero(overlap >= 0.02)
     last = max(int(useful[-1]), 8) if len(useful) else 256
     wanted = float(motion[:last].sum()) / STEP
     planes = int(np.clip(np.ceil(wanted), MIN_PLANES, MAX_PLANES))
     return np.linspace(samples[0], samples[last], planes).astype(np.float32)
+
+
+def quantiles(
+    values: Float[np.ndarray, "r c"], counted: Bool[np.ndarray, "r c"], share: float
+) -> Float[np.ndarray, "r"]:
+    """Of each row, the quantile of the values that are counted; 0 where none is."""
+    ordered = np.sort(np.where(counted, values, np.inf), axis=1)
+    last = counted.sum(axis=1) - 1
+    at = share * last.clip(0)
+    below = np.floor(at).astype(int)
+    above = np.minimum(below + 1, last.clip(0))
+    low, high = (np.take_along_axis(ordered, i[:, None], 1)[:, 0] for i in (below, above))
+    return np.where(last >= 0, low + (at - below) * np.where(last >= 0, high - low, 0), 0)
 
 
 def matched_costs(

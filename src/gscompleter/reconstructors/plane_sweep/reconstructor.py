@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from gscompleter.kernels.sharing import side_by_side
 from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.matching.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance
@@ -102,7 +103,7 @@ class PlaneSweep:
     def layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
         """What stereo says of each view."""
         found = matched(rig, views, halves=len(views) > 2)
-        return list(map(surfaces_of, rig.images, found))
+        return side_by_side(surfaces_of, rig.images, found)
 
     def chosen(
         self,

@@ -1,0 +1,64 @@
+"""Kernels on several threads: each call works on a range of its elements, and writes only there.
+
+They are threads of our own and not those of numba: its OpenMP layer spins where cores are scarce
+and meddles with torch's, its other layer does not bear two callers at once, and a kernel that it
+makes parallel takes two to five times as long to compile.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from itertools import pairwise
+
+import numba
+
+PIECES_PER_THREAD = 4
+"""Pieces take unequally long; more of them than threads even that out."""
+
+
+def share(kernel, count, *arguments, threads=None):
+    """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time.
+
+    The result depends neither on the pieces nor on the threads, which are NUMBA_NUM_THREADS if left
+    out: as many as there are usable cores where that is not set.
+    """
+    threads = threads or numba.config.NUMBA_NUM_THREADS
+    pieces = ranges(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
+    run(kernel, [(*piece, *arguments) for piece in pieces], threads)
+
+
+def run(kernel, calls, threads=None):
+    """Call a kernel, which releases the interpreter lock, with each of `calls`."""
+    threads = threads or numba.config.NUMBA_NUM_THREADS
+    if threads == 1 or len(calls) == 1:
+        for arguments in calls:
+            kernel(*arguments)
+        return
+    pool = thread_pool(threads, os.getpid())
+    for future in [pool.submit(kernel, *arguments) for arguments in calls]:
+        future.result()
+
+
+def side_by_side(function, *arguments):
+    """What `function` makes of each of the arguments, like `map`, several at a time.
+
+    It may call kernels itself: the threads that it runs on are not those that share them.
+    """
+    threads = numba.config.NUMBA_NUM_THREADS
+    if threads == 1:
+        return list(map(function, *arguments))
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, *arguments))
+
+
+def ranges(count, pieces):
+    """range(count) cut into at most `pieces` contiguous pieces of about equal length."""
+    pieces = max(1, min(pieces, count))
+    bounds = [count * piece // pieces for piece in range(pieces + 1)]
+    return list(pairwise(bounds))
+
+
+@lru_cache(maxsize=8)
+def thread_pool(threads, process):
+    """Threads that wait for work. A forked process inherits none and asks for its own."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="gscompleter")
