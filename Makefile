@@ -39,7 +39,10 @@ evaluate: $(VENV)/installed-evaluation
 	$(BIN)/gscompleter evaluate $(CASES) --methods $(METHODS) --out $(RESULTS)
 
 # Ours beside what else a user has. Holes are filled on photographs that are held back: name a CASES.
+# What completions take comes first (docs/performance.md); without its scenes, name another PERFORMANCE.
+PERFORMANCE ?= benchmarks/performance.json
 bench: $(VENV)/installed-test
+	$(BIN)/gscompleter bench --cases $(PERFORMANCE) --out $(RESULTS)/bench --overwrite
 	for script in $(filter-out %/bench_inpaint.py,$(wildcard benchmarks/bench_*.py)); do \
 		$(BIN)/python $$script || exit 1; done
 	$(BIN)/python benchmarks/bench_inpaint.py $(CASES)

@@ -21,6 +21,7 @@ from gscompleter.commands.convert import ConvertOptions
 from gscompleter.commands.generator_options import generator_flags
 from gscompleter.commands.options import (
     FOUND,
+    BenchOptions,
     CleanOptions,
     CompleteOptions,
     ComputeOptions,
@@ -48,6 +49,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "evaluate": (EvaluateOptions, "gscompleter.commands.evaluate", "run_evaluation"),
     "tables": (TablesOptions, "gscompleter.commands.evaluate", "run_tables"),
     "index": (IndexOptions, "gscompleter.commands.evaluate", "run_index"),
+    "bench": (BenchOptions, "gscompleter.commands.bench", "run_bench"),
     "models": (ModelsOptions, "gscompleter.commands.models", "run_models"),
     "convert": (ConvertOptions, "gscompleter.commands.convert", "run_convert"),
     "poses": (PosesOptions, "gscompleter.commands.poses", "run_poses"),

@@ -227,6 +227,58 @@ class IndexOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BenchOptions(RunOptions):
+    """Measure what completions take on this machine, and how that grows.
+
+    Every completion is a process of its own, start-up included; methods are compared within one
+    process. All times are also told in yardsticks: the renderer, forward and backward, on 196,608
+    Gaussians at 256 x 256, just before and just after. Without a scene or cases it is the stereo
+    pair of `gscompleter demo` that is completed. The tables are printed.
+    """
+
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
+    """Posed photographs, as `complete` takes them; --context and --target name frames."""
+    context: tuple[Frame, ...] = ()
+    """Frames to start from."""
+    target: tuple[Frame, ...] = ()
+    """Frames to complete the scene for. Methods are compared on the first."""
+    resolution: tuple[int, int] = (256, 256)
+    """Height and width to work at, without --cases."""
+    near: float | None = None
+    """Smallest depth in the scene, in its own unit. Estimated if not given."""
+    far: float | None = None
+    """Largest depth in the scene, in its own unit. Estimated if not given."""
+    cases: Path | None = None
+    """A JSON file that names cases, and what they grow over, instead of a scene; as
+    benchmarks/performance.json does. Methods are compared on the first."""
+    only: tuple[str, ...] = ()
+    """Names of cases; all of the file if none is given."""
+    methods: tuple[str, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
+    """What to compare: full, which is ours, autograd, which is ours without a frozen context,
+    densify-100, densify-800, distill, reggs."""
+    growth: tuple[Literal["gaussians", "pixels", "views", "targets"], ...] = (
+        "gaussians",
+        "pixels",
+        "views",
+        "targets",
+    )
+    """Over what to let the first case grow."""
+    repeats: Annotated[int, Interval(ge=1, le=1000)] = 5
+    """How often everything is measured."""
+    baseline_repeats: Annotated[int, Interval(ge=1, le=1000)] = 1
+    """How often at most methods are that take minutes: all but full and autograd."""
+    quick: bool = False
+    """Only try it: the smallest case, once, kernels compiled or not, two iterations of the
+    baselines, no growth."""
+    json: bool = False
+    """Print everything that was measured as JSON, instead of the tables."""
+    out: Path | None = None
+    """Folder for bench.json, tables.md and growth.png."""
+    overwrite: bool = False
+    """Replace what an earlier run left in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ModelsOptions(Settings):
     """List the published weights: what they are, under which licence, and which are cached."""
 

@@ -65,14 +65,14 @@ def save_curves(path: Path, steps: Mapping[str, Sequence[Step]]) -> Path:
         for number, (method, found) in enumerate(steps.items()):
             known = [(s["frame"], v) for s in found if (v := of(s)) is not None]
             if known:
-                axes.plot(*zip(*known, strict=True), label=method, linewidth=1, **_style(number))
+                axes.plot(*zip(*known, strict=True), label=method, linewidth=1, **style_of(number))
         axes.set_ylabel(title)
         axes.grid(alpha=0.3)
     if any(step["seconds"]["total"] > 0 for found in steps.values() for step in found):
         panels[-1].set_yscale("log")
     panels[-1].set_xlabel("frame")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
-    return _write(figure, path)
+    return write_figure(figure, path)
 
 
 def save_plot(
@@ -85,10 +85,11 @@ def save_plot(
     figure = new_figure(height)
     draw(figure.add_subplot(), summary)
     figure.legend(loc="outside right upper", fontsize="small")
-    return _write(figure, path)
+    return write_figure(figure, path)
 
 
-def _write(figure: Figure, path: Path) -> Path:
+def write_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure as a PNG; the same values give the same bytes."""
     with replacing(path) as file:
         figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
     return path
@@ -121,7 +122,7 @@ def draw_gain_by_hole(axes: Axes, summary: Summary) -> None:
             [gain_of(step) for step in steps],
             linestyle="none",
             label=method,
-            **_style(number),
+            **style_of(number),
         )
     _finish_gain(axes, "hole at the target (% of its pixels)")
 
@@ -134,7 +135,7 @@ def draw_gain_by_distance(axes: Axes, summary: Summary) -> None:
             for gap, cells in summary.gains.items()
             if (value := cells[method].value) is not None
         }
-        axes.plot(list(gains), list(gains.values()), linewidth=1, label=method, **_style(number))
+        axes.plot(list(gains), list(gains.values()), linewidth=1, label=method, **style_of(number))
     axes.set_xticks(list(summary.gains))
     _finish_gain(axes, "frames from the target to the nearest context frame")
 
@@ -156,7 +157,8 @@ def draw_seconds(axes: Axes, summary: Summary) -> None:
     axes.set_xlabel("median seconds per step")
 
 
-def _style(number: int) -> dict[str, Any]:
+def style_of(number: int) -> dict[str, Any]:
+    """How the curve of that number looks."""
     marker = MARKERS[number % len(MARKERS)]
     return {"color": f"C{number % 10}", "marker": marker, "markersize": 5, "alpha": 0.8}
 

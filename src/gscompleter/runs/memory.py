@@ -36,5 +36,15 @@ def peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
         Path("/proc/self/clear_refs").write_text("5")
         told = True
     yield peak
-    if told and (most := re.search(r"VmHWM:\s*([0-9]+) kB", Path("/proc/self/status").read_text())):
-        peak.bytes = 1024 * int(most[1])
+    if told:
+        peak.bytes = peak_of_process()
+
+
+def peak_of_process() -> int | None:
+    """The most resident memory that this process held; None where the system does not tell."""
+    try:
+        status = Path("/proc/self/status").read_text()
+    except OSError:
+        return None
+    most = re.search(r"VmHWM:\s*([0-9]+) kB", status)
+    return None if most is None else 1024 * int(most[1])

@@ -1,0 +1,52 @@
+"""A case completed by the command line, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from gscompleter.benchmark.crowding import crowded
+from gscompleter.benchmark.manifest import BenchCase
+from gscompleter.benchmark.processes import run_alone
+from gscompleter.benchmark.samples import Sample
+from gscompleter.benchmark.yardstick import Yardstick
+from gscompleter.data.formats import open_photographs
+from gscompleter.io.files import SUMMARY
+from gscompleter.io.ply import save_ply
+from gscompleter.runs.methods import Models
+
+PROCESS, REST = "process", "rest"
+"""All of a process, and what of it is none of the completion's own seconds: start-up, imports,
+reading, scoring, writing."""
+
+
+def completed(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
+    """One run of the command that `words` are, which writes `out`, beside the yardstick.
+
+    Raises:
+        InputError: where the command refuses its input.
+    """
+    ended, unit = yardstick.beside(lambda: run_alone(words))
+    summary = json.loads((out / SUMMARY).read_text())
+    stages = summary["seconds"]
+    seconds = {**stages, REST: ended.seconds - stages["total"], PROCESS: ended.seconds}
+    return Sample(seconds, unit, ended.peak_bytes, summary["gaussians"])
+
+
+def brought(case: BenchCase, folder: Path, models: Models, device: str) -> Path | None:
+    """The file of the scene that a case brings; None where its context is reconstructed.
+
+    It is made of the context of the case, once, and stays in `folder`.
+    """
+    if case.gaussians is None:
+        return None
+    alike = replace(case, name="", targets=(0,))
+    path = folder / f"{abs(hash(alike)):x}.ply"
+    if not path.exists():
+        photographs = open_photographs(case.scene, near=case.near, far=case.far)
+        views = [view.to(device) for view in photographs.views(case.context, case.resolution)]
+        context = models.completer().begin(views).context
+        save_ply(path, crowded(context, case.gaussians, models.seed))
+    return path

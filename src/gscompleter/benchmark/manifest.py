@@ -1,0 +1,172 @@
+"""What is measured: cases of a completion, and the series that grow from one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from gscompleter.data.formats import open_photographs
+from gscompleter.errors import InputError, quoted
+from gscompleter.io.json_file import read_json
+
+
+@dataclass(frozen=True)
+class BenchCase:
+    """One completion whose time is taken."""
+
+    name: str
+    scene: Path
+    """Folder of the scene."""
+    context: tuple[int, ...]
+    """Frames that are known."""
+    targets: tuple[int, ...]
+    """Frames that are completed, in this order."""
+    resolution: tuple[int, int]
+    """Height and width, in pixels."""
+    near: float | None = None
+    """Smallest depth, in scene units; estimated where it is None."""
+    far: float | None = None
+    """Largest depth, in scene units; estimated where it is None."""
+    gaussians: int | None = None
+    """How many the scene holds that is brought; None where the context is reconstructed."""
+
+    @property
+    def pixels(self) -> int:
+        return self.resolution[0] * self.resolution[1]
+
+
+AXES: dict[str, str] = {
+    "gaussians": "gaussians",
+    "pixels": "resolution",
+    "views": "context",
+    "targets": "targets",
+}
+"""What a series can grow over, and the field of a case that it changes."""
+
+GAUSSIANS = (250_000, 500_000, 1_000_000, 2_000_000)
+"""Of the scenes that are brought, where nobody says."""
+SIDES = (0.5, 0.5**0.5, 1.0, 2**0.5, 2.0)
+"""Of the images, as multiples of the case's, where nobody says."""
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """All that is measured."""
+
+    cases: tuple[BenchCase, ...]
+    """The first is the one that methods are compared on."""
+    growth: Mapping[str, tuple[BenchCase, ...]] = field(default_factory=dict)
+    """By axis, cases that differ in nothing but its field."""
+
+
+def size_over(axis: str, case: BenchCase) -> int:
+    """How large a case is along an axis."""
+    if axis == "pixels":
+        return case.pixels
+    value = getattr(case, AXES[axis])
+    return value if isinstance(value, int) else len(value)
+
+
+def grown_from(case: BenchCase) -> dict[str, tuple[BenchCase, ...]]:
+    """The series of a case where nobody names any, with the first of its targets, and over views
+    and targets with twice as many of its own each time."""
+    height, width = case.resolution
+    sides = [(round(s * height), round(s * width)) for s in SIDES]
+    values: dict[str, Sequence[Any]] = {
+        "gaussians": GAUSSIANS,
+        "pixels": sides,
+        "views": prefixes(case.context, 2),
+        "targets": prefixes(case.targets, 1),
+    }
+    base = replace(case, targets=case.targets[:1])
+    return {axis: series(base, axis, found) for axis, found in values.items() if len(found) > 1}
+
+
+def prefixes(frames: tuple[int, ...], fewest: int) -> list[tuple[int, ...]]:
+    """The first `fewest` of `frames`, the first twice as many, and so on."""
+    counts = [fewest * 2**n for n in range(len(frames).bit_length())]
+    return [frames[:count] for count in counts if count <= len(frames)]
+
+
+def series(case: BenchCase, axis: str, values: Sequence[Any]) -> tuple[BenchCase, ...]:
+    """`case` with each of `values` along an axis, named by its size there."""
+    cases = [replace(case, **{AXES[axis]: value}) for value in values]
+    return tuple(replace(c, name=f"{case.name}, {size_over(axis, c):,} {axis}") for c in cases)
+
+
+def read_manifest(path: Path) -> Manifest:
+    """The manifest in a JSON file, which names scenes by paths from its own folder.
+
+    Raises:
+        InputError: where the file is missing or is no manifest.
+    """
+    content = read_json(path, "name a file of cases to measure")
+    try:
+        cases = tuple(_case(row, path.parent) for row in content["cases"])
+        by_name = {case.name: case for case in cases}
+        if not cases or len(by_name) < len(cases):
+            raise ValueError("cases need names, each another")
+        return Manifest(cases, _growth(content.get("growth"), by_name))
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise InputError(
+            f"{quoted(path)} names no cases to measure ({type(error).__name__}: "
+            f"{quoted(str(error))}); it needs cases, each with name, scene, context, targets and "
+            "resolution.",
+            "cases",
+        ) from error
+
+
+def check_frames(cases: Sequence[BenchCase]) -> None:
+    """Open the scene of each case, and look for its frames, before anything is measured.
+
+    Raises:
+        InputError: where a scene cannot be opened or has no such frame.
+    """
+    for case in cases:
+        photographs = open_photographs(case.scene, near=case.near, far=case.far)
+        for frame in (*case.context, *case.targets):
+            photographs.camera(frame, case.resolution)
+
+
+def _growth(content: Any, cases: Mapping[str, BenchCase]) -> dict[str, tuple[BenchCase, ...]]:
+    if content is None:
+        return {}
+    base = cases[content["case"]]
+    read = {"gaussians": _whole, "pixels": _size, "views": _frames, "targets": _frames}
+    return {
+        axis: series(base, axis, [of(value) for value in content[axis]])
+        for axis, of in read.items()
+        if axis in content
+    }
+
+
+def _case(row: Any, folder: Path) -> BenchCase:
+    return BenchCase(
+        str(row["name"]),
+        folder / row["scene"],
+        _frames(row["context"]),
+        _frames(row["targets"]),
+        _size(row["resolution"]),
+        None if row.get("near") is None else float(row["near"]),
+        None if row.get("far") is None else float(row["far"]),
+        None if row.get("gaussians") is None else _whole(row["gaussians"]),
+    )
+
+
+def _frames(value: Any) -> tuple[int, ...]:
+    if not value:
+        raise ValueError("no frames")
+    return tuple(map(_whole, value))
+
+
+def _size(value: Any) -> tuple[int, int]:
+    height, width = map(_whole, value)
+    return height, width
+
+
+def _whole(value: Any) -> int:
+    if type(value) is not int or value < 0:
+        raise TypeError(f"{quoted(value)} is no whole number")
+    return value

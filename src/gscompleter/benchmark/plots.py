@@ -1,0 +1,47 @@
+"""Growth as curves, both axes logarithmic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gscompleter.benchmark.completions import PROCESS, REST
+from gscompleter.benchmark.growth import Growth
+from gscompleter.completer import STAGES
+from gscompleter.reports.plots import new_figure, style_of, write_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+CURVES = (*STAGES, REST, PROCESS)
+
+
+def plot_growth(path: Path, growth: Sequence[Growth]) -> Path:
+    """A PNG with a panel for each series, one above the other.
+
+    Raises:
+        PlotsNotAvailable: where matplotlib is missing.
+        InputError: where the file cannot be written.
+    """
+    figure = new_figure(3.2 * len(growth))
+    panels = figure.subplots(len(growth), squeeze=False)[:, 0]
+    for axes, series in zip(panels, growth, strict=True):
+        draw(axes, series)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
+    return write_figure(figure, path)
+
+
+def draw(axes: Axes, series: Growth) -> None:
+    """Median seconds of each stage against the size, the exponent of the process in the label."""
+    for number, stage in enumerate(CURVES):
+        if stage in series.points[0].stages:
+            axes.plot(
+                series.sizes, series.medians(stage), label=stage, linewidth=1, **style_of(number)
+            )
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    found = series.slopes[PROCESS]
+    axes.set_xlabel(series.axis if found is None else f"{series.axis} (process: {found:.2f})")
+    axes.set_ylabel("seconds")
+    axes.grid(alpha=0.3)

@@ -1,0 +1,297 @@
+"""The command `bench`: what completions take on this machine, and how that grows."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rich.console import Console
+
+from gscompleter.benchmark.comparison import OWN, check_compared, compared, start_of
+from gscompleter.benchmark.completions import PROCESS, brought, completed
+from gscompleter.benchmark.growth import Growth
+from gscompleter.benchmark.machine import machine
+from gscompleter.benchmark.manifest import (
+    BenchCase,
+    Manifest,
+    check_frames,
+    grown_from,
+    read_manifest,
+    size_over,
+)
+from gscompleter.benchmark.plots import plot_growth
+from gscompleter.benchmark.report import Report, content, report_markdown
+from gscompleter.benchmark.rounds import Task, in_rounds
+from gscompleter.benchmark.samples import Measured, Sample
+from gscompleter.benchmark.yardstick import Yardstick
+from gscompleter.commands.demo import (
+    BASELINE_M,
+    motorcycle_cameras,
+    moved,
+    write_motorcycle_scene,
+)
+from gscompleter.commands.options import BenchOptions
+from gscompleter.data.scene import write_cameras
+from gscompleter.errors import InputError, quoted
+from gscompleter.generators import load_generator
+from gscompleter.io.files import check_output, output_folder
+from gscompleter.progress import shown_on
+from gscompleter.reconstructors import load_reconstructor
+from gscompleter.render import choose_device, load_renderer
+from gscompleter.reports.plots import PlotsNotAvailable
+from gscompleter.runs.methods import Models
+
+BEYOND = (1.0, 1.25, 1.5, 1.75)
+"""How far the targets of the demo's pair lie beyond its two cameras, in baselines."""
+QUICK_ITERATIONS = 2
+"""Of the baselines, where the bench is only to be tried."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What all measurements share."""
+
+    options: BenchOptions
+    device: str
+    models: Models
+    yardstick: Yardstick
+    folder: Path
+    """Where processes write, and scenes lie that they are given."""
+
+    def complete(self, case: BenchCase) -> Sample:
+        """A case in a process of its own."""
+        out = self.folder / "completion"
+        scene = brought(case, self.folder, self.models, self.device)
+        return completed(self.words(case, scene, out), out, self.yardstick)
+
+    def words(self, case: BenchCase, scene: Path | None, out: Path) -> list[str]:
+        """What the command line is told to complete a case."""
+        planes = {"--near": case.near, "--far": case.far, "--scene": scene}
+        given = [(flag, value) for flag, value in planes.items() if value is not None]
+        return [
+            *("complete", str(case.scene), "--out", str(out), "--overwrite", "--quiet"),
+            *("--context", *map(str, case.context), "--target", *map(str, case.targets)),
+            *("--resolution", *map(str, case.resolution)),
+            *("--device", self.device, "--seed", str(self.options.seed)),
+            *(str(word) for pair in given for word in pair),
+        ]
+
+
+def run_bench(options: BenchOptions) -> None:
+    """Measure what the options name, and print or write the tables.
+
+    Raises:
+        InputError: where a scene, a case or a method is not there, before anything is measured.
+    """
+    check_asked(options)
+    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
+        manifest = chosen(manifest_of(options, Path(temporary)), options)
+        bench = prepared(options, Path(temporary))
+        with shown_on(None if options.quiet else console):
+            report = measured(bench, manifest, told_on(console))
+    if options.out is not None:
+        write(report, options.out, options.overwrite, console)
+    print(json.dumps(content(report), indent=1) if options.json else report_markdown(report))
+
+
+def check_asked(options: BenchOptions) -> None:
+    """Refuse what cannot be measured, or could not be written.
+
+    Raises:
+        InputError: with the reason.
+    """
+    check_compared(options.methods)
+    if options.folder is not None and options.cases is not None:
+        raise InputError("A scene and a file of cases are both named; name one.", "cases")
+    if options.out is not None:
+        check_output(options.out, options.overwrite)
+
+
+def told_on(console: Console) -> Callable[[str], None]:
+    """What writes a line there, whatever brackets are in it."""
+    return lambda line: console.print(line, markup=False, soft_wrap=True)
+
+
+def manifest_of(options: BenchOptions, folder: Path) -> Manifest:
+    """What is measured: the cases of a file, a scene that is named, or the demo's pair."""
+    if options.cases is not None:
+        return read_manifest(options.cases)
+    if options.folder is not None:
+        case = scene_case(options, options.folder)
+        return Manifest((case,), grown_from(case))
+    case = demo_case(options, folder / "motorcycle")
+    return Manifest((replace(case, targets=case.targets[:1]),), grown_from(case))
+
+
+def scene_case(options: BenchOptions, scene: Path) -> BenchCase:
+    """The case of a scene that is named.
+
+    Raises:
+        InputError: where the frames to start from or the targets are not named.
+    """
+    if not options.context or not options.target:
+        raise InputError(
+            "The bench needs to be told the frames to start from and those to complete the scene "
+            "for, as in --context 0 4 --target 8.",
+        )
+    name = scene.resolve().name
+    planes = options.near, options.far
+    return BenchCase(name, scene, options.context, options.target, options.resolution, *planes)
+
+
+def demo_case(options: BenchOptions, folder: Path) -> BenchCase:
+    """The demo's pair in `folder`, with targets beyond its cameras that have no photograph."""
+    write_motorcycle_scene(folder)
+    left, right = motorcycle_cameras(741, 500)
+    beyond = [
+        moved(camera, side * step * BASELINE_M)
+        for step in BEYOND
+        for camera, side in ((left, -1), (right, 1))
+    ]
+    names = ["images/left.png", "images/right.png"]
+    names += [f"images/unseen_{number}.png" for number in range(len(beyond))]
+    write_cameras(folder / "transforms.json", [left, right, *beyond], names)
+    targets = tuple(range(2, 2 + len(beyond)))
+    return BenchCase("motorcycle", folder, (0, 1), targets, options.resolution)
+
+
+def chosen(manifest: Manifest, options: BenchOptions) -> Manifest:
+    """What of a manifest the options ask for, once its frames are seen to be there.
+
+    Raises:
+        InputError: where a case is named that it does not have, or one cannot be opened.
+    """
+    cases = [case for case in manifest.cases if not options.only or case.name in options.only]
+    unknown = set(options.only) - {case.name for case in cases}
+    if unknown:
+        known = ", ".join(case.name for case in manifest.cases)
+        raise InputError(
+            f"There is no case '{quoted(min(unknown))}' to measure; choose of {known}.", "only"
+        )
+    axes: set[str] = set() if options.quick else {*options.growth}
+    growth = {axis: found for axis, found in manifest.growth.items() if axis in axes}
+    if options.quick:
+        cases = [min(cases, key=lambda case: (case.gaussians or 0, case.pixels))]
+    check_frames([*cases, *(case for found in growth.values() for case in found)])
+    return Manifest(tuple(cases), growth)
+
+
+def prepared(options: BenchOptions, folder: Path) -> Bench:
+    """Models and the yardstick, compiled."""
+    device = choose_device(options.device)
+    renderer = load_renderer(device)
+    models = Models(
+        load_reconstructor("plane-sweep", None, device),
+        load_generator("warp-inpaint", options.seed, device=device),
+        renderer,
+        options.seed,
+        QUICK_ITERATIONS if options.quick else None,
+    )
+    return Bench(options, device, models, Yardstick.on(renderer, device), folder)
+
+
+def measured(bench: Bench, manifest: Manifest, tell: Callable[[str], None]) -> Report:
+    """All of a manifest, in rounds. What compiles has run once before, uncounted."""
+    growing = [case for found in manifest.growth.values() for case in found]
+    names = names_of([*manifest.cases, *growing])
+    if not bench.options.quick:
+        tell(f"{manifest.cases[0].name}: once, uncounted")
+        bench.complete(manifest.cases[0])
+    methods = method_tasks(bench, manifest.cases[0])
+    found = in_rounds([*case_tasks(bench, names), *methods], tell)
+    growth = [
+        Growth(
+            axis,
+            tuple(size_over(axis, case) for case in cases),
+            tuple(replace(found[names[nameless(case)]], name=case.name) for case in cases),
+        )
+        for axis, cases in manifest.growth.items()
+    ]
+    return Report(
+        machine(bench.device),
+        settings_of(bench),
+        tuple(found[names[nameless(case)]] for case in manifest.cases),
+        tuple(method_named(found[task.name]) for task in methods),
+        tuple(growth),
+    )
+
+
+def names_of(cases: Sequence[BenchCase]) -> dict[BenchCase, str]:
+    """By all but its name, what each case is called first: none is measured twice."""
+    names: dict[BenchCase, str] = {}
+    for case in cases:
+        names.setdefault(nameless(case), case.name)
+    return names
+
+
+def nameless(case: BenchCase) -> BenchCase:
+    """What a case is, whatever it is called."""
+    return replace(case, name="")
+
+
+def case_tasks(bench: Bench, names: dict[BenchCase, str]) -> list[Task]:
+    """Each of the cases, completed by the command line."""
+    repeats = repeats_of(bench.options)
+
+    def task(case: BenchCase, name: str) -> Task:
+        return Task(name, lambda: bench.complete(case), PROCESS, repeats)
+
+    return [task(case, name) for case, name in names.items()]
+
+
+METHOD = "method "
+"""Tells the tasks of methods from those of cases."""
+
+
+def method_tasks(bench: Bench, case: BenchCase) -> list[Task]:
+    """Each of the methods at the first target of `case`. What they share has run once before,
+    uncounted."""
+    if not bench.options.methods:
+        return []
+    start = start_of(case, bench.models, bench.device)
+    if not bench.options.quick:
+        compared("full", start, bench.yardstick)
+
+    def task(name: str) -> Task:
+        repeats = repeats_of(bench.options)
+        if name not in ("full", "autograd"):
+            repeats = min(repeats, bench.options.baseline_repeats)
+        return Task(METHOD + name, lambda: compared(name, start, bench.yardstick), OWN, repeats)
+
+    return [task(name) for name in dict.fromkeys(bench.options.methods)]
+
+
+def method_named(found: Measured) -> Measured:
+    """What was measured of a method, by its own name."""
+    return replace(found, name=found.name.removeprefix(METHOD))
+
+
+def repeats_of(options: BenchOptions) -> int:
+    return 1 if options.quick else options.repeats
+
+
+def settings_of(bench: Bench) -> dict[str, int | None]:
+    """What decides the numbers besides the machine."""
+    options = bench.options
+    return {
+        "seed": options.seed,
+        "repeats": repeats_of(options),
+        "baseline_repeats": min(repeats_of(options), options.baseline_repeats),
+        "baseline_iterations": bench.models.baseline_iterations,
+    }
+
+
+def write(report: Report, out: Path, overwrite: bool, console: Console) -> None:
+    """bench.json, tables.md and, where anything grew, growth.png."""
+    with output_folder(out, overwrite) as folder:
+        (folder / "bench.json").write_text(json.dumps(content(report), indent=1) + "\n")
+        (folder / "tables.md").write_text(report_markdown(report))
+        if report.growth:
+            try:
+                plot_growth(folder / "growth.png", report.growth)
+            except PlotsNotAvailable as missing:
+                console.print(str(missing), markup=False)

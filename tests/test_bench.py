@@ -1,0 +1,273 @@
+"""`gscompleter bench`: what it measures and how it tells it; never how long anything takes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from command import run
+from gscompleter.benchmark.completions import PROCESS, REST
+from gscompleter.benchmark.crowding import crowded
+from gscompleter.benchmark.growth import Growth, slope
+from gscompleter.benchmark.manifest import BenchCase, grown_from, read_manifest
+from gscompleter.benchmark.plots import plot_growth
+from gscompleter.benchmark.processes import run_alone
+from gscompleter.benchmark.report import Report, content, report_markdown, times
+from gscompleter.benchmark.rounds import Task, in_rounds
+from gscompleter.benchmark.samples import Measured, Sample, Spread
+from gscompleter.benchmark.unfrozen import Unfrozen
+from gscompleter.benchmark.yardstick import Yardstick
+from gscompleter.commands.bench import names_of
+from gscompleter.completer import GSCompleter
+from gscompleter.config import CompleterConfig
+from gscompleter.errors import InputError
+from gscompleter.render import load_renderer
+from gscompleter.types import merge
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
+
+SIZE = 64
+CAMERAS = (camera_at(-0.2, size=SIZE), camera_at(0.2, size=SIZE), camera_at(0.5, size=SIZE))
+PERFORMANCE = Path(__file__).resolve().parents[1] / "benchmarks" / "performance.json"
+CASE = BenchCase("room", Path("room"), (0, 1, 2, 3), (4, 5), (64, 96))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return photographed(tmp_path_factory.mktemp("bench") / "room", CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def quick(scene, tmp_path_factory):
+    """A quick run on a room: what it writes."""
+    out = tmp_path_factory.mktemp("bench") / "out"
+    given = ("--context", 0, 1, "--target", 2, "--resolution", SIZE, SIZE, "--near", 0.5)
+    methods = ("--methods", "full", "autograd", "densify-100")
+    with pytest.MonkeyPatch.context() as patch:
+        assert run(patch, "bench", scene, *given, "--far", 20, *methods, "--quick", "--quiet",
+                   "--out", out) == 0  # fmt: skip
+    return out
+
+
+def sample(seconds: float, yardstick: float = 0.5) -> Sample:
+    return Sample({"lift": seconds / 4, PROCESS: seconds}, yardstick, 2**30, {"context": 1})
+
+
+def test_a_quick_run_tells_every_stage_of_its_case_and_its_methods(quick):
+    told = json.loads((quick / "bench.json").read_text())
+    (case,) = told["cases"]
+    assert {"context", "generate", "lift", "register", "integrate", "total"} < set(case["seconds"])
+    assert case["gaussians"]["context"] == 2 * SIZE * SIZE
+    assert [method["name"] for method in told["methods"]] == [
+        "full",
+        "autograd",
+        "densify-100",
+    ]
+    assert told["growth"] == []
+    assert told["machine"]["cores"] >= 1
+    assert told["settings"]["baseline_iterations"] == 2
+
+
+def test_every_ratio_is_seconds_in_yardsticks(quick):
+    told = json.loads((quick / "bench.json").read_text())
+    for measured in (*told["cases"], *told["methods"]):
+        for one in measured["samples"]:
+            for stage, seconds in one["seconds"].items():
+                assert one["ratios"][stage] == pytest.approx(seconds / one["yardstick"])
+
+
+def test_the_rest_of_a_process_is_what_its_completion_does_not_count(quick):
+    (case,) = json.loads((quick / "bench.json").read_text())["cases"]
+    seconds = case["samples"][0]["seconds"]
+    assert seconds["total"] + seconds[REST] == pytest.approx(seconds[PROCESS])
+    assert seconds[REST] > 0
+
+
+def test_the_tables_have_a_row_for_each_case_and_method(quick):
+    text = (quick / "tables.md").read_text()
+    assert text.count("| room |") == 2
+    assert all(f"| {name} |" in text for name in ("full", "autograd", "densify-100"))
+    assert not (quick / "growth.png").exists()
+
+
+def test_nothing_frozen_descends_as_what_is_frozen_does():
+    views = [view_of(Room(), camera) for camera in CAMERAS[:2]]
+    scene = merge([gaussians_of(view) for view in views])
+    renderer = load_renderer("cpu")
+
+    def losses(renderer, config):
+        completer = GSCompleter(renderer=renderer, config=config)
+        (target,) = completer(views, CAMERAS[2], scene).targets
+        assert len(target.added) > 0
+        return torch.tensor([*target.losses["register"], *target.losses["refine"]])
+
+    for config in (CompleterConfig(), CompleterConfig.paper()):
+        frozen, plain = losses(renderer, config), losses(Unfrozen(renderer), config)
+        assert (frozen - plain).abs().max() < 1e-4 * frozen.abs().max()
+
+
+def test_a_crowd_of_copies_looks_like_the_scene():
+    view = view_of(Room(), CAMERAS[0])
+    scene, renderer = gaussians_of(view), load_renderer("cpu")
+    crowd = crowded(scene, 10 * len(scene) + 7)
+    assert len(crowd) == 10 * len(scene) + 7
+    one, many = (renderer.render(g, view.camera) for g in (scene, crowd))
+    assert (one.image - many.image).square().mean() < 0.2 * one.image.var()
+    assert (one.alpha - many.alpha).abs().mean() < 0.02
+
+
+def test_a_crowd_is_the_same_for_the_same_seed_and_may_be_smaller():
+    scene = gaussians_of(view_of(Room(), CAMERAS[0]))
+    assert torch.equal(crowded(scene, 100, 3).means, crowded(scene, 100, 3).means)
+    assert not torch.equal(crowded(scene, 100, 3).means, crowded(scene, 100, 4).means)
+    few = crowded(scene, 100)
+    assert torch.allclose(few.opacities, torch.full((100,), 0.95), atol=1e-6)
+
+
+def test_the_yardstick_is_one_gaussian_per_pixel_of_three_cameras():
+    yardstick = Yardstick.on(load_renderer("cpu"), "cpu")
+    assert len(yardstick.gaussians) == 3 * 256 * 256
+    slopes = yardstick.draw()
+    assert all(slope.abs().max() > 0 for slope in slopes[:4])
+    found, unit = yardstick.beside(lambda: "found")
+    assert found == "found"
+    assert unit > 0
+
+
+def test_the_slope_of_a_power_is_its_exponent():
+    sizes = [10, 20, 40, 80]
+    assert slope(sizes, [0.3 * n**1.5 for n in sizes]) == pytest.approx(1.5)
+    assert slope(sizes, [2.0] * 4) == pytest.approx(0)
+    assert slope(sizes, [0.0, 0.0, 0.0, 1.0]) is None
+    assert slope([5, 5], [1.0, 2.0]) is None
+
+
+def test_a_sample_in_yardsticks_is_its_seconds_over_theirs():
+    measured = Measured("case", (sample(1.0, 0.5), sample(3.0, 0.5), sample(10.0, 2.0)))
+    assert measured.seconds[PROCESS] == Spread(3.0, 1.0, 10.0)
+    assert measured.ratios[PROCESS] == Spread(5.0, 2.0, 6.0)
+    assert measured.peak_bytes == 2**30
+
+
+def test_everything_has_its_turn_before_anything_has_two():
+    turns = []
+
+    def task(name, repeats):
+        return Task(name, lambda: turns.append(name) or sample(1.0), PROCESS, repeats)
+
+    lines = []
+    found = in_rounds([task("a", 3), task("b", 1)], lines.append)
+    assert turns == ["a", "b", "a", "a"]
+    assert [len(found[name].samples) for name in "ab"] == [3, 1]
+    assert lines[-1].startswith("4/4 a:")
+
+
+def test_methods_are_told_in_multiples_of_the_first():
+    def method(name, own):
+        return Measured(name, (Sample({"register": own, "own": own}, 0.5, None, {}),))
+
+    ours, theirs = method("full", 0.5), method("reggs", 150.0)
+    assert times(theirs, ours) == pytest.approx(300)
+    report = Report({}, {"repeats": 1}, (), (ours, theirs), ())
+    assert "| reggs | 150.00 | 150.00 | 300.0 | 300 | – |" in report_markdown(report)
+
+
+def test_a_case_that_several_series_share_is_measured_once():
+    growth = grown_from(CASE)
+    base = replace(CASE, targets=(4,))
+    assert [c.resolution for c in growth["pixels"]][2] == base.resolution
+    names = names_of([base, *(case for found in growth.values() for case in found)])
+    assert len(names) == 1 + 4 + 4 + 1 + 1  # each but Gaussians holds the base
+    assert [c.context for c in growth["views"]] == [(0, 1), (0, 1, 2, 3)]
+    assert [c.targets for c in growth["targets"]] == [(4,), (4, 5)]
+
+
+def test_growth_is_drawn_and_told_with_its_exponents(tmp_path):
+    points = tuple(Measured(f"{n}", (sample(0.1 * n, 0.5),)) for n in (1, 2, 4))
+    series = Growth("targets", (1, 2, 4), points)
+    report = Report({"cores": 2}, {"repeats": 1}, (), (), (series,))
+    assert content(report)["growth"][0]["slopes"][PROCESS] == pytest.approx(1)
+    assert "| exponent | 1.00 | 1.00 | 0.00 |" in report_markdown(report)
+    drawn = [plot_growth(tmp_path / f"{n}.png", [series]).read_bytes() for n in (1, 2)]
+    assert drawn[0] == drawn[1]
+    assert drawn[0].startswith(b"\x89PNG")
+
+
+def test_the_cases_of_the_documentation_can_be_read():
+    manifest = read_manifest(PERFORMANCE)
+    assert len(manifest.cases) == 6
+    assert manifest.cases[0].resolution == (256, 256)
+    assert len(manifest.cases[4].targets) == 8
+    assert manifest.cases[5].gaussians == 4_000_000
+    assert set(manifest.growth) == {"gaussians", "pixels", "views", "targets"}
+    assert len(manifest.growth["views"][-1].context) == 8
+
+
+def test_a_process_that_refuses_its_input_says_why(tmp_path):
+    with pytest.raises(InputError, match="nowhere"):
+        run_alone(["complete", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")])
+
+
+def test_a_process_tells_its_own_memory_and_not_its_parents():
+    ballast = torch.ones(2**28)  # 1 GiB
+    ended = run_alone(["models", "--json"])
+    assert ended.seconds > 0
+    assert ended.peak_bytes is None or 0 < ended.peak_bytes < ballast.numel() * 4
+
+
+ROW = {"name": "a", "scene": "room", "context": [0, 1], "targets": [2], "resolution": [64, 64]}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "no JSON",
+        "[]",
+        '{"cases": []}',
+        json.dumps({"cases": [ROW, ROW]}),
+        json.dumps({"cases": [{**ROW, "context": []}]}),
+        json.dumps({"cases": [{**ROW, "resolution": [64]}]}),
+        json.dumps({"cases": [{**ROW, "targets": [2.5]}]}),
+        json.dumps({"cases": [{**ROW, "near": "close"}]}),
+        json.dumps({"cases": [ROW], "growth": {"case": "b"}}),
+        json.dumps({"cases": [ROW], "growth": {"case": "a", "pixels": [64]}}),
+        json.dumps({"cases": [ROW]}),
+    ],
+)
+def test_a_file_that_names_no_cases_is_refused(tmp_path, monkeypatch, capsys, text):
+    path = tmp_path / "manifest.json"
+    path.write_text(text)
+    assert run(monkeypatch, "bench", "--cases", path) == 2
+    assert_a_sentence(capsys)
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (["--context", 0, 1], "frames to start from"),
+        (["--context", 0, 1, "--target", 9], "no frame 9"),
+        (["--context", 0, 1, "--target", 2, "--only", "other"], "no case 'other'"),
+        (["--context", 0, 1, "--target", 2, "--methods", "magic"], "no method 'magic'"),
+        (["--cases", "cases.json"], "both named"),
+        (["--repeats", 0], "repeats"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(scene, monkeypatch, capsys, more, sentence):
+    assert run(monkeypatch, "bench", scene, *more) == 2
+    assert sentence in assert_a_sentence(capsys)
+
+
+def test_results_are_not_replaced_unasked(quick, scene, monkeypatch, capsys):
+    given = ("--context", 0, 1, "--target", 2, "--out", quick)
+    assert run(monkeypatch, "bench", scene, *given) == 2
+    assert "not empty" in assert_a_sentence(capsys)
+
+
+def assert_a_sentence(capsys) -> str:
+    """What stderr holds, once it is seen to be one sentence and stdout empty."""
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("gscompleter: ")
+    assert told.err.count("\n") == 1
+    return told.err
