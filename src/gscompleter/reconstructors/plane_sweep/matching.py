@@ -65,12 +65,12 @@ def quantiles(
 ) -> Float[np.ndarray, "r"]:
     """Of each row, the quantile of the values that are counted; 0 where none is."""
     ordered = np.sort(np.where(counted, values, np.inf), axis=1)
-    last = counted.sum(axis=1) - 1
-    at = share * last.clip(0)
-    below = np.floor(at).astype(int)
-    above = np.minimum(below + 1, last.clip(0))
+    ordered[~counted.any(axis=1)] = 0
+    last = (counted.sum(axis=1) - 1).clip(0)
+    below = np.floor(share * last).astype(int)
+    above = np.minimum(below + 1, last)
     low, high = (np.take_along_axis(ordered, i[:, None], 1)[:, 0] for i in (below, above))
-    return np.where(last >= 0, low + (at - below) * np.where(last >= 0, high - low, 0), 0)
+    return low + (share * last - below) * (high - low)
 
 
 def matched_costs(
