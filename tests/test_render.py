@@ -8,6 +8,7 @@ import torch
 
 import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
+from gscompleter.kernels import rasterizer
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.cuda import CudaView
@@ -177,6 +178,65 @@ def test_what_is_frozen_alone_is_its_own_render():
     assert_same_drawing(frozen, alone)
 
 
+@pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
+def test_an_extended_view_is_the_frozen_view_of_both(renderer):
+    context, new = context_and_new()
+    last = random_gaussians(50, seed=6)
+    extended = renderer.freeze(context, CAMERA).extended(new)
+    frozen = renderer.freeze(merge([context, new]), CAMERA)
+    for ours, truth in (
+        (extended.context, frozen.context),
+        (extended.composite(last), frozen.composite(last)),
+        (extended.plan(last)(last.opacities), frozen.plan(last)(last.opacities)),
+        (extended.extended(last).context, frozen.extended(last).context),
+    ):
+        for name in ("image", "depth", "alpha"):
+            assert torch.equal(getattr(ours, name), getattr(truth, name)), name
+
+
+def test_a_frozen_view_keeps_no_splat_that_no_tile_draws():
+    wall = gaussians_of(view_of(Room(), camera_at(size=64)))
+    hidden = replace(wall, means=2 * wall.means, scales=2 * wall.scales)
+    opaque = merge([wall, wall, wall, hidden])
+    frozen = CPU.freeze(opaque, CAMERA)
+    assert len(frozen.layer.splats) < 0.8 * len(opaque)
+    assert set(frozen.layer.entries) == set(range(len(frozen.layer.splats)))
+    assert_same_drawing(frozen.context, CPU.render(opaque, CAMERA))
+
+
+def test_only_tiles_that_something_new_touches_are_drawn(monkeypatch):
+    """Of the nine tiles the new Gaussian lies within one, forward and backward."""
+    drawn = count_tiles(monkeypatch)
+    frozen = CpuRenderer(threads=1).freeze(SCENES["random"], CAMERA)
+    assert drawn.pop() == 9
+    new = replace(random_gaussians(1), means=torch.tensor([[0.0, 0.0, 1.0]]))
+    new = replace(new, scales=torch.full((1, 3), 0.02), opacities=torch.ones(1))
+    found = opacity_gradient(frozen.plan(new), new.opacities)[1]
+    assert drawn == [1, 1]
+    assert found.abs() > 0
+    assert frozen.extended(replace(new, means=-new.means)) is frozen
+    assert drawn == [1, 1]
+
+
+def count_tiles(monkeypatch) -> list[int]:
+    """How many tiles each call of the two kernels that draw will visit, as it happens.
+
+    It is one call a drawing where a single thread draws.
+    """
+    drawn: list[int] = []
+
+    def counting(kernel):
+        def counted(begin, end, *arguments):
+            drawn.append(end - begin)
+            return kernel(begin, end, *arguments)
+
+        return counted
+
+    for name in ("composite", "composite_backward"):
+        monkeypatch.setattr(rasterizer, name, counting(getattr(rasterizer, name)))
+    return drawn
+
+
 def opacity_gradient(function, opacities: torch.Tensor) -> tuple[Render, torch.Tensor]:
     variable = opacities.clone().requires_grad_()
     render = function(variable)
@@ -327,6 +387,8 @@ def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name
     view = cuda.freeze(context, CAMERA)
     assert 0 < len(view.seen) < len(context)
     check_frozen(view, REFERENCE.freeze(context, CAMERA), new, 1e-4)
+    more = random_gaussians(30, seed=6)
+    check_frozen(view.extended(new), REFERENCE.freeze(merge([context, new]), CAMERA), more, 1e-4)
     assert not cuda.render(new[:0], CAMERA).image.any()
     assert len(cuda.freeze(new[:0], CAMERA).seen) == 0
 

@@ -788,27 +788,49 @@ def fill_entries(
                     slot += 1
 
 
+@njit(cache=True)
+def _depth_at(splats, entries, place, begin, end, beyond):
+    """Depth of an entry, or `beyond` where the place lies outside of begin..end."""
+    if place < begin or place >= end:
+        return beyond
+    return splats[entries[place], DEPTH]
+
+
 @njit(cache=True, nogil=True)
-def truncated(layer, used, full):
-    """The lists of a layer as far as they were walked, and how far each tile can be seen.
+def merged_lists(context, new, used, full):
+    """The lists of two layers merged as far as they were walked, and how far each tile can be seen.
 
     What was not reached without anything in front of it is not reached with something in front.
-    Returns tile_start [tiles + 1] int64, entries [e] int32 and depth limits [tiles] float32.
+
+    context, new: Layer. used [tiles, 2] int32, full [tiles] bool: as `composite` left them.
+    Returns tile_start [tiles + 1] int64; entries [e] int32, in which the splats of `new` are
+    numbered after those of the context; and depth limits [tiles] float32.
     """
-    splats, _, _, old_start, old_entries = layer
-    tiles = len(used)
+    c_splats, _, _, c_start, c_entries = context
+    n_splats, _, _, n_start, n_entries = new
+    tiles, infinity = len(full), np.float32(np.inf)
     tile_start = np.empty(tiles + 1, np.int64)
     tile_start[0] = 0
     for tile in range(tiles):
-        tile_start[tile + 1] = tile_start[tile] + used[tile]
+        tile_start[tile + 1] = tile_start[tile] + used[tile, 0] + used[tile, 1]
     entries = np.empty(tile_start[tiles], np.int32)
-    depth_limits = np.full(tiles, np.inf, np.float32)
+    depth_limits = np.full(tiles, infinity, np.float32)
     for tile in range(tiles):
-        start, source = tile_start[tile], old_start[tile]
-        for k in range(used[tile]):
-            entries[start + k] = old_entries[source + k]
-        if full[tile] and used[tile] > 0:
-            depth_limits[tile] = splats[entries[start + used[tile] - 1], DEPTH]
+        c, n = c_start[tile], n_start[tile]
+        c_end, n_end = c + used[tile, 0], n + used[tile, 1]
+        depth = infinity
+        for place in range(tile_start[tile], tile_start[tile + 1]):
+            c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
+            n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
+            if c_depth <= n_depth:
+                entries[place] = c_entries[c]
+                c += 1
+            else:
+                entries[place] = len(c_splats) + n_entries[n]
+                n += 1
+            depth = min(c_depth, n_depth)
+        if full[tile]:
+            depth_limits[tile] = depth
     return tile_start, entries, depth_limits
 
 
@@ -845,17 +867,9 @@ def _placed(splats, opacities, boxes, i, left, top):
     )
 
 
-@njit(cache=True)
-def _depth_at(splats, entries, place, begin, end, beyond):
-    """Depth of an entry, or `beyond` where the place lies outside of begin..end."""
-    if place < begin or place >= end:
-        return beyond
-    return splats[entries[place], DEPTH]
-
-
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def composite(begin, end, context, new, frame):
-    """Draw the tiles begin..end of two layers merged by depth; of equals the context is in front.
+def composite(begin, end, tiles, context, new, frame):
+    """Draw tiles[begin:end] of two layers merged by depth; of equals the context is in front.
 
     context, new: Layer. frame: Frame, of which these tiles are written.
     """
@@ -869,7 +883,8 @@ def composite(begin, end, context, new, frame):
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
     infinity = np.float32(np.inf)
-    for tile in range(begin, end):
+    for index in range(begin, end):
+        tile = tiles[index]
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         rows, columns = min(TILE, height - top), min(TILE, width - left)
         state[:] = 0
@@ -918,9 +933,9 @@ def composite(begin, end, context, new, frame):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def composite_backward(
-    begin, end, context, new, frame, slopes, slots, opacity_only, gradients, written
+    begin, end, tiles, context, new, frame, slopes, slots, opacity_only, gradients, written
 ):
-    """Walk the tiles begin..end back to front and sum up the gradients of the new layer's entries.
+    """Walk tiles[begin:end] back to front and sum up the gradients of the new layer's entries.
 
     slopes: gradients of the frame's image [h, w, 3], depth [h, w] and alpha [h, w].
     slots [e] int32: slot of each entry of `new`.
@@ -938,7 +953,8 @@ def composite_backward(
     row_limit = np.empty(TILE, np.int32)
     sums = np.zeros(TILE, np.float32)
     nothing = np.float32(-np.inf)
-    for tile in range(begin, end):
+    for index in range(begin, end):
+        tile = tiles[index]
         n_begin = n_start[tile]
         n = n_begin + used[tile, 1]
         if n == n_begin:

@@ -34,6 +34,9 @@ class FrozenView(Protocol):
     def context(self) -> Render:
         """The context alone."""
 
+    def extended(self, new: Gaussians) -> FrozenView:
+        """The view of context and `new`, in that order, both frozen."""
+
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; differentiable in `new`."""
 

@@ -43,30 +43,52 @@ class CpuRenderer:
     where it is not set. The result does not depend on it."""
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
-        viewpoint = self._viewpoint(camera)
-        return CpuView(viewpoint, viewpoint.nothing(), viewpoint.unlimited()).composite(gaussians)
+        return self._empty(camera).composite(gaussians)
 
     def freeze(self, context: Gaussians, camera: Camera) -> CpuView:
-        return self._viewpoint(camera).freeze(context)
+        return self._empty(camera).extended(context)
 
-    def _viewpoint(self, camera: Camera) -> Viewpoint:
+    def _empty(self, camera: Camera) -> CpuView:
         threads = self.threads or numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-        return Viewpoint(pinhole_of(camera), threads)
+        return Viewpoint(pinhole_of(camera), threads).empty()
 
 
 @dataclass(frozen=True)
 class CpuView:
-    """The frozen context: projected, sorted, binned, and cut where nothing shows through it."""
+    """The frozen context: projected, sorted, binned, and cut where nothing shows through it.
+
+    Only splats that some tile draws are kept. With something new in it, only the tiles that this
+    touches are drawn; the others are those of the context's own frame.
+    """
 
     viewpoint: Viewpoint
     layer: Layer
+    frame: Frame
+    """The context alone."""
     depth_limits: Float32[ndarray, "tiles"]
     """z-depth behind which a tile shows nothing new."""
 
     @cached_property
     def context(self) -> Render:
         """The context alone."""
-        return render_of(self.viewpoint.composite(self.viewpoint.nothing(), self.layer))
+        return render_of(self.frame)
+
+    def extended(self, new: Gaussians) -> CpuView:
+        """The same as freezing context and `new` together, in that order."""
+        added = self.viewpoint.bin(arrays_of(new), self.depth_limits).layer
+        if len(added.entries) == 0:
+            return self
+        frame = self.viewpoint.composite(self, added)
+        tile_start, entries, depth_limits = rasterizer.merged_lists(
+            self.layer, added, frame.used, frame.full
+        )
+        splats, opacities, boxes = (
+            np.concatenate(pair) for pair in zip(self.layer[:3], added[:3], strict=True)
+        )
+        layer = compact(Layer(splats, opacities, boxes, tile_start, entries))
+        used = np.zeros_like(frame.used)
+        used[:, 0] = frame.used.sum(axis=1)
+        return CpuView(self.viewpoint, layer, frame._replace(used=used), depth_limits)
 
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; only `new` is projected, sorted and binned."""
@@ -114,27 +136,26 @@ class Viewpoint:
     def tiles(self) -> int:
         return self.tiles_x * -(-self.pinhole.height // TILE)
 
-    def nothing(self) -> Layer:
-        """A layer without splats."""
-        return Layer(
+    def empty(self) -> CpuView:
+        """The view of a context without Gaussians."""
+        height, width = self.pinhole.height, self.pinhole.width
+        frame = Frame(
+            image=np.zeros((height, width, 3), np.float32),
+            depth=np.zeros((height, width), np.float32),
+            alpha=np.zeros((height, width), np.float32),
+            transmittance=np.ones((height, width), np.float32),
+            last=np.full((height, width), -1, np.int32),
+            used=np.zeros((self.tiles, 2), np.int32),
+            full=np.zeros(self.tiles, np.bool_),
+        )
+        layer = Layer(
             np.empty((0, rasterizer.NUM_SPLAT_COLUMNS), np.float32),
             np.empty(0, np.float32),
             np.empty((0, 4), np.int32),
             np.zeros(self.tiles + 1, np.int64),
             np.empty(0, np.int32),
         )
-
-    def unlimited(self) -> Float32[ndarray, "tiles"]:
-        """Depth limits of tiles in which nothing hides what comes behind."""
-        return np.full(self.tiles, np.inf, np.float32)
-
-    def freeze(self, context: Gaussians) -> CpuView:
-        """The context's part of every picture that will be taken from here."""
-        layer = self.bin(arrays_of(context), self.unlimited()).layer
-        frame = self.composite(self.nothing(), layer)
-        used = np.ascontiguousarray(frame.used[:, 1])
-        tile_start, entries, depth_limits = rasterizer.truncated(layer, used, frame.full)
-        return CpuView(self, layer._replace(tile_start=tile_start, entries=entries), depth_limits)
+        return CpuView(self, layer, frame, np.full(self.tiles, np.inf, np.float32))
 
     def bin(self, gaussians: GaussianArrays, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
         """Project the Gaussians, sort them and enter them into the lists of the tiles."""
@@ -169,19 +190,11 @@ class Viewpoint:
         layer = Layer(splats, gaussians.opacities, boxes, tile_start, entries)
         return Binned(layer, slots, slot_start)
 
-    def composite(self, context: Layer, new: Layer) -> Frame:
-        """Draw two layers merged by depth."""
-        size = (self.pinhole.height, self.pinhole.width)
-        frame = Frame(
-            image=np.empty((*size, 3), np.float32),
-            depth=np.empty(size, np.float32),
-            alpha=np.empty(size, np.float32),
-            transmittance=np.empty(size, np.float32),
-            last=np.empty(size, np.int32),
-            used=np.empty((self.tiles, 2), np.int32),
-            full=np.empty(self.tiles, np.bool_),
-        )
-        self.share(rasterizer.composite, self.tiles, context, new, frame)
+    def composite(self, view: CpuView, new: Layer) -> Frame:
+        """Draw the context of `view` and a new layer merged by depth, where this has anything."""
+        frame = Frame(*(array.copy() for array in view.frame))
+        tiles = touched(new)
+        self.share(rasterizer.composite, len(tiles), tiles, view.layer, new, frame)
         return frame
 
     def composite_backward(
@@ -198,9 +211,10 @@ class Viewpoint:
         """
         values = np.empty((len(new.slots), columns), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
-        drawn = (context, new.layer, frame, tuple(map(float32, slopes)))
+        tiles = touched(new.layer)
+        drawn = (tiles, context, new.layer, frame, tuple(map(float32, slopes)))
         received = (new.slots, columns == 1, values, written)
-        self.share(rasterizer.composite_backward, self.tiles, *drawn, *received)
+        self.share(rasterizer.composite_backward, len(tiles), *drawn, *received)
         return values, written
 
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
@@ -216,7 +230,7 @@ class _Composite(torch.autograd.Function):
     def forward(ctx: Any, view: CpuView, *tensors: Tensor) -> tuple[Tensor, ...]:
         gaussians = GaussianArrays(*map(float32, tensors))
         binned = view.viewpoint.bin(gaussians, view.depth_limits)
-        frame = view.viewpoint.composite(view.layer, binned.layer)
+        frame = view.viewpoint.composite(view, binned.layer)
         render = render_of(frame)
         ctx.scene = (view, binned, frame)
         # Saving tensors makes torch notice if one of them is written to before the backward pass.
@@ -242,7 +256,7 @@ class _Planned(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, view: CpuView, binned: Binned, opacities: Tensor) -> tuple[Tensor, ...]:
         layer = binned.layer._replace(opacities=float32(opacities))
-        frame = view.viewpoint.composite(view.layer, layer)
+        frame = view.viewpoint.composite(view, layer)
         render = render_of(frame)
         ctx.scene = (view, replace(binned, layer=layer), frame)
         ctx.save_for_backward(opacities, render.depth, render.alpha)
@@ -281,6 +295,20 @@ def pinhole_of(camera: Camera) -> Pinhole:
         width=camera.width,
         height=camera.height,
     )
+
+
+def touched(layer: Layer) -> Int64[ndarray, "touched"]:
+    """The tiles in which a layer has anything to draw."""
+    return np.flatnonzero(np.diff(layer.tile_start))
+
+
+def compact(layer: Layer) -> Layer:
+    """The layer without the splats that no list names."""
+    named = np.zeros(len(layer.splats), np.bool_)
+    named[layer.entries] = True
+    numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
+    splats, opacities, boxes = (array[named] for array in layer[:3])
+    return Layer(splats, opacities, boxes, layer.tile_start, numbers[layer.entries])
 
 
 def length_of(gaussians: GaussianArrays) -> int:

@@ -152,6 +152,10 @@ class CudaView:
         colours = colours_from(kept.sh, kept.means, center)
         return replace(kept, sh=sh_from_rgb(colours), encoded=None)
 
+    def extended(self, new: Gaussians) -> CudaView:
+        """The view of what is seen of the context, and of `new`."""
+        return replace(self, scene=merge([self.seen, new]))
+
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together."""
         return self.drawing.render(merge([self.seen, new]), self.camera)

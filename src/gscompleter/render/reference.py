@@ -69,6 +69,9 @@ class ReferenceView:
     def context(self) -> Render:
         return self.renderer.render(self.scene, self.camera)
 
+    def extended(self, new: Gaussians) -> ReferenceView:
+        return replace(self, scene=merge([self.scene, new]))
+
     def composite(self, new: Gaussians) -> Render:
         return self.renderer.render(merge([self.scene, new]), self.camera)
 
