@@ -8,6 +8,7 @@ import torch
 
 import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
+from gscompleter.geometry import at_depths, z_depths
 from gscompleter.kernels import rasterizer
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
@@ -19,6 +20,7 @@ from scenes import Room, camera_at, gaussians_of, random_gaussians, scaled, view
 
 CAMERA = camera_at(size=48)
 CPU, REFERENCE = load_renderer("cpu"), load_renderer("reference")
+DRAWN = ("image", "depth", "alpha")
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 ROUNDING = 1e-5
 """Largest difference of drawings and of gradients, of the largest value. At most 5.1e-6 was
@@ -190,7 +192,7 @@ def test_an_extended_view_is_the_frozen_view_of_both(renderer):
         (extended.plan(last)(last.opacities), frozen.plan(last)(last.opacities)),
         (extended.extended(last).context, frozen.extended(last).context),
     ):
-        for name in ("image", "depth", "alpha"):
+        for name in DRAWN:
             assert torch.equal(getattr(ours, name), getattr(truth, name)), name
 
 
@@ -257,6 +259,39 @@ def test_a_plan_is_the_composite_with_other_opacities(renderer):
         )
         assert_same_drawing(planned, truth)
         assert_same_slopes({"opacities": slope}, {"opacities": expected})
+
+
+def test_a_plan_of_depths_is_the_composite_at_these_depths():
+    """Where it is asked for; elsewhere tiles may show the context alone."""
+    context, new = context_and_new()
+    frozen, left = CPU.freeze(context, CAMERA), torch.zeros(48, 48, dtype=torch.bool)
+    left[:, :16] = True
+    before = z_depths(new, CAMERA)
+    for ratio in (torch.ones(len(new)), torch.linspace(0.5, 2.0, len(new))):
+        depths = before * ratio
+        truth, expected = depth_gradient(
+            lambda values: frozen.composite(at_depths(new, CAMERA, values)), depths, left
+        )
+        for where in (left, torch.ones_like(left)):
+            planned, slope = depth_gradient(frozen.plan_depths(new, where), depths, left)
+            assert_same_drawing(*(masked(render, where) for render in (planned, truth)))
+            assert_close(slope, expected, "slope of depths")
+        beside = frozen.plan_depths(new, left)(depths)
+        assert torch.equal(beside.image[:, 16:], frozen.context.image[:, 16:])
+    before_the_lens = frozen.plan_depths(new, torch.ones_like(left))(1e-3 * before)
+    assert torch.equal(before_the_lens.image, frozen.context.image)
+
+
+def masked(render: Render, where: torch.Tensor) -> Render:
+    return Render(render.image * where[..., None], render.depth * where, render.alpha * where)
+
+
+def depth_gradient(function, depths: torch.Tensor, where: torch.Tensor):
+    variable = depths.clone().requires_grad_()
+    render = function(variable)
+    weight = torch.linspace(0, 1, render.depth.numel()).view_as(render.depth)
+    covered = where & (render.alpha > 0.05)
+    return render, torch.autograd.grad((render.depth * weight * covered).sum(), variable)[0]
 
 
 def test_composites_have_the_gradients_of_the_render_of_both():

@@ -33,7 +33,6 @@ from gscompleter.runs.steps import (
 )
 from gscompleter.runs.store import read_json
 from gscompleter.runs.tasks import Task, tasks_of
-from gscompleter.stages.registration import slide
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 

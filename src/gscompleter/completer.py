@@ -16,7 +16,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
-from gscompleter.geometry import project, same_camera, sample, widened
+from gscompleter.geometry import project, same_camera, sample, slide, widened
 from gscompleter.masks import dilate
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, load_renderer
@@ -42,7 +42,7 @@ from gscompleter.stages.integration import (
     squared_error,
 )
 from gscompleter.stages.reconciliation import reconcile
-from gscompleter.stages.registration import Registration, register, slide
+from gscompleter.stages.registration import Registration, register
 from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.stereo import Stereo, corrected, stereo_among
 from gscompleter.stages.support import (

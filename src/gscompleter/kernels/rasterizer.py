@@ -48,6 +48,10 @@ SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
 `q = alpha dL/dalpha`, and the next five those of q times s, t, s², s t and t²."""
 NUM_GRADIENT_COLUMNS = 10
 
+OF_ALL, OF_OPACITY, OF_DEPTH = range(3)
+"""Which gradients are wanted: all of them, or SUM or SUM_DEPTH alone, which is then the only
+column."""
+
 
 class Pinhole(NamedTuple):
     """A camera, as the kernels want it."""
@@ -323,7 +327,7 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
 def _undraw(wanted):
     """An intrinsic that takes a splat off a tile again, back to front.
 
-    `wanted` names what it sums up for the gradients: "nothing", "opacity" or "all".
+    `wanted` names what it sums up for the gradients: "nothing", "opacity", "depth" or "all".
     """
 
     @intrinsic
@@ -348,7 +352,7 @@ def _undraw(wanted):
             last = _Rows(context, builder, signature.args[4], last, _INTS, 1)
             limits = context.make_array(signature.args[5])(context, builder, row_limit).data
             positions = _broadcast(builder, position, _INTS)
-            count = {"nothing": 0, "opacity": 1, "all": 7}[wanted]
+            count = {"nothing": 0, "opacity": 1, "depth": 1, "all": 7}[wanted]
             totals = [
                 cgutils.alloca_once_value(builder, ir.Constant(_FLOATS, [0.0] * TILE))
                 for _ in range(count)
@@ -375,7 +379,7 @@ def _undraw(wanted):
 
                 q = (before * value - behind * opening) * alpha
                 q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
-                terms = [q]
+                terms = [weight * slopes[3]] if wanted == "depth" else [q]
                 if wanted == "all":
                     dys = _Lanes(builder, _broadcast(builder, dy))
                     terms += [q * dys, q * dys * dys]
@@ -403,6 +407,7 @@ def _undraw(wanted):
 
 _pass_rows = _undraw("nothing")
 _undraw_rows_for_opacity = _undraw("opacity")
+_undraw_rows_for_depth = _undraw("depth")
 _undraw_rows = _undraw("all")
 
 
@@ -933,13 +938,14 @@ def composite(begin, end, tiles, context, new, frame):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def composite_backward(
-    begin, end, tiles, context, new, frame, slopes, slots, opacity_only, gradients, written
+    begin, end, tiles, context, new, frame, slopes, slots, wanted, gradients, written
 ):
     """Walk tiles[begin:end] back to front and sum up the gradients of the new layer's entries.
 
     slopes: gradients of the frame's image [h, w, 3], depth [h, w] and alpha [h, w].
     slots [e] int32: slot of each entry of `new`.
-    gradients [slots, 10] float32, or [slots, 1] where `opacity_only`: columns SUM to SUM_RED + 2.
+    wanted: OF_ALL, OF_OPACITY or OF_DEPTH.
+    gradients [slots, 10] float32, columns SUM to SUM_RED + 2; [slots, 1] where less is wanted.
     written [slots] bool: set for the slots, and only those, that receive a gradient.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
@@ -996,9 +1002,13 @@ def composite_backward(
             n_depth = _depth_at(n_splats, n_entries, n - 1, n_begin, n, nothing)
             slot = slots[n]
             written[slot] = True
-            if opacity_only:
+            if wanted == OF_OPACITY:
                 _undraw_rows_for_opacity(first, stop, position, state, last, row_limit, sums, splat)
-                gradients[slot, SUM] = sums[0]
+                gradients[slot, 0] = sums[0]
+                continue
+            if wanted == OF_DEPTH:
+                _undraw_rows_for_depth(first, stop, position, state, last, row_limit, sums, splat)
+                gradients[slot, 0] = sums[0]
                 continue
             _undraw_rows(first, stop, position, state, last, row_limit, sums, splat)
             u, v, w = splat[2], splat[3], splat[4]
@@ -1017,19 +1027,19 @@ def composite_backward(
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def opacity_backward(begin, end, opacities, slot_start, gradients, written, d_opacities):
-    """Gradients of the opacities of the Gaussians begin..end.
+def sum_entries(begin, end, slot_start, gradients, written, totals):
+    """Sums of the gradients of the entries of each of the Gaussians begin..end.
 
-    gradients [slots, 1] float32: column SUM of their entries, where written [slots].
-    d_opacities [n] is written where a gradient arrives.
+    gradients [slots, 1] float32, where written [slots]: the slots from slot_start[i] to
+        slot_start[i + 1] belong to Gaussian i.
+    totals [n] float32 is written.
     """
     for i in range(begin, end):
         total = np.float32(0)
         for slot in range(slot_start[i], slot_start[i + 1]):
             if written[slot]:
-                total += gradients[slot, SUM]
-        if total != 0:
-            d_opacities[i] = total / opacities[i]
+                total += gradients[slot, 0]
+        totals[i] = total
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

@@ -17,11 +17,12 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import max_pool2d
 
 from gscompleter.errors import InputError
 from gscompleter.kernels import rasterizer
 from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
-from gscompleter.render import OpacityRender
+from gscompleter.render import DepthRender, OpacityRender
 from gscompleter.types import Camera, Gaussians, Render
 
 PIECES_PER_THREAD = 4
@@ -105,6 +106,35 @@ class CpuView:
 
         return render
 
+    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        """Project `new` once, as far as it touches a tile that is asked for."""
+        splats = self.viewpoint.project(arrays_of(new))
+        anywhere = np.where(self.viewpoint.tiles_of(where), np.inf, -np.inf).astype(np.float32)
+        sizes = np.diff(self.viewpoint.enter(splats, anywhere).slot_start)
+        splats = replace(splats, boxes=np.where(sizes[:, None] > 0, splats.boxes, np.int32(0)))
+        limits = np.minimum(anywhere, self.depth_limits)
+
+        def render(depths: Float[Tensor, "n"]) -> Render:
+            return Render(*_Slid.apply(self, splats, limits, depths.to("cpu", torch.float32)))
+
+        return render
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Projected Gaussians, see `Layer`."""
+
+    columns: Float32[ndarray, "n 9"]
+    opacities: Float32[ndarray, "n"]
+    boxes: Int32[ndarray, "n 4"]
+
+    def at_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
+        """The same at other z-depths; what comes nearer than `near` gets an empty box."""
+        columns = self.columns.copy()
+        columns[:, rasterizer.DEPTH] = depths
+        boxes = np.where(depths[:, None] > near, self.boxes, np.int32(0))
+        return replace(self, columns=columns, boxes=boxes)
+
 
 @dataclass(frozen=True)
 class Binned:
@@ -159,11 +189,20 @@ class Viewpoint:
 
     def bin(self, gaussians: GaussianArrays, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
         """Project the Gaussians, sort them and enter them into the lists of the tiles."""
+        return self.enter(self.project(gaussians), depth_limits)
+
+    def project(self, gaussians: GaussianArrays) -> Splats:
+        """The Gaussians as splats; those that cannot be seen get an empty box."""
         n = length_of(gaussians)
-        splats = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
+        columns = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
         boxes = np.empty((n, 4), np.int32)
-        self.share(rasterizer.project, n, gaussians, self.pinhole, splats, boxes)
-        order, depths = rasterizer.depth_order(splats, boxes)
+        self.share(rasterizer.project, n, gaussians, self.pinhole, columns, boxes)
+        return Splats(columns, gaussians.opacities, boxes)
+
+    def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
+        """Sort the splats and enter them into the lists of the tiles."""
+        n, boxes = len(splats.columns), splats.boxes
+        order, depths = rasterizer.depth_order(splats.columns, boxes)
 
         chunks = ranges(len(order), self.threads)
         rectangles = np.empty((len(order), 4), np.int16)
@@ -187,7 +226,7 @@ class Viewpoint:
             for chunk, places in zip(chunks, counts, strict=True)
         ]
         run(self.threads, rasterizer.fill_entries, filling)
-        layer = Layer(splats, gaussians.opacities, boxes, tile_start, entries)
+        layer = Layer(splats.columns, splats.opacities, boxes, tile_start, entries)
         return Binned(layer, slots, slot_start)
 
     def composite(self, view: CpuView, new: Layer) -> Frame:
@@ -203,19 +242,28 @@ class Viewpoint:
         new: Binned,
         frame: Frame,
         slopes: tuple[Tensor, ...],
-        columns: int = rasterizer.NUM_GRADIENT_COLUMNS,
+        wanted: int = rasterizer.OF_ALL,
     ) -> EntryGradients:
-        """Gradients of the entries of the new layer from those of image, depth and alpha.
-
-        One column is enough where only opacities are wanted.
-        """
+        """Gradients of the entries of the new layer from those of image, depth and alpha."""
+        columns = rasterizer.NUM_GRADIENT_COLUMNS if wanted == rasterizer.OF_ALL else 1
         values = np.empty((len(new.slots), columns), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
         tiles = touched(new.layer)
         drawn = (tiles, context, new.layer, frame, tuple(map(float32, slopes)))
-        received = (new.slots, columns == 1, values, written)
+        received = (new.slots, wanted, values, written)
         self.share(rasterizer.composite_backward, len(tiles), *drawn, *received)
         return values, written
+
+    def sums(self, new: Binned, gradients: EntryGradients) -> Float32[ndarray, "n"]:
+        """For each Gaussian, the sum of the only column of the gradients of its entries."""
+        totals = np.empty(len(new.slot_start) - 1, np.float32)
+        self.share(rasterizer.sum_entries, len(totals), new.slot_start, *gradients, totals)
+        return totals
+
+    def tiles_of(self, where: Bool[Tensor, "h w"]) -> Bool[ndarray, "tiles"]:
+        """The tiles that hold any pixel of a mask."""
+        tiles = max_pool2d(where[None].float(), TILE, ceil_mode=True)
+        return (tiles.flatten() > 0).cpu().numpy()
 
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
         """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time."""
@@ -267,11 +315,36 @@ class _Planned(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
         opacities = float32(ctx.saved_tensors[0])
-        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, slopes, columns=1)
-        result = np.zeros_like(opacities)
-        arguments = (opacities, binned.slot_start, *gradients, result)
-        view.viewpoint.share(rasterizer.opacity_backward, len(opacities), *arguments)
+        drawn = (view.layer, binned, frame, slopes)
+        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_OPACITY)
+        sums = view.viewpoint.sums(binned, gradients)
+        result = np.divide(sums, opacities, out=np.zeros_like(sums), where=sums != 0)
         return None, None, torch.from_numpy(result)
+
+
+class _Slid(torch.autograd.Function):
+    """The same where only depths along the rays change: nothing is projected."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, view: CpuView, splats: Splats, limits: Any, depths: Tensor
+    ) -> tuple[Tensor, ...]:
+        moved = splats.at_depths(float32(depths), view.viewpoint.pinhole.near)
+        binned = view.viewpoint.enter(moved, limits)
+        frame = view.viewpoint.composite(view, binned.layer)
+        render = render_of(frame)
+        ctx.scene = (view, binned, frame)
+        ctx.save_for_backward(render.depth, render.alpha)
+        ctx.mark_non_differentiable(render.image, render.alpha)
+        return render.image, render.depth, render.alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        view, binned, frame = ctx.scene
+        drawn = (view.layer, binned, frame, slopes)
+        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_DEPTH)
+        return None, None, None, torch.from_numpy(view.viewpoint.sums(binned, gradients))
 
 
 def pinhole_of(camera: Camera) -> Pinhole:

@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.render import OpacityRender, Renderer
+from gscompleter.geometry import at_depths
+from gscompleter.render import DepthRender, OpacityRender, Renderer
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
@@ -165,3 +166,7 @@ class CudaView:
         opaque = replace(new, opacities=torch.ones_like(new.opacities))
         render = self.drawing.plan(merge([self.seen, opaque]), self.camera)
         return lambda opacities: render(torch.cat([self.seen.opacities, opacities]))
+
+    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        """Context and `new` at other depths, all of it drawn anew."""
+        return lambda depths: self.composite(at_depths(new, self.camera, depths))

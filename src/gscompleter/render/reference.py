@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gscompleter.geometry import rotations_from
-from gscompleter.render import OpacityRender, Renderer
+from gscompleter.geometry import at_depths, rotations_from
+from gscompleter.render import DepthRender, OpacityRender, Renderer
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -84,6 +84,9 @@ class ReferenceView:
             sh=new.sh.detach(),
         )
         return lambda opacities: self.composite(replace(fixed, opacities=opacities))
+
+    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        return lambda depths: self.composite(at_depths(new, self.camera, depths))
 
 
 @dataclass(frozen=True)
