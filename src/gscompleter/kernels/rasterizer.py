@@ -823,17 +823,19 @@ def merged_lists(context, new, used, full):
     for tile in range(tiles):
         c, n = c_start[tile], n_start[tile]
         c_end, n_end = c + used[tile, 0], n + used[tile, 1]
+        c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
+        n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
         depth = infinity
         for place in range(tile_start[tile], tile_start[tile + 1]):
-            c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
-            n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
+            depth = min(c_depth, n_depth)
             if c_depth <= n_depth:
                 entries[place] = c_entries[c]
                 c += 1
+                c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
             else:
                 entries[place] = len(c_splats) + n_entries[n]
                 n += 1
-            depth = min(c_depth, n_depth)
+                n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
         if full[tile]:
             depth_limits[tile] = depth
     return tile_start, entries, depth_limits
