@@ -802,43 +802,44 @@ def _depth_at(splats, entries, place, begin, end, beyond):
 
 
 @njit(cache=True, nogil=True)
-def merged_lists(context, new, used, full):
-    """The lists of two layers merged as far as they were walked, and how far each tile can be seen.
+def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth_limits):
+    """Merge the lists of the tiles begin..end of two layers, as far as they were walked.
 
     What was not reached without anything in front of it is not reached with something in front.
 
     context, new: Layer. used [tiles, 2] int32, full [tiles] bool: as `composite` left them.
-    Returns tile_start [tiles + 1] int64; entries [e] int32, in which the splats of `new` are
-    numbered after those of the context; and depth limits [tiles] float32.
+    tile_start [tiles + 1] int64: where the merged lists start.
+    entries [e] int32 is written; the splats of `new` are numbered after those of the context.
+    depth_limits [tiles] float32 is written: the z-depth behind which a tile shows nothing.
     """
     c_splats, _, _, c_start, c_entries = context
     n_splats, _, _, n_start, n_entries = new
-    tiles, infinity = len(full), np.float32(np.inf)
-    tile_start = np.empty(tiles + 1, np.int64)
-    tile_start[0] = 0
-    for tile in range(tiles):
-        tile_start[tile + 1] = tile_start[tile] + used[tile, 0] + used[tile, 1]
-    entries = np.empty(tile_start[tiles], np.int32)
-    depth_limits = np.full(tiles, infinity, np.float32)
-    for tile in range(tiles):
+    infinity = np.float32(np.inf)
+    for tile in range(begin, end):
         c, n = c_start[tile], n_start[tile]
         c_end, n_end = c + used[tile, 0], n + used[tile, 1]
+        place, depth = tile_start[tile], infinity
         c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
         n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
-        depth = infinity
-        for place in range(tile_start[tile], tile_start[tile + 1]):
-            depth = min(c_depth, n_depth)
+        while c < c_end and n < n_end:
             if c_depth <= n_depth:
-                entries[place] = c_entries[c]
+                depth, entries[place] = c_depth, c_entries[c]
                 c += 1
                 c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
             else:
-                entries[place] = len(c_splats) + n_entries[n]
+                depth, entries[place] = n_depth, len(c_splats) + n_entries[n]
                 n += 1
                 n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
-        if full[tile]:
-            depth_limits[tile] = depth
-    return tile_start, entries, depth_limits
+            place += 1
+        for rest in range(c, c_end):
+            entries[place + rest - c] = c_entries[rest]
+        for rest in range(n, n_end):
+            entries[place + rest - n] = len(c_splats) + n_entries[rest]
+        if c < c_end:
+            depth = c_splats[c_entries[c_end - 1], DEPTH]
+        if n < n_end:
+            depth = n_splats[n_entries[n_end - 1], DEPTH]
+        depth_limits[tile] = depth if full[tile] else infinity
 
 
 # ---- Compositing ---------------------------------------------------------------------------------

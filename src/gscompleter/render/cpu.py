@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numba
@@ -80,15 +80,15 @@ class CpuView:
         if len(added.entries) == 0:
             return self
         frame = self.viewpoint.composite(self, added)
-        tile_start, entries, depth_limits = rasterizer.merged_lists(
-            self.layer, added, frame.used, frame.full
-        )
-        splats, opacities, boxes = (
-            np.concatenate(pair) for pair in zip(self.layer[:3], added[:3], strict=True)
-        )
-        layer = compact(Layer(splats, opacities, boxes, tile_start, entries))
         used = np.zeros_like(frame.used)
         used[:, 0] = frame.used.sum(axis=1)
+        tile_start = np.concatenate([[0], np.cumsum(used[:, 0], dtype=np.int64)])
+        entries = np.empty(tile_start[-1], np.int32)
+        depth_limits = np.empty(self.viewpoint.tiles, np.float32)
+        walked = (self.layer, added, frame.used, frame.full)
+        lists = (tile_start, entries, depth_limits)
+        self.viewpoint.share(rasterizer.merge_lists, len(used), *walked, *lists)
+        layer = joined(self.layer, added, tile_start, entries)
         return CpuView(self.viewpoint, layer, frame._replace(used=used), depth_limits)
 
     def composite(self, new: Gaussians) -> Render:
@@ -375,13 +375,31 @@ def touched(layer: Layer) -> Int64[ndarray, "touched"]:
     return np.flatnonzero(np.diff(layer.tile_start))
 
 
-def compact(layer: Layer) -> Layer:
-    """The layer without the splats that no list names."""
-    named = np.zeros(len(layer.splats), np.bool_)
-    named[layer.entries] = True
+def joined(
+    context: Layer,
+    new: Layer,
+    tile_start: Int64[ndarray, "bounds"],
+    entries: Int32[ndarray, "entries"],
+) -> Layer:
+    """The lists of both layers merged, and the splats that these name: the new ones are numbered
+    after those of the context."""
+    named = np.zeros(len(context.splats) + len(new.splats), np.bool_)
+    named[entries] = True
     numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
-    splats, opacities, boxes = (array[named] for array in layer[:3])
-    return Layer(splats, opacities, boxes, layer.tile_start, numbers[layer.entries])
+    rows = [np.flatnonzero(part) for part in np.split(named, [len(context.splats)])]
+    splats, opacities, boxes = (
+        chosen(pair, rows) for pair in zip(context[:3], new[:3], strict=True)
+    )
+    return Layer(splats, opacities, boxes, tile_start, numbers[entries])
+
+
+def chosen(arrays: Sequence[ndarray], rows: Sequence[Int64[ndarray, "_"]]) -> ndarray:
+    """These rows of each of the arrays, one after the other."""
+    bounds = [0, *accumulate(map(len, rows))]
+    out = np.empty((bounds[-1], *arrays[0].shape[1:]), arrays[0].dtype)
+    for array, row, (start, stop) in zip(arrays, rows, pairwise(bounds), strict=True):
+        array.take(row, axis=0, out=out[start:stop], mode="clip")
+    return out
 
 
 def length_of(gaussians: GaussianArrays) -> int:
