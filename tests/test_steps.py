@@ -15,6 +15,7 @@ from command import run
 from gscompleter import InputError
 from gscompleter.baselines.reggs import RegGSConfig
 from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.geometry import slide
 from gscompleter.io.image import read_pixels
 from gscompleter.reports.plots import plots
 from gscompleter.reports.summary import SEQUENCE, gains_by_gap
