@@ -1,6 +1,6 @@
 """The whole: what holds whatever the models are."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import pytest
@@ -18,6 +18,7 @@ from gscompleter.config import HarmConfig
 from gscompleter.generators import Synthesis
 from gscompleter.geometry import project
 from gscompleter.metrics.image import psnr
+from gscompleter.render.cpu import CpuRenderer
 from gscompleter.stages.anchor import lift
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import hole_mask, is_undone
@@ -298,6 +299,44 @@ def test_undo_is_to_go_on_from_the_former_state():
     again = knowing().advance(begun, target)
     for name, tensor in tensors(first.scene).items():
         assert torch.equal(tensor, getattr(again.scene, name)), name
+
+
+@dataclass(frozen=True)
+class Counting(CpuRenderer):
+    """Remembers which cameras a scene was frozen at."""
+
+    frozen: list[Camera] = field(default_factory=list)
+
+    def freeze(self, context, camera):
+        self.frozen.append(camera)
+        return super().freeze(context, camera)
+
+
+def test_photographs_are_frozen_once_however_many_targets_there_are():
+    """Once as they are and once as a small image; what was added extends them."""
+    views, (_, target) = photographs(), cameras()
+    targets = [target, camera_at(-0.9, yaw=-12, size=SIZE)]
+    renderer = Counting()
+    completer = replace(knowing(), renderer=renderer)
+    begun = completer.begin(views)
+    first = completer.advance(begun, targets[0])
+    second = completer.advance(first, targets[1])
+    assert len(second.scene) > len(first.scene) > len(begun.scene)
+    for view in begun.views:
+        assert sum(torch.equal(c.c2w, view.camera.c2w) for c in renderer.frozen) == 2
+
+
+def test_a_completer_that_kept_views_of_another_state_gives_the_same_bytes():
+    views, (_, target) = photographs(), cameras()
+    other = camera_at(-0.9, yaw=-12, size=SIZE)
+    completer = knowing()
+    begun = completer.begin(views)
+    first = completer.advance(begun, target)
+    completer.advance(first, other)
+    for start, camera in ((begun, target), (first, other), (begun, other)):
+        ours, truth = completer.advance(start, camera), knowing().advance(start, camera)
+        for name, tensor in tensors(truth.scene).items():
+            assert torch.equal(tensor, getattr(ours.scene, name)), name
 
 
 def test_a_generator_that_takes_no_margin_is_asked_for_the_target_itself():

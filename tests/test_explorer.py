@@ -68,7 +68,7 @@ def test_cameras_are_found_until_little_is_left_and_the_scene_covers_more(begun)
     assert len(completion.targets) == len(choices)
     assert all(choice.gain >= 0.01 for choice in choices)
     aside = held_out_cameras(cameras(), seed=0)
-    found = coverage_of(begun.context, completion.scene, aside, load_renderer("cpu"))
+    found = coverage_of(completion, aside, load_renderer("cpu"))
     assert found.before < 0.95
     assert found.after - found.before > 0.4 * (1 - found.before)
 
@@ -124,7 +124,10 @@ def test_a_miniature_covers_what_the_scene_covers(begun):
     assert len(small.scene) <= 3000 < len(begun.scene)
     renderer = load_renderer("cpu")
     aside = held_out_cameras(cameras(), seed=3, count=8)
-    shares = [covered(completion.scene, aside, renderer) for completion in (begun, small)]
+    shares = [
+        covered([renderer.render(completion.scene, camera) for camera in aside])
+        for completion in (begun, small)
+    ]
     assert shares[1] == pytest.approx(shares[0], abs=0.02)
 
 

@@ -8,6 +8,8 @@ import torch
 
 import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
+from gscompleter.geometry import at_depths, z_depths
+from gscompleter.kernels import rasterizer
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.cuda import CudaView
@@ -18,6 +20,7 @@ from scenes import Room, camera_at, gaussians_of, random_gaussians, scaled, view
 
 CAMERA = camera_at(size=48)
 CPU, REFERENCE = load_renderer("cpu"), load_renderer("reference")
+DRAWN = ("image", "depth", "alpha")
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 ROUNDING = 1e-5
 """Largest difference of drawings and of gradients, of the largest value. At most 5.1e-6 was
@@ -177,6 +180,65 @@ def test_what_is_frozen_alone_is_its_own_render():
     assert_same_drawing(frozen, alone)
 
 
+@pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
+def test_an_extended_view_is_the_frozen_view_of_both(renderer):
+    context, new = context_and_new()
+    last = random_gaussians(50, seed=6)
+    extended = renderer.freeze(context, CAMERA).extended(new)
+    frozen = renderer.freeze(merge([context, new]), CAMERA)
+    for ours, truth in (
+        (extended.context, frozen.context),
+        (extended.composite(last), frozen.composite(last)),
+        (extended.plan(last)(last.opacities), frozen.plan(last)(last.opacities)),
+        (extended.extended(last).context, frozen.extended(last).context),
+    ):
+        for name in DRAWN:
+            assert torch.equal(getattr(ours, name), getattr(truth, name)), name
+
+
+def test_a_frozen_view_keeps_no_splat_that_no_tile_draws():
+    wall = gaussians_of(view_of(Room(), camera_at(size=64)))
+    hidden = replace(wall, means=2 * wall.means, scales=2 * wall.scales)
+    opaque = merge([wall, wall, wall, hidden])
+    frozen = CPU.freeze(opaque, CAMERA)
+    assert len(frozen.layer.splats) < 0.8 * len(opaque)
+    assert set(frozen.layer.entries) == set(range(len(frozen.layer.splats)))
+    assert_same_drawing(frozen.context, CPU.render(opaque, CAMERA))
+
+
+def test_only_tiles_that_something_new_touches_are_drawn(monkeypatch):
+    """Of the nine tiles the new Gaussian lies within one, forward and backward."""
+    drawn = count_tiles(monkeypatch)
+    frozen = CpuRenderer(threads=1).freeze(SCENES["random"], CAMERA)
+    assert drawn.pop() == 9
+    new = replace(random_gaussians(1), means=torch.tensor([[0.0, 0.0, 1.0]]))
+    new = replace(new, scales=torch.full((1, 3), 0.02), opacities=torch.ones(1))
+    found = opacity_gradient(frozen.plan(new), new.opacities)[1]
+    assert drawn == [1, 1]
+    assert found.abs() > 0
+    assert frozen.extended(replace(new, means=-new.means)) is frozen
+    assert drawn == [1, 1]
+
+
+def count_tiles(monkeypatch) -> list[int]:
+    """How many tiles each call of the two kernels that draw will visit, as it happens.
+
+    It is one call a drawing where a single thread draws.
+    """
+    drawn: list[int] = []
+
+    def counting(kernel):
+        def counted(begin, end, *arguments):
+            drawn.append(end - begin)
+            return kernel(begin, end, *arguments)
+
+        return counted
+
+    for name in ("composite", "composite_backward"):
+        monkeypatch.setattr(rasterizer, name, counting(getattr(rasterizer, name)))
+    return drawn
+
+
 def opacity_gradient(function, opacities: torch.Tensor) -> tuple[Render, torch.Tensor]:
     variable = opacities.clone().requires_grad_()
     render = function(variable)
@@ -197,6 +259,61 @@ def test_a_plan_is_the_composite_with_other_opacities(renderer):
         )
         assert_same_drawing(planned, truth)
         assert_same_slopes({"opacities": slope}, {"opacities": expected})
+
+
+def test_a_plan_of_depths_is_the_composite_at_these_depths():
+    """Where it is asked for; elsewhere tiles may show the context alone."""
+    context, new = context_and_new()
+    frozen, left = CPU.freeze(context, CAMERA), torch.zeros(48, 48, dtype=torch.bool)
+    left[:, :16] = True
+    before = z_depths(new, CAMERA)
+    for ratio in (torch.ones(len(new)), torch.linspace(0.5, 2.0, len(new))):
+        depths = before * ratio
+        truth, expected = depth_gradient(
+            lambda values: frozen.composite(at_depths(new, CAMERA, values)), depths, left
+        )
+        for where in (left, torch.ones_like(left)):
+            planned, slope = depth_gradient(frozen.plan_depths(new, where), depths, left)
+            assert_same_drawing(*(masked(render, where) for render in (planned, truth)))
+            assert_close(slope, expected, "slope of depths")
+        beside = frozen.plan_depths(new, left)(depths)
+        assert torch.equal(beside.image[:, 16:], frozen.context.image[:, 16:])
+    before_the_lens = frozen.plan_depths(new, torch.ones_like(left))(1e-3 * before)
+    assert torch.equal(before_the_lens.image, frozen.context.image)
+
+
+def test_a_plan_of_colours_is_the_composite_in_these_colours():
+    context, new = context_and_new()
+    frozen = CPU.freeze(context, CAMERA)
+    weight = torch.linspace(0, 1, 48 * 48 * 3).view(48, 48, 3)
+
+    def drawn(function, colours):
+        variable = colours.clone().requires_grad_()
+        render = function(variable)
+        return render, torch.autograd.grad((render.image * weight).sum(), variable)[0]
+
+    generator = torch.Generator().manual_seed(0)
+    plan = frozen.plan_colours(new)
+    for _ in range(2):
+        colours = torch.rand(len(new), 3, generator=generator) - 0.2
+        planned, slope = drawn(plan, colours)
+        truth, expected = drawn(
+            lambda values: frozen.composite(replace(new, sh=sh_from_rgb(values))), colours
+        )
+        assert_same_drawing(planned, truth)
+        assert_close(slope, expected, "slope of colours")
+
+
+def masked(render: Render, where: torch.Tensor) -> Render:
+    return Render(render.image * where[..., None], render.depth * where, render.alpha * where)
+
+
+def depth_gradient(function, depths: torch.Tensor, where: torch.Tensor):
+    variable = depths.clone().requires_grad_()
+    render = function(variable)
+    weight = torch.linspace(0, 1, render.depth.numel()).view_as(render.depth)
+    covered = where & (render.alpha > 0.05)
+    return render, torch.autograd.grad((render.depth * weight * covered).sum(), variable)[0]
 
 
 def test_composites_have_the_gradients_of_the_render_of_both():
@@ -327,6 +444,8 @@ def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name
     view = cuda.freeze(context, CAMERA)
     assert 0 < len(view.seen) < len(context)
     check_frozen(view, REFERENCE.freeze(context, CAMERA), new, 1e-4)
+    more = random_gaussians(30, seed=6)
+    check_frozen(view.extended(new), REFERENCE.freeze(merge([context, new]), CAMERA), more, 1e-4)
     assert not cuda.render(new[:0], CAMERA).image.any()
     assert len(cuda.freeze(new[:0], CAMERA).seen) == 0
 

@@ -14,8 +14,6 @@ main()
 print(*sys.modules)
 """
 
-GRAD_OUTPUTS = "torch imports sympy for the grad_outputs that plane_sweep/appearance.py gives"
-
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory) -> set[str]:
@@ -35,7 +33,7 @@ def imported(tmp_path_factory) -> set[str]:
         "rich.progress",
         "scipy.optimize",
         "scipy.spatial",
-        pytest.param("sympy", marks=pytest.mark.xfail(strict=True, reason=GRAD_OUTPUTS)),
+        "sympy",
     ],
 )
 def test_a_completion_does_not_wait_for(imported, module):

@@ -15,6 +15,7 @@ from command import run
 from gscompleter import InputError
 from gscompleter.baselines.reggs import RegGSConfig
 from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.geometry import slide
 from gscompleter.io.image import read_pixels
 from gscompleter.reports.plots import plots
 from gscompleter.reports.summary import SEQUENCE, gains_by_gap
@@ -33,7 +34,6 @@ from gscompleter.runs.steps import (
 )
 from gscompleter.runs.store import read_json
 from gscompleter.runs.tasks import Task, tasks_of
-from gscompleter.stages.registration import slide
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import cached_property, reduce
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,7 +16,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
-from gscompleter.geometry import project, same_camera, sample, widened
+from gscompleter.geometry import project, same_camera, sample, slide, widened
 from gscompleter.masks import dilate
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, load_renderer
@@ -29,7 +29,7 @@ from gscompleter.stages.anchor import (
 )
 from gscompleter.stages.candidates import shrunk
 from gscompleter.stages.context import init_context, working_range
-from gscompleter.stages.exploration import overlap_of, small_renders
+from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
     do_no_harm,
@@ -40,8 +40,9 @@ from gscompleter.stages.integration import (
     refine_opacities,
     squared_error,
 )
+from gscompleter.stages.kept_views import KeptViews
 from gscompleter.stages.reconciliation import reconcile
-from gscompleter.stages.registration import Registration, register, slide
+from gscompleter.stages.registration import Registration, register
 from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.stereo import Stereo, corrected, stereo_among
 from gscompleter.stages.support import (
@@ -141,6 +142,16 @@ class GSCompleter:
         """Raises InputError where a setting is out of its range."""
         checked(self.config, "config.")
 
+    @cached_property
+    def frozen(self) -> KeptViews:
+        """The scene that was worked on last, frozen at the cameras of its photographs."""
+        return KeptViews(self.renderer)
+
+    @cached_property
+    def small(self) -> KeptViews:
+        """The same at cameras of small images, about."""
+        return KeptViews(self.renderer, MAX_GAUSSIANS)
+
     def __call__(
         self,
         views: Sequence[View],
@@ -198,11 +209,9 @@ class GSCompleter:
             evidence = None
             if scene is not None and witnesses is not None:
                 evidence = self.evidence(scene, (*views, *others))
-            tolerance = 0.0 if evidence is not None else self.config.harm.tolerance or 0.0
-            allowed = self.allowed_errors(context, (*views, *others), tolerance)
-        return Completion(
-            context, context, views, allowed, (), clock.seconds, others, evidence=evidence
-        )
+            completion = Completion(context, context, views, (), (), {}, others, evidence=evidence)
+            allowed = self.allowed_errors(completion)
+        return replace(completion, allowed_errors=allowed, seconds=clock.seconds)
 
     def advance(
         self, completion: Completion, target: Camera, reference: Synthesized | None = None
@@ -230,7 +239,10 @@ class GSCompleter:
             sight = self.without_unsupported(sight)
         result = self.completed(sight, result, reference, clock)
         reached = sight.completion if len(result.added) else completion
-        return followed_by(reached, result, clock.seconds)
+        advanced = followed_by(reached, result, clock.seconds)
+        for kept in (self.frozen, self.small):
+            kept.grown(reached.scene, advanced.scene)
+        return advanced
 
     def completed(
         self, sight: Sight, result: TargetCompletion, reference: Synthesized | None, clock: Clock
@@ -238,9 +250,7 @@ class GSCompleter:
         """`result` once the four stages have done their work."""
         completion, target = sight.completion, sight.window.target
         with clock("generate"):
-            frozen_views = [
-                self.renderer.freeze(completion.scene, view.camera) for view in completion.views
-            ]
+            frozen_views = self.at(completion, completion.views)
             if reference is None:
                 (reference,) = self.synthesize([sight], contexts_of(frozen_views))
         result = replace(result, reference=View(sight.window.crop(reference.image), target))
@@ -253,7 +263,7 @@ class GSCompleter:
         with clock("integrate"):
             kept = self.keep(sight, lifted, registration, frozen_views)
             added, losses = self.refine(sight, kept, reference, frozen_views)
-            after = self.renderer.render(merge([completion.scene, added]), target)
+            after = sight.frozen.composite(added).cropped(sight.window)
         return replace(
             result,
             after=after,
@@ -283,7 +293,7 @@ class GSCompleter:
         It is the one that `advance` would take: drawn with the margin, which is then cut off.
         """
         sight = self.sight(completion, target)
-        at_views = [self.renderer.render(completion.scene, v.camera) for v in completion.views]
+        at_views = contexts_of(self.at(completion, completion.views))
         (image,) = self.synthesize([sight], at_views)
         return View(sight.window.crop(image.image), sight.window.target)
 
@@ -298,7 +308,7 @@ class GSCompleter:
                 nothing_added(sight, sight.window.crop(self.holes(sight))) for sight in sights
             ]
             asked = [nothing_to_do(result, completion.views) is None for result in results]
-            at_views = [self.renderer.render(completion.scene, v.camera) for v in completion.views]
+            at_views = contexts_of(self.at(completion, completion.views))
         with clock("generate"):
             wanted = [sight for sight, needed in zip(sights, asked, strict=True) if needed]
             found = iter(self.synthesize(wanted, at_views))
@@ -365,7 +375,7 @@ class GSCompleter:
             [*(view.camera for view in views), *aside],
             [
                 *(self.as_believed(sight, f, v) for f, v in zip(frozen_views, views, strict=True)),
-                *small_renders(sight.completion.scene, aside, self.renderer),
+                *self.small_renders(sight.completion, aside),
             ],
             self.config.registration.footprint,
             self.config.free_space,
@@ -402,8 +412,7 @@ class GSCompleter:
         """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
         watching = (*completion.views, *completion.witnesses)
-        others = [self.renderer.freeze(completion.scene, v.camera) for v in completion.witnesses]
-        frozen, allowed = (*frozen_views, *others), completion.allowed_errors
+        frozen, allowed = self.at(completion, watching), completion.allowed_errors
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
             near_frozen = [frozen_views[i] for i in nearest]
@@ -442,7 +451,7 @@ class GSCompleter:
             shrunk(c, self.config.exploration.side)
             for c in (target, *(view.camera for view in views))
         ]
-        seen, *at_views = small_renders(completion.scene, cameras, self.renderer)
+        seen, *at_views = self.small_renders(completion, cameras)
         overlaps = [
             overlap_of(cameras[0], seen, camera, render)
             for camera, render in zip(cameras[1:], at_views, strict=True)
@@ -522,15 +531,22 @@ class GSCompleter:
         """Where the scene has a hole at the wider camera, by the settings of this completer."""
         return hole_mask(sight.alpha, self.config.holes)
 
-    def allowed_errors(
-        self, context: Gaussians, views: Sequence[View], tolerance: float
-    ) -> tuple[float, ...]:
+    def allowed_errors(self, completion: Completion) -> tuple[float, ...]:
         """Largest mean squared error that each photograph may have once all is done."""
-        renders = [self.renderer.render(context, view.camera).image for view in views]
+        tolerance = 0.0 if completion.evidence is not None else self.config.harm.tolerance or 0.0
+        watching = (*completion.views, *completion.witnesses)
         return tuple(
-            error_with_loss(squared_error(image, view.image).item(), max(tolerance, ROUNDING))
-            for image, view in zip(renders, views, strict=True)
+            error_with_loss(squared_error(r.image, v.image).item(), max(tolerance, ROUNDING))
+            for r, v in zip(contexts_of(self.at(completion, watching)), watching, strict=True)
         )
+
+    def at(self, completion: Completion, views: Sequence[View]) -> tuple[FrozenView, ...]:
+        """The scene as it stands, frozen at the cameras of photographs."""
+        return self.frozen.of(completion, [view.camera for view in views])
+
+    def small_renders(self, completion: Completion, cameras: Sequence[Camera]) -> Sequence[Render]:
+        """What cameras of small images see of the scene as it stands, about."""
+        return contexts_of(self.small.of(completion, cameras))
 
 
 def ranged(view: View, near: float, far: float) -> View:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.types import Camera, Window
+from gscompleter.types import Camera, Gaussians, Window
 
 
 def unproject(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w 3"]:
@@ -54,6 +55,32 @@ def sample(
 def distance_from_depth(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w"]:
     """Euclidean distance along each pixel's ray, from z-depth (paper, Eq. 9)."""
     return depth * camera.z_rays().norm(dim=-1)
+
+
+def slide(
+    gaussians: Gaussians,
+    camera: Camera,
+    ratio: Float[Tensor, "n"],
+    footprint: Literal["constant", "fixed"],
+) -> Gaussians:
+    """`gaussians` at `ratio` times their distance from the centre of `camera`.
+
+    With a constant footprint sizes follow: a similarity about the camera centre, under which the
+    image in that camera is exactly what it was.
+    """
+    means = camera.center + ratio[:, None] * (gaussians.means - camera.center)
+    scales = gaussians.scales * ratio[:, None] if footprint == "constant" else gaussians.scales
+    return replace(gaussians, means=means, scales=scales, encoded=None)
+
+
+def at_depths(gaussians: Gaussians, camera: Camera, depths: Float[Tensor, "n"]) -> Gaussians:
+    """`gaussians` on the same rays of `camera` at other z-depths, with a constant footprint."""
+    return slide(gaussians, camera, depths / z_depths(gaussians, camera), "constant")
+
+
+def z_depths(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n"]:
+    """How far Gaussians stand from `camera` along its axis, in scene units."""
+    return (gaussians.means - camera.center) @ camera.forward
 
 
 def rotation_between(a: Camera, b: Camera) -> float:

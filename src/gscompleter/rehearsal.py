@@ -57,6 +57,12 @@ def render_with(renderer: str) -> None:
     moved = observed(means, gaussians.quats, gaussians.scales, opacities, gaussians.sh)
     frozen.composite(moved).image.sum().backward()
     frozen.plan(gaussians)(opacities).image.sum().backward()
+    colours = torch.rand(len(gaussians), 3, requires_grad=True)
+    frozen.plan_colours(gaussians)(colours).image.sum().backward()
+    depths = torch.full((len(gaussians),), DEPTH, requires_grad=True)
+    everywhere = torch.ones(SIDE, SIDE, dtype=torch.bool)
+    frozen.plan_depths(gaussians, everywhere)(depths).depth.sum().backward()
+    frozen.extended(gaussians)
 
 
 def some_gaussians() -> Gaussians:

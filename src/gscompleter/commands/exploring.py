@@ -149,8 +149,7 @@ def coverage(
 ) -> dict[str, float]:
     """How much is covered from around `cameras`, before and after, for `summary.json`."""
     aside = held_out_cameras(list(cameras), options.seed)
-    renderer = explorer.completer.renderer
-    return coverage_of(completion.context, completion.scene, aside, renderer).as_summary()
+    return coverage_of(completion, aside, explorer.completer.renderer).as_summary()
 
 
 def as_given(camera: Camera, transform: Float[np.ndarray, "4 4"]) -> Camera:

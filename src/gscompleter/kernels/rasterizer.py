@@ -48,6 +48,10 @@ SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
 `q = alpha dL/dalpha`, and the next five those of q times s, t, s², s t and t²."""
 NUM_GRADIENT_COLUMNS = 10
 
+OF_ALL, OF_OPACITY, OF_DEPTH, OF_COLOUR = range(4)
+"""Which gradients are wanted: all of them, or SUM, SUM_DEPTH or those of the three colours alone,
+which are then the only columns."""
+
 
 class Pinhole(NamedTuple):
     """A camera, as the kernels want it."""
@@ -323,7 +327,8 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
 def _undraw(wanted):
     """An intrinsic that takes a splat off a tile again, back to front.
 
-    `wanted` names what it sums up for the gradients: "nothing", "opacity" or "all".
+    `wanted` names what it sums up for the gradients: "nothing", "opacity", "depth", "colour" or
+    "all".
     """
 
     @intrinsic
@@ -348,7 +353,7 @@ def _undraw(wanted):
             last = _Rows(context, builder, signature.args[4], last, _INTS, 1)
             limits = context.make_array(signature.args[5])(context, builder, row_limit).data
             positions = _broadcast(builder, position, _INTS)
-            count = {"nothing": 0, "opacity": 1, "all": 7}[wanted]
+            count = {"nothing": 0, "opacity": 1, "depth": 1, "colour": 3, "all": 7}[wanted]
             totals = [
                 cgutils.alloca_once_value(builder, ir.Constant(_FLOATS, [0.0] * TILE))
                 for _ in range(count)
@@ -373,9 +378,15 @@ def _undraw(wanted):
                 if wanted == "nothing":
                     return
 
+                if wanted == "colour":
+                    for total, slope in zip(totals, slopes[:3], strict=True):
+                        value = weight.times(slope, plus=_Lanes(builder, builder.load(total)))
+                        builder.store(value.value, total)
+                    return
+
                 q = (before * value - behind * opening) * alpha
                 q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
-                terms = [q]
+                terms = [weight * slopes[3]] if wanted == "depth" else [q]
                 if wanted == "all":
                     dys = _Lanes(builder, _broadcast(builder, dy))
                     terms += [q * dys, q * dys * dys]
@@ -403,6 +414,8 @@ def _undraw(wanted):
 
 _pass_rows = _undraw("nothing")
 _undraw_rows_for_opacity = _undraw("opacity")
+_undraw_rows_for_depth = _undraw("depth")
+_undraw_rows_for_colour = _undraw("colour")
 _undraw_rows = _undraw("all")
 
 
@@ -788,28 +801,53 @@ def fill_entries(
                     slot += 1
 
 
+@njit(cache=True)
+def _depth_at(splats, entries, place, begin, end, beyond):
+    """Depth of an entry, or `beyond` where the place lies outside of begin..end."""
+    if place < begin or place >= end:
+        return beyond
+    return splats[entries[place], DEPTH]
+
+
 @njit(cache=True, nogil=True)
-def truncated(layer, used, full):
-    """The lists of a layer as far as they were walked, and how far each tile can be seen.
+def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth_limits):
+    """Merge the lists of the tiles begin..end of two layers, as far as they were walked.
 
     What was not reached without anything in front of it is not reached with something in front.
-    Returns tile_start [tiles + 1] int64, entries [e] int32 and depth limits [tiles] float32.
+
+    context, new: Layer. used [tiles, 2] int32, full [tiles] bool: as `composite` left them.
+    tile_start [tiles + 1] int64: where the merged lists start.
+    entries [e] int32 is written; the splats of `new` are numbered after those of the context.
+    depth_limits [tiles] float32 is written: the z-depth behind which a tile shows nothing.
     """
-    splats, _, _, old_start, old_entries = layer
-    tiles = len(used)
-    tile_start = np.empty(tiles + 1, np.int64)
-    tile_start[0] = 0
-    for tile in range(tiles):
-        tile_start[tile + 1] = tile_start[tile] + used[tile]
-    entries = np.empty(tile_start[tiles], np.int32)
-    depth_limits = np.full(tiles, np.inf, np.float32)
-    for tile in range(tiles):
-        start, source = tile_start[tile], old_start[tile]
-        for k in range(used[tile]):
-            entries[start + k] = old_entries[source + k]
-        if full[tile] and used[tile] > 0:
-            depth_limits[tile] = splats[entries[start + used[tile] - 1], DEPTH]
-    return tile_start, entries, depth_limits
+    c_splats, _, _, c_start, c_entries = context
+    n_splats, _, _, n_start, n_entries = new
+    infinity = np.float32(np.inf)
+    for tile in range(begin, end):
+        c, n = c_start[tile], n_start[tile]
+        c_end, n_end = c + used[tile, 0], n + used[tile, 1]
+        place, depth = tile_start[tile], infinity
+        c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
+        n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
+        while c < c_end and n < n_end:
+            if c_depth <= n_depth:
+                depth, entries[place] = c_depth, c_entries[c]
+                c += 1
+                c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
+            else:
+                depth, entries[place] = n_depth, len(c_splats) + n_entries[n]
+                n += 1
+                n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
+            place += 1
+        for rest in range(c, c_end):
+            entries[place + rest - c] = c_entries[rest]
+        for rest in range(n, n_end):
+            entries[place + rest - n] = len(c_splats) + n_entries[rest]
+        if c < c_end:
+            depth = c_splats[c_entries[c_end - 1], DEPTH]
+        if n < n_end:
+            depth = n_splats[n_entries[n_end - 1], DEPTH]
+        depth_limits[tile] = depth if full[tile] else infinity
 
 
 # ---- Compositing ---------------------------------------------------------------------------------
@@ -845,17 +883,9 @@ def _placed(splats, opacities, boxes, i, left, top):
     )
 
 
-@njit(cache=True)
-def _depth_at(splats, entries, place, begin, end, beyond):
-    """Depth of an entry, or `beyond` where the place lies outside of begin..end."""
-    if place < begin or place >= end:
-        return beyond
-    return splats[entries[place], DEPTH]
-
-
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def composite(begin, end, context, new, frame):
-    """Draw the tiles begin..end of two layers merged by depth; of equals the context is in front.
+def composite(begin, end, tiles, context, new, frame):
+    """Draw tiles[begin:end] of two layers merged by depth; of equals the context is in front.
 
     context, new: Layer. frame: Frame, of which these tiles are written.
     """
@@ -869,7 +899,8 @@ def composite(begin, end, context, new, frame):
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
     infinity = np.float32(np.inf)
-    for tile in range(begin, end):
+    for index in range(begin, end):
+        tile = tiles[index]
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         rows, columns = min(TILE, height - top), min(TILE, width - left)
         state[:] = 0
@@ -918,13 +949,15 @@ def composite(begin, end, context, new, frame):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def composite_backward(
-    begin, end, context, new, frame, slopes, slots, opacity_only, gradients, written
+    begin, end, tiles, context, new, frame, slopes, slots, wanted, gradients, written
 ):
-    """Walk the tiles begin..end back to front and sum up the gradients of the new layer's entries.
+    """Walk tiles[begin:end] back to front and sum up the gradients of the new layer's entries.
 
     slopes: gradients of the frame's image [h, w, 3], depth [h, w] and alpha [h, w].
     slots [e] int32: slot of each entry of `new`.
-    gradients [slots, 10] float32, or [slots, 1] where `opacity_only`: columns SUM to SUM_RED + 2.
+    wanted: OF_ALL, OF_OPACITY, OF_DEPTH or OF_COLOUR.
+    gradients [slots, 10] float32, columns SUM to SUM_RED + 2; [slots, 1] or, of colours, [slots, 3]
+        where less is wanted.
     written [slots] bool: set for the slots, and only those, that receive a gradient.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
@@ -938,7 +971,8 @@ def composite_backward(
     row_limit = np.empty(TILE, np.int32)
     sums = np.zeros(TILE, np.float32)
     nothing = np.float32(-np.inf)
-    for tile in range(begin, end):
+    for index in range(begin, end):
+        tile = tiles[index]
         n_begin = n_start[tile]
         n = n_begin + used[tile, 1]
         if n == n_begin:
@@ -980,9 +1014,18 @@ def composite_backward(
             n_depth = _depth_at(n_splats, n_entries, n - 1, n_begin, n, nothing)
             slot = slots[n]
             written[slot] = True
-            if opacity_only:
+            if wanted == OF_OPACITY:
                 _undraw_rows_for_opacity(first, stop, position, state, last, row_limit, sums, splat)
-                gradients[slot, SUM] = sums[0]
+                gradients[slot, 0] = sums[0]
+                continue
+            if wanted == OF_DEPTH:
+                _undraw_rows_for_depth(first, stop, position, state, last, row_limit, sums, splat)
+                gradients[slot, 0] = sums[0]
+                continue
+            if wanted == OF_COLOUR:
+                _undraw_rows_for_colour(first, stop, position, state, last, row_limit, sums, splat)
+                for channel in range(3):
+                    gradients[slot, channel] = sums[channel]
                 continue
             _undraw_rows(first, stop, position, state, last, row_limit, sums, splat)
             u, v, w = splat[2], splat[3], splat[4]
@@ -1001,19 +1044,20 @@ def composite_backward(
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def opacity_backward(begin, end, opacities, slot_start, gradients, written, d_opacities):
-    """Gradients of the opacities of the Gaussians begin..end.
+def sum_entries(begin, end, slot_start, gradients, written, totals):
+    """Sums of the gradients of the entries of each of the Gaussians begin..end.
 
-    gradients [slots, 1] float32: column SUM of their entries, where written [slots].
-    d_opacities [n] is written where a gradient arrives.
+    gradients [slots, c] float32, where written [slots]: the slots from slot_start[i] to
+        slot_start[i + 1] belong to Gaussian i.
+    totals [n, c] float32 is written.
     """
     for i in range(begin, end):
-        total = np.float32(0)
+        for column in range(gradients.shape[1]):
+            totals[i, column] = np.float32(0)
         for slot in range(slot_start[i], slot_start[i + 1]):
             if written[slot]:
-                total += gradients[slot, SUM]
-        if total != 0:
-            d_opacities[i] = total / opacities[i]
+                for column in range(gradients.shape[1]):
+                    totals[i, column] += gradients[slot, column]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

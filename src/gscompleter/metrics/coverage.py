@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import torch
 
@@ -17,8 +17,9 @@ from gscompleter.coverage import COVERED
 from gscompleter.geometry import baseline_between, rotation_about, share_of_turn
 from gscompleter.render import Renderer
 from gscompleter.stages.candidates import moved, shrunk, spacing
-from gscompleter.stages.exploration import small_renders
-from gscompleter.types import Camera, Gaussians
+from gscompleter.stages.exploration import MAX_GAUSSIANS
+from gscompleter.stages.kept_views import KeptViews
+from gscompleter.types import Camera, Completion, Render
 
 NUM_CAMERAS = 32
 SIDE = 96
@@ -41,18 +42,20 @@ class Coverage:
         return asdict(self)
 
 
-def coverage_of(
-    before: Gaussians, after: Gaussians, cameras: Sequence[Camera], renderer: Renderer
-) -> Coverage:
-    """How much two scenes cover, as `cameras` see them in small images."""
-    first, last = (covered(scene, cameras, renderer) for scene in (before, after))
+def coverage_of(completion: Completion, cameras: Sequence[Camera], renderer: Renderer) -> Coverage:
+    """How much a scene covers, as `cameras` see it in small images."""
+    kept, small = KeptViews(renderer, MAX_GAUSSIANS), [shrunk(c, SIDE) for c in cameras]
+    context = completion.context
+    begun = replace(completion, scene=context, set_aside=None, targets=())
+    first = covered([view.context for view in kept.of(begun, small)])
+    if completion.set_aside is None:
+        kept.grown(context, completion.scene)
+    last = covered([view.context for view in kept.of(completion, small)])
     return Coverage(first, last, len(cameras))
 
 
-def covered(scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer) -> float:
-    """Share of the pixels of all cameras that the scene covers."""
-    with torch.no_grad():
-        renders = small_renders(scene, [shrunk(camera, SIDE) for camera in cameras], renderer)
+def covered(renders: Sequence[Render]) -> float:
+    """Share of the pixels of all renders that the scene covers."""
     return torch.cat([r.alpha.flatten() >= COVERED for r in renders]).float().mean().item()
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError, quoted
@@ -20,6 +20,14 @@ from gscompleter.types import Camera, Gaussians, Render
 
 OpacityRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene plus Gaussians of which only the opacities [n] may change."""
+
+
+DepthRender = Callable[[Float[Tensor, "n"]], Render]
+"""Renders a frozen scene plus Gaussians of which only the z-depths [n] may change."""
+
+
+ColourRender = Callable[[Float[Tensor, "n 3"]], Render]
+"""Renders a frozen scene plus Gaussians of which only the colours [n, 3] may change."""
 
 
 @runtime_checkable
@@ -34,11 +42,23 @@ class FrozenView(Protocol):
     def context(self) -> Render:
         """The context alone."""
 
+    def extended(self, new: Gaussians) -> FrozenView:
+        """The view of context and `new`, in that order, both frozen."""
+
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; differentiable in `new`."""
 
     def plan(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities; the function it returns is differentiable."""
+
+    def plan_colours(self, new: Gaussians) -> ColourRender:
+        """Fix all of `new` but its colours, which the camera sees as they are given, from 0 up; the
+        function it returns is differentiable."""
+
+    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        """Fix all of `new` but how far along the rays of the camera it stands, and draw it at least
+        `where` it is asked for. Sizes follow, so that its image stays: what changes is which of two
+        is in front, and the depth, which is differentiable."""
 
 
 @runtime_checkable

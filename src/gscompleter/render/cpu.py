@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from itertools import pairwise
+from functools import cached_property
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numba
@@ -17,15 +15,14 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import max_pool2d
 
 from gscompleter.errors import InputError
 from gscompleter.kernels import rasterizer
 from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
-from gscompleter.render import OpacityRender
+from gscompleter.kernels.sharing import ranges, run, share
+from gscompleter.render import ColourRender, DepthRender, OpacityRender
 from gscompleter.types import Camera, Gaussians, Render
-
-PIECES_PER_THREAD = 4
-"""Tiles take unequally long; more pieces than threads even that out."""
 
 MAX_SIDE = TILE * np.iinfo(np.int16).max
 """Pixels of an image's side, whose tiles the kernels number in 16 bits."""
@@ -43,30 +40,52 @@ class CpuRenderer:
     where it is not set. The result does not depend on it."""
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
-        viewpoint = self._viewpoint(camera)
-        return CpuView(viewpoint, viewpoint.nothing(), viewpoint.unlimited()).composite(gaussians)
+        return self._empty(camera).composite(gaussians)
 
     def freeze(self, context: Gaussians, camera: Camera) -> CpuView:
-        return self._viewpoint(camera).freeze(context)
+        return self._empty(camera).extended(context)
 
-    def _viewpoint(self, camera: Camera) -> Viewpoint:
+    def _empty(self, camera: Camera) -> CpuView:
         threads = self.threads or numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-        return Viewpoint(pinhole_of(camera), threads)
+        return Viewpoint(pinhole_of(camera), threads).empty()
 
 
 @dataclass(frozen=True)
 class CpuView:
-    """The frozen context: projected, sorted, binned, and cut where nothing shows through it."""
+    """The frozen context: projected, sorted, binned, and cut where nothing shows through it.
+
+    Only splats that some tile draws are kept. With something new in it, only the tiles that this
+    touches are drawn; the others are those of the context's own frame.
+    """
 
     viewpoint: Viewpoint
     layer: Layer
+    frame: Frame
+    """The context alone."""
     depth_limits: Float32[ndarray, "tiles"]
     """z-depth behind which a tile shows nothing new."""
 
     @cached_property
     def context(self) -> Render:
         """The context alone."""
-        return render_of(self.viewpoint.composite(self.viewpoint.nothing(), self.layer))
+        return render_of(self.frame)
+
+    def extended(self, new: Gaussians) -> CpuView:
+        """The same as freezing context and `new` together, in that order."""
+        added = self.viewpoint.bin(arrays_of(new), self.depth_limits).layer
+        if len(added.entries) == 0:
+            return self
+        frame = self.viewpoint.composite(self, added)
+        used = np.zeros_like(frame.used)
+        used[:, 0] = frame.used.sum(axis=1)
+        tile_start = np.concatenate([[0], np.cumsum(used[:, 0], dtype=np.int64)])
+        entries = np.empty(tile_start[-1], np.int32)
+        depth_limits = np.empty(self.viewpoint.tiles, np.float32)
+        walked = (self.layer, added, frame.used, frame.full)
+        lists = (tile_start, entries, depth_limits)
+        self.viewpoint.share(rasterizer.merge_lists, len(used), *walked, *lists)
+        layer = joined(self.layer, added, tile_start, entries)
+        return CpuView(self.viewpoint, layer, frame._replace(used=used), depth_limits)
 
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; only `new` is projected, sorted and binned."""
@@ -82,6 +101,44 @@ class CpuView:
             return Render(*_Planned.apply(self, binned, opacities.to("cpu", torch.float32)))
 
         return render
+
+    def plan_colours(self, new: Gaussians) -> ColourRender:
+        """Project, sort and bin `new` once."""
+        binned = self.viewpoint.bin(arrays_of(new), self.depth_limits)
+
+        def render(colours: Float[Tensor, "n 3"]) -> Render:
+            return Render(*_Painted.apply(self, binned, colours.to("cpu", torch.float32)))
+
+        return render
+
+    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        """Project `new` once, as far as it touches a tile that is asked for."""
+        splats = self.viewpoint.project(arrays_of(new))
+        anywhere = np.where(self.viewpoint.tiles_of(where), np.inf, -np.inf).astype(np.float32)
+        sizes = np.diff(self.viewpoint.enter(splats, anywhere).slot_start)
+        splats = replace(splats, boxes=np.where(sizes[:, None] > 0, splats.boxes, np.int32(0)))
+        limits = np.minimum(anywhere, self.depth_limits)
+
+        def render(depths: Float[Tensor, "n"]) -> Render:
+            return Render(*_Slid.apply(self, splats, limits, depths.to("cpu", torch.float32)))
+
+        return render
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Projected Gaussians, see `Layer`."""
+
+    columns: Float32[ndarray, "n 9"]
+    opacities: Float32[ndarray, "n"]
+    boxes: Int32[ndarray, "n 4"]
+
+    def at_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
+        """The same at other z-depths; what comes nearer than `near` gets an empty box."""
+        columns = self.columns.copy()
+        columns[:, rasterizer.DEPTH] = depths
+        boxes = np.where(depths[:, None] > near, self.boxes, np.int32(0))
+        return replace(self, columns=columns, boxes=boxes)
 
 
 @dataclass(frozen=True)
@@ -114,35 +171,43 @@ class Viewpoint:
     def tiles(self) -> int:
         return self.tiles_x * -(-self.pinhole.height // TILE)
 
-    def nothing(self) -> Layer:
-        """A layer without splats."""
-        return Layer(
+    def empty(self) -> CpuView:
+        """The view of a context without Gaussians."""
+        height, width = self.pinhole.height, self.pinhole.width
+        frame = Frame(
+            image=np.zeros((height, width, 3), np.float32),
+            depth=np.zeros((height, width), np.float32),
+            alpha=np.zeros((height, width), np.float32),
+            transmittance=np.ones((height, width), np.float32),
+            last=np.full((height, width), -1, np.int32),
+            used=np.zeros((self.tiles, 2), np.int32),
+            full=np.zeros(self.tiles, np.bool_),
+        )
+        layer = Layer(
             np.empty((0, rasterizer.NUM_SPLAT_COLUMNS), np.float32),
             np.empty(0, np.float32),
             np.empty((0, 4), np.int32),
             np.zeros(self.tiles + 1, np.int64),
             np.empty(0, np.int32),
         )
-
-    def unlimited(self) -> Float32[ndarray, "tiles"]:
-        """Depth limits of tiles in which nothing hides what comes behind."""
-        return np.full(self.tiles, np.inf, np.float32)
-
-    def freeze(self, context: Gaussians) -> CpuView:
-        """The context's part of every picture that will be taken from here."""
-        layer = self.bin(arrays_of(context), self.unlimited()).layer
-        frame = self.composite(self.nothing(), layer)
-        used = np.ascontiguousarray(frame.used[:, 1])
-        tile_start, entries, depth_limits = rasterizer.truncated(layer, used, frame.full)
-        return CpuView(self, layer._replace(tile_start=tile_start, entries=entries), depth_limits)
+        return CpuView(self, layer, frame, np.full(self.tiles, np.inf, np.float32))
 
     def bin(self, gaussians: GaussianArrays, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
         """Project the Gaussians, sort them and enter them into the lists of the tiles."""
+        return self.enter(self.project(gaussians), depth_limits)
+
+    def project(self, gaussians: GaussianArrays) -> Splats:
+        """The Gaussians as splats; those that cannot be seen get an empty box."""
         n = length_of(gaussians)
-        splats = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
+        columns = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
         boxes = np.empty((n, 4), np.int32)
-        self.share(rasterizer.project, n, gaussians, self.pinhole, splats, boxes)
-        order, depths = rasterizer.depth_order(splats, boxes)
+        self.share(rasterizer.project, n, gaussians, self.pinhole, columns, boxes)
+        return Splats(columns, gaussians.opacities, boxes)
+
+    def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
+        """Sort the splats and enter them into the lists of the tiles."""
+        n, boxes = len(splats.columns), splats.boxes
+        order, depths = rasterizer.depth_order(splats.columns, boxes)
 
         chunks = ranges(len(order), self.threads)
         rectangles = np.empty((len(order), 4), np.int16)
@@ -150,7 +215,7 @@ class Viewpoint:
         counts = np.zeros((len(chunks), self.tiles), np.int32)
         seen = (order, depths, boxes, depth_limits, self.tiles_x, rectangles, sizes)
         counting = [(*chunk, *seen, count) for chunk, count in zip(chunks, counts, strict=True)]
-        run(self.threads, rasterizer.count_entries, counting)
+        run(rasterizer.count_entries, counting, self.threads)
         slot_start = np.zeros(n + 1, np.int64)
         np.cumsum(sizes, out=slot_start[1:])
         if slot_start[-1] > MAX_ENTRIES:
@@ -165,23 +230,15 @@ class Viewpoint:
             (*chunk, *known, places, entries, slots)
             for chunk, places in zip(chunks, counts, strict=True)
         ]
-        run(self.threads, rasterizer.fill_entries, filling)
-        layer = Layer(splats, gaussians.opacities, boxes, tile_start, entries)
+        run(rasterizer.fill_entries, filling, self.threads)
+        layer = Layer(splats.columns, splats.opacities, boxes, tile_start, entries)
         return Binned(layer, slots, slot_start)
 
-    def composite(self, context: Layer, new: Layer) -> Frame:
-        """Draw two layers merged by depth."""
-        size = (self.pinhole.height, self.pinhole.width)
-        frame = Frame(
-            image=np.empty((*size, 3), np.float32),
-            depth=np.empty(size, np.float32),
-            alpha=np.empty(size, np.float32),
-            transmittance=np.empty(size, np.float32),
-            last=np.empty(size, np.int32),
-            used=np.empty((self.tiles, 2), np.int32),
-            full=np.empty(self.tiles, np.bool_),
-        )
-        self.share(rasterizer.composite, self.tiles, context, new, frame)
+    def composite(self, view: CpuView, new: Layer) -> Frame:
+        """Draw the context of `view` and a new layer merged by depth, where this has anything."""
+        frame = Frame(*(array.copy() for array in view.frame))
+        tiles = touched(new)
+        self.share(rasterizer.composite, len(tiles), tiles, view.layer, new, frame)
         return frame
 
     def composite_backward(
@@ -190,23 +247,32 @@ class Viewpoint:
         new: Binned,
         frame: Frame,
         slopes: tuple[Tensor, ...],
-        columns: int = rasterizer.NUM_GRADIENT_COLUMNS,
+        wanted: int = rasterizer.OF_ALL,
     ) -> EntryGradients:
-        """Gradients of the entries of the new layer from those of image, depth and alpha.
-
-        One column is enough where only opacities are wanted.
-        """
-        values = np.empty((len(new.slots), columns), np.float32)
+        """Gradients of the entries of the new layer from those of image, depth and alpha."""
+        columns = {rasterizer.OF_ALL: rasterizer.NUM_GRADIENT_COLUMNS, rasterizer.OF_COLOUR: 3}
+        values = np.empty((len(new.slots), columns.get(wanted, 1)), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
-        drawn = (context, new.layer, frame, tuple(map(float32, slopes)))
-        received = (new.slots, columns == 1, values, written)
-        self.share(rasterizer.composite_backward, self.tiles, *drawn, *received)
+        tiles = touched(new.layer)
+        drawn = (tiles, context, new.layer, frame, tuple(map(float32, slopes)))
+        received = (new.slots, wanted, values, written)
+        self.share(rasterizer.composite_backward, len(tiles), *drawn, *received)
         return values, written
+
+    def sums(self, new: Binned, gradients: EntryGradients) -> Float32[ndarray, "n columns"]:
+        """For each Gaussian, the sums of the gradients of its entries."""
+        totals = np.empty((len(new.slot_start) - 1, gradients[0].shape[1]), np.float32)
+        self.share(rasterizer.sum_entries, len(totals), new.slot_start, *gradients, totals)
+        return totals
+
+    def tiles_of(self, where: Bool[Tensor, "h w"]) -> Bool[ndarray, "tiles"]:
+        """The tiles that hold any pixel of a mask."""
+        tiles = max_pool2d(where[None].float(), TILE, ceil_mode=True)
+        return (tiles.flatten() > 0).cpu().numpy()
 
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
         """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time."""
-        pieces = ranges(count, self.threads * PIECES_PER_THREAD if self.threads > 1 else 1)
-        run(self.threads, kernel, [(*piece, *arguments) for piece in pieces])
+        share(kernel, count, *arguments, threads=self.threads)
 
 
 class _Composite(torch.autograd.Function):
@@ -216,7 +282,7 @@ class _Composite(torch.autograd.Function):
     def forward(ctx: Any, view: CpuView, *tensors: Tensor) -> tuple[Tensor, ...]:
         gaussians = GaussianArrays(*map(float32, tensors))
         binned = view.viewpoint.bin(gaussians, view.depth_limits)
-        frame = view.viewpoint.composite(view.layer, binned.layer)
+        frame = view.viewpoint.composite(view, binned.layer)
         render = render_of(frame)
         ctx.scene = (view, binned, frame)
         # Saving tensors makes torch notice if one of them is written to before the backward pass.
@@ -242,7 +308,7 @@ class _Planned(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, view: CpuView, binned: Binned, opacities: Tensor) -> tuple[Tensor, ...]:
         layer = binned.layer._replace(opacities=float32(opacities))
-        frame = view.viewpoint.composite(view.layer, layer)
+        frame = view.viewpoint.composite(view, layer)
         render = render_of(frame)
         ctx.scene = (view, replace(binned, layer=layer), frame)
         ctx.save_for_backward(opacities, render.depth, render.alpha)
@@ -253,11 +319,61 @@ class _Planned(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
         opacities = float32(ctx.saved_tensors[0])
-        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, slopes, columns=1)
-        result = np.zeros_like(opacities)
-        arguments = (opacities, binned.slot_start, *gradients, result)
-        view.viewpoint.share(rasterizer.opacity_backward, len(opacities), *arguments)
+        drawn = (view.layer, binned, frame, slopes)
+        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_OPACITY)
+        sums = view.viewpoint.sums(binned, gradients)[:, 0]
+        result = np.divide(sums, opacities, out=np.zeros_like(sums), where=sums != 0)
         return None, None, torch.from_numpy(result)
+
+
+class _Painted(torch.autograd.Function):
+    """The same where only colours change."""
+
+    @staticmethod
+    def forward(ctx: Any, view: CpuView, binned: Binned, colours: Tensor) -> tuple[Tensor, ...]:
+        splats = binned.layer.splats.copy()
+        splats[:, rasterizer.RED :] = np.maximum(float32(colours), 0)
+        painted = replace(binned, layer=binned.layer._replace(splats=splats))
+        frame = view.viewpoint.composite(view, painted.layer)
+        render = render_of(frame)
+        ctx.scene = (view, painted, frame)
+        ctx.save_for_backward(colours, render.depth, render.alpha)
+        ctx.mark_non_differentiable(render.depth, render.alpha)
+        return render.image, render.depth, render.alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        view, painted, frame = ctx.scene
+        drawn = (view.layer, painted, frame, slopes)
+        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_COLOUR)
+        sums = torch.from_numpy(view.viewpoint.sums(painted, gradients))
+        return None, None, torch.where(ctx.saved_tensors[0] > 0, sums, 0.0)
+
+
+class _Slid(torch.autograd.Function):
+    """The same where only depths along the rays change: nothing is projected."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, view: CpuView, splats: Splats, limits: Any, depths: Tensor
+    ) -> tuple[Tensor, ...]:
+        moved = splats.at_depths(float32(depths), view.viewpoint.pinhole.near)
+        binned = view.viewpoint.enter(moved, limits)
+        frame = view.viewpoint.composite(view, binned.layer)
+        render = render_of(frame)
+        ctx.scene = (view, binned, frame)
+        ctx.save_for_backward(render.depth, render.alpha)
+        ctx.mark_non_differentiable(render.image, render.alpha)
+        return render.image, render.depth, render.alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        view, binned, frame = ctx.scene
+        drawn = (view.layer, binned, frame, slopes)
+        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_DEPTH)
+        return None, None, None, torch.from_numpy(view.viewpoint.sums(binned, gradients)[:, 0])
 
 
 def pinhole_of(camera: Camera) -> Pinhole:
@@ -283,6 +399,38 @@ def pinhole_of(camera: Camera) -> Pinhole:
     )
 
 
+def touched(layer: Layer) -> Int64[ndarray, "touched"]:
+    """The tiles in which a layer has anything to draw."""
+    return np.flatnonzero(np.diff(layer.tile_start))
+
+
+def joined(
+    context: Layer,
+    new: Layer,
+    tile_start: Int64[ndarray, "bounds"],
+    entries: Int32[ndarray, "entries"],
+) -> Layer:
+    """The lists of both layers merged, and the splats that these name: the new ones are numbered
+    after those of the context."""
+    named = np.zeros(len(context.splats) + len(new.splats), np.bool_)
+    named[entries] = True
+    numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
+    rows = [np.flatnonzero(part) for part in np.split(named, [len(context.splats)])]
+    splats, opacities, boxes = (
+        chosen(pair, rows) for pair in zip(context[:3], new[:3], strict=True)
+    )
+    return Layer(splats, opacities, boxes, tile_start, numbers[entries])
+
+
+def chosen(arrays: Sequence[ndarray], rows: Sequence[Int64[ndarray, "_"]]) -> ndarray:
+    """These rows of each of the arrays, one after the other."""
+    bounds = [0, *accumulate(map(len, rows))]
+    out = np.empty((bounds[-1], *arrays[0].shape[1:]), arrays[0].dtype)
+    for array, row, (start, stop) in zip(arrays, rows, pairwise(bounds), strict=True):
+        array.take(row, axis=0, out=out[start:stop], mode="clip")
+    return out
+
+
 def length_of(gaussians: GaussianArrays) -> int:
     """How many there are, once every array is seen to hold that many: kernels do not look."""
     lengths = {len(array) for array in gaussians}
@@ -304,31 +452,3 @@ def render_of(frame: Frame) -> Render:
 def float32(values: Tensor) -> Float32[ndarray, "..."]:
     """The values of a tensor as a contiguous array, not copied where they are one already."""
     return values.detach().to("cpu", torch.float32).contiguous().numpy()
-
-
-def ranges(count: int, pieces: int) -> list[tuple[int, int]]:
-    """range(count) cut into at most `pieces` contiguous pieces of about equal length."""
-    pieces = max(1, min(pieces, count))
-    bounds = [count * piece // pieces for piece in range(pieces + 1)]
-    return list(pairwise(bounds))
-
-
-def run(threads: int, kernel: Callable[..., None], calls: list[tuple[Any, ...]]) -> None:
-    """Run a kernel, which releases the interpreter lock, on several threads.
-
-    They are threads of our own and not those of numba: its OpenMP layer spins where cores are
-    scarce and meddles with torch's, and its other layer does not bear two callers at once.
-    """
-    if threads == 1 or len(calls) == 1:
-        for arguments in calls:
-            kernel(*arguments)
-        return
-    pool = thread_pool(threads, os.getpid())
-    for future in [pool.submit(kernel, *arguments) for arguments in calls]:
-        future.result()
-
-
-@lru_cache(maxsize=8)
-def thread_pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Threads that wait for work. A forked process inherits none and asks for its own."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="gscompleter")

@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.render import OpacityRender, Renderer
+from gscompleter.geometry import at_depths
+from gscompleter.render import ColourRender, DepthRender, OpacityRender, Renderer
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
@@ -152,6 +153,10 @@ class CudaView:
         colours = colours_from(kept.sh, kept.means, center)
         return replace(kept, sh=sh_from_rgb(colours), encoded=None)
 
+    def extended(self, new: Gaussians) -> CudaView:
+        """The view of what is seen of the context, and of `new`."""
+        return replace(self, scene=merge([self.seen, new]))
+
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together."""
         return self.drawing.render(merge([self.seen, new]), self.camera)
@@ -161,3 +166,11 @@ class CudaView:
         opaque = replace(new, opacities=torch.ones_like(new.opacities))
         render = self.drawing.plan(merge([self.seen, opaque]), self.camera)
         return lambda opacities: render(torch.cat([self.seen.opacities, opacities]))
+
+    def plan_colours(self, new: Gaussians) -> ColourRender:
+        """Context and `new` in other colours, all of it drawn anew."""
+        return lambda colours: self.composite(replace(new, sh=sh_from_rgb(colours), encoded=None))
+
+    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        """Context and `new` at other depths, all of it drawn anew."""
+        return lambda depths: self.composite(at_depths(new, self.camera, depths))

@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gscompleter.geometry import rotations_from
-from gscompleter.render import OpacityRender, Renderer
+from gscompleter.geometry import at_depths, rotations_from
+from gscompleter.render import ColourRender, DepthRender, OpacityRender, Renderer
 from gscompleter.render.spherical_harmonics import colours_from
-from gscompleter.types import Camera, Gaussians, Render, merge
+from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
 BLUR = 0.3
 """Added to the 2D variances, in px²: a low-pass of about a pixel."""
@@ -69,6 +69,9 @@ class ReferenceView:
     def context(self) -> Render:
         return self.renderer.render(self.scene, self.camera)
 
+    def extended(self, new: Gaussians) -> ReferenceView:
+        return replace(self, scene=merge([self.scene, new]))
+
     def composite(self, new: Gaussians) -> Render:
         return self.renderer.render(merge([self.scene, new]), self.camera)
 
@@ -81,6 +84,12 @@ class ReferenceView:
             sh=new.sh.detach(),
         )
         return lambda opacities: self.composite(replace(fixed, opacities=opacities))
+
+    def plan_colours(self, new: Gaussians) -> ColourRender:
+        return lambda colours: self.composite(replace(new, sh=sh_from_rgb(colours), encoded=None))
+
+    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        return lambda depths: self.composite(at_depths(new, self.camera, depths))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ from gscompleter.geometry import (
 )
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.masks import dilate
-from gscompleter.render import Renderer
 from gscompleter.stages.candidates import Candidate, opening
 from gscompleter.types import (
     Camera,
@@ -139,12 +138,6 @@ def stand_ins(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gau
         torch.full_like(size, 0.99),
         torch.zeros((len(means), 1, 3)).to(means),
     )
-
-
-def small_renders(scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer) -> list[Render]:
-    """What cameras of small images see of a scene, about, at the cost of a small scene."""
-    small = thinned(scene, MAX_GAUSSIANS)
-    return [renderer.render(small, camera) for camera in cameras]
 
 
 def miniature(completion: Completion, most: int = MAX_GAUSSIANS) -> Completion:

@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import FreeSpaceConfig
-from gscompleter.geometry import project
-from gscompleter.stages.registration import slide
+from gscompleter.geometry import project, slide
 from gscompleter.types import Camera, Gaussians, Render
 
 STEP = 0.04

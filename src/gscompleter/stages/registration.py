@@ -3,16 +3,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gscompleter.config import RegistrationConfig
 from gscompleter.coverage import COVERED
 from gscompleter.descent import Adam
+from gscompleter.geometry import slide, z_depths
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, Renderer
@@ -121,22 +123,6 @@ def apply_affine(
     return slide(gaussians, camera, ratio, footprint)
 
 
-def slide(
-    gaussians: Gaussians,
-    camera: Camera,
-    ratio: Float[Tensor, "n"],
-    footprint: Literal["constant", "fixed"],
-) -> Gaussians:
-    """`gaussians` at `ratio` times their distance from the centre of `camera`.
-
-    With a constant footprint sizes follow: a similarity about the camera centre, under which the
-    image in that camera is exactly what it was.
-    """
-    means = camera.center + ratio[:, None] * (gaussians.means - camera.center)
-    scales = gaussians.scales * ratio[:, None] if footprint == "constant" else gaussians.scales
-    return replace(gaussians, means=means, scales=scales, encoded=None)
-
-
 def register_along_rays(
     coarse: Gaussians,
     frozen_target: FrozenView,
@@ -148,6 +134,7 @@ def register_along_rays(
 ) -> tuple[Gaussians, tuple[float, ...]]:
     """Minimise Eq. 11 over one distance per Gaussian; also returns the loss of each iteration."""
     objective = Objective.of(frozen_target.context, at_anchor, reference, config)
+    alone = drawn_alone(coarse, reference.camera, objective.target_depth.valid, renderer, config)
     parameters = torch.zeros(
         (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )
@@ -156,7 +143,7 @@ def register_along_rays(
     for iteration in track(range(config.iterations), "Registering"):
         left = 1 - iteration / config.iterations if config.schedule == "falling" else 1.0
         moved = displace(coarse, parameters, reference.camera, config)
-        loss = objective(moved, frozen_target, reference.camera, anchor, renderer)
+        loss = objective(moved, frozen_target, alone, renderer.render(moved, anchor))
         optimizer.step(loss, left)
         losses.append(loss.item())
     with torch.no_grad():
@@ -177,6 +164,24 @@ def displace(
         return replace(coarse, means=coarse.means + unit * parameters, encoded=None)
     ratio = 1 + (unit * parameters / distances)[:, 0]
     return slide(coarse, camera, ratio.clamp_min(0.1), config.footprint)
+
+
+def drawn_alone(
+    coarse: Gaussians,
+    camera: Camera,
+    where: Bool[Tensor, "h w"],
+    renderer: Renderer,
+    config: RegistrationConfig,
+) -> Callable[[Gaussians], Render]:
+    """Draws what `displace` makes of `coarse`, and nothing else, at least `where` it is asked for.
+
+    On their rays and with a constant footprint candidates look the same wherever they stand, and
+    all that is drawn anew is their depth.
+    """
+    if config.degrees_of_freedom == 3 or config.footprint == "fixed":
+        return lambda moved: renderer.render(moved, camera)
+    plan = renderer.freeze(coarse[:0], camera).plan_depths(coarse, where)
+    return lambda moved: plan(z_depths(moved, camera))
 
 
 @dataclass(frozen=True)
@@ -205,23 +210,28 @@ class Objective:
         self,
         candidates: Gaussians,
         frozen_target: FrozenView,
-        target: Camera,
-        anchor: Camera,
-        renderer: Renderer,
+        alone: Callable[[Gaussians], Render],
+        at_anchor: Render,
     ) -> Float[Tensor, ""]:
-        """The loss of `candidates` where they stand."""
+        """The loss of `candidates` where they stand.
+
+        Args:
+            candidates: Where they stand.
+            frozen_target: The scene frozen at the target.
+            alone: Draws them alone at the target.
+            at_anchor: The same as the anchor sees it.
+        """
         c = self.config
         loss = torch.zeros((), device=candidates.means.device)
         if c.depth_of == "composite" or c.rgb_weight > 0:
             together = frozen_target.composite(candidates)
             loss = loss + c.rgb_weight * (together.image - self.image).abs().mean()
-        shown = together if c.depth_of == "composite" else renderer.render(candidates, target)
+        shown = together if c.depth_of == "composite" else alone(candidates)
         loss = loss + c.depth_weight * self.depth_error(
             shown, self.target_depth, self.target_depth.valid & shown.depth_map().valid
         )
-        alone = renderer.render(candidates, anchor)
         return loss + c.stereo_weight * self.depth_error(
-            alone, self.anchor_depth, self.comparable(alone)
+            at_anchor, self.anchor_depth, self.comparable(at_anchor)
         )
 
     def depth_error(self, shown: Render, expected: DepthMap, where: Tensor) -> Float[Tensor, ""]:

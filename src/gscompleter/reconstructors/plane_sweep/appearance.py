@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gscompleter.descent import Adam
 from gscompleter.render import Renderer
-from gscompleter.types import SH_C0, Gaussians, View
+from gscompleter.types import SH_C0, Gaussians, View, sh_from_rgb
 
 OPACITY_STEPS = 15
 """Steps of Adam on the opacities."""
@@ -54,23 +54,24 @@ def fit_colours(gaussians: Gaussians, views: Sequence[View], renderer: Renderer)
     The mean is weighted by the share that the Gaussian has in each pixel: SIRT (Gilbert 1972), as
     the image is linear in the colours.
     """
-    sh, drawn = gaussians.sh.detach().clone(), torch.zeros_like(gaussians.opacities)
+    nothing, colours = gaussians[:0], gaussians.sh[:, 0] * SH_C0 + 0.5
+    plans = [(renderer.freeze(nothing, v.camera).plan_colours(gaussians), v.image) for v in views]
+    drawn = torch.zeros_like(gaussians.opacities)
     for step in range(COLOUR_STEPS):
-        moved = torch.zeros_like(sh[:, 0])
-        for view in views:
-            colours = sh.clone().requires_grad_()
-            image = renderer.render(replace(gaussians, sh=colours), view.camera).image
-            moved += backprojected(image, view.image - image.detach(), colours)
+        moved = torch.zeros_like(colours)
+        for plan, photograph in plans:
+            variable = colours.clone().requires_grad_()
+            image = plan(variable).image
+            moved += backprojected(image, photograph - image.detach(), variable)
             if step == 0:
-                drawn += backprojected(image, torch.ones_like(image), colours).mean(dim=-1)
+                drawn += backprojected(image, torch.ones_like(image), variable).mean(dim=-1)
         # What is hardly drawn is hardly known.
-        sh[:, 0] += moved / drawn.clamp_min(0.05)[:, None] / SH_C0
-    return replace(gaussians, sh=sh)
+        colours = colours + moved / drawn.clamp_min(0.05)[:, None]
+    return replace(gaussians, sh=sh_from_rgb(colours))
 
 
 def backprojected(
-    image: Float[Tensor, "h w 3"], values: Float[Tensor, "h w 3"], sh: Float[Tensor, "n k 3"]
+    image: Float[Tensor, "h w 3"], values: Float[Tensor, "h w 3"], colours: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
     """The sum of `values` over the pixels each Gaussian is drawn on, by its share of them."""
-    (slope,) = torch.autograd.grad(image, sh, values, retain_graph=True)
-    return slope[:, 0] / SH_C0
+    return torch.autograd.grad((image * values).sum(), colours, retain_graph=True)[0]

@@ -1,0 +1,72 @@
+"""Frozen views that are kept from target to target.
+
+A scene only grows while it is completed, and most of its cameras are looked from again at every
+target. What they see of it is frozen once and then extended by what was added since.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Hashable, Sequence
+from itertools import accumulate, pairwise
+
+from gscompleter.frames.thinning import thinned
+from gscompleter.render import FrozenView, Renderer
+from gscompleter.types import Camera, Completion, Gaussians, merge
+
+Views = dict[Hashable, tuple[int, FrozenView]]
+"""By camera, how many Gaussians of the scene are frozen in a view, and the view."""
+
+
+class KeptViews:
+    """What cameras see of the scene that was looked at last.
+
+    Nothing but time depends on whether a view was kept: it is the same as one that is frozen anew.
+    """
+
+    def __init__(self, renderer: Renderer, most: int | None = None) -> None:
+        """
+        Args:
+            renderer: Freezes and extends the views.
+            most: Gaussians of the context, and of what each target added, that are drawn at most;
+                None for all.
+        """
+        self._renderer, self._most = renderer, most
+        self._scene: weakref.ref[Gaussians] | None = None
+        self._views: Views = {}
+
+    def of(self, completion: Completion, cameras: Sequence[Camera]) -> tuple[FrozenView, ...]:
+        """The scene as it stands, frozen at each of `cameras`."""
+        if self._scene is None or self._scene() is not completion.scene:
+            self._scene, self._views = weakref.ref(completion.scene), {}
+        views, keys = self._views, [key_of(camera) for camera in cameras]
+        behind = {views[key][0] if key in views else 0 for key in keys}
+        missing = {count: self._since(completion, count) for count in behind}
+        for camera, key in zip(cameras, keys, strict=True):
+            count, view = views.get(key, (0, None))
+            if view is None:
+                view = self._renderer.freeze(missing[0], camera)
+            elif count < len(completion.scene):
+                view = view.extended(missing[count])
+            views[key] = len(completion.scene), view
+        return tuple(views[key][1] for key in keys)
+
+    def grown(self, before: Gaussians, after: Gaussians) -> None:
+        """Be told that the scene `after` is `before`, and something that was added to it."""
+        if self._scene is not None and self._scene() is before:
+            self._scene = weakref.ref(after)
+
+    def _since(self, completion: Completion, count: int) -> Gaussians:
+        """What is drawn of a scene behind its first `count` Gaussians, as many as it had once."""
+        if self._most is None:
+            return completion.scene[count:]
+        added = [len(result.added) for result in completion.targets]
+        bounds = [0, *accumulate(added, initial=completion.num_kept)]
+        parts = [completion.scene[a:b] for a, b in pairwise(bounds) if a >= count]
+        return merge([completion.scene[:0], *(thinned(part, self._most) for part in parts)])
+
+
+def key_of(camera: Camera) -> Hashable:
+    """What two cameras that draw the same image have in common."""
+    numbers = (*camera.c2w.flatten().tolist(), *camera.K.flatten().tolist())
+    return (*numbers, camera.width, camera.height, camera.near_plane)
