@@ -18,14 +18,16 @@ from gscompleter.descent import Adam
 from gscompleter.render import Renderer
 from gscompleter.types import SH_C0, Gaussians, View, sh_from_rgb
 
-OPACITY_STEPS = 15
+OPACITY_STEPS = 6
 """Steps of Adam on the opacities."""
-LEARNING_RATE = 0.4
+LEARNING_RATE = 1.0
 """Step of Adam, on the logit."""
 REMOVAL_PENALTY = 0.01
 """Cost of an opacity taken away, so that what no photograph objects to stays."""
 COLOUR_STEPS = 4
 """Rounds of correcting the colours."""
+RELAXATION = 1.7
+"""How far a round goes, as a multiple of the mean difference; under 2 the rounds converge."""
 
 
 def fit_appearance(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
@@ -49,7 +51,7 @@ def fit_opacities(gaussians: Gaussians, views: Sequence[View], renderer: Rendere
 
 
 def fit_colours(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
-    """Each colour moved, again and again, by the mean difference from the photographs.
+    """Each colour moved, again and again, along the mean difference from the photographs.
 
     The mean is weighted by the share that the Gaussian has in each pixel: SIRT (Gilbert 1972), as
     the image is linear in the colours.
@@ -66,7 +68,7 @@ def fit_colours(gaussians: Gaussians, views: Sequence[View], renderer: Renderer)
             if step == 0:
                 drawn += backprojected(image, torch.ones_like(image), variable).mean(dim=-1)
         # What is hardly drawn is hardly known.
-        colours = colours + moved / drawn.clamp_min(0.05)[:, None]
+        colours = colours + RELAXATION * moved / drawn.clamp_min(0.05)[:, None]
     return replace(gaussians, sh=sh_from_rgb(colours))
 
 
