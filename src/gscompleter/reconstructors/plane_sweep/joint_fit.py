@@ -17,11 +17,13 @@ from gscompleter.descent import Adam
 from gscompleter.render import Renderer
 from gscompleter.types import Gaussians, View
 
-PASSES = 12
+PASSES = 10
 """How often each photograph is asked."""
-RATES = {"moved": 0.15, "quats": 0.015, "grown": 0.075, "logits": 0.3, "sh": 0.045}
-"""Steps of Adam: on the place, in units of the Gaussian's own size; on the quaternion; on the
+RATES = {"moved": 0.375, "quats": 0.0375, "grown": 0.1875, "logits": 0.75, "sh": 0.1125}
+"""First steps of Adam: on the place, in units of the Gaussian's own size; on the quaternion; on the
 logarithm of the size; on the logit of the opacity; and on the colour."""
+LAST = 0.2
+"""What is left of these steps in the end; they shrink evenly."""
 BETAS = 0.9, 0.99
 """Decay of Adam's means: shorter than usual, as the steps are few."""
 FAINTEST = 0.02
@@ -32,10 +34,12 @@ def fit_jointly(gaussians: Gaussians, views: Sequence[View], renderer: Renderer)
     """`gaussians` fitted to `views` by the squared difference."""
     unknown = unknowns(gaussians)
     optimizer = Adam([(unknown[name], rate) for name, rate in RATES.items()], BETAS)
-    for number in order_of(len(views)):
+    order = order_of(len(views))
+    for step, number in enumerate(order):
         view, fitted = views[number], moved_by(gaussians, unknown)
         image = renderer.render(fitted, view.camera).image
-        optimizer.step((image - view.image).square().mean())
+        left = 1 - (1 - LAST) * step / len(order)
+        optimizer.step((image - view.image).square().mean(), left)
     return moved_by(gaussians, {name: value.detach() for name, value in unknown.items()})
 
 
