@@ -19,7 +19,7 @@ from gscompleter.types import Gaussians, View
 
 PASSES = 10
 """How often each photograph is asked."""
-RATES = {"moved": 0.375, "quats": 0.0375, "grown": 0.1875, "logits": 0.75, "sh": 0.1125}
+RATES = {"moved": 0.2, "quats": 0.0375, "grown": 0.1875, "logits": 0.75, "sh": 0.1125}
 """First steps of Adam: on the place, in units of the Gaussian's own size; on the quaternion; on the
 logarithm of the size; on the logit of the opacity; and on the colour."""
 LAST = 0.2
