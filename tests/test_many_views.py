@@ -155,7 +155,7 @@ def test_the_indices_tell_where_each_gaussian_came_from(found):
         pixels, _ = project(made.gaussians.means[own], view.camera)
         rows, columns = made.pixel_index[own] // SIZE, made.pixel_index[own] % SIZE
         apart = (pixels - torch.stack([columns, rows], dim=-1) - 0.5).norm(dim=-1)
-        assert apart.median() < 1.5
+        assert apart.median() < 1.0
 
 
 def test_the_joint_fit_brings_every_photograph_nearer_and_repeats_itself():
