@@ -68,9 +68,12 @@ def compare(
 ) -> Images:
     """The context and the completed scene as `camera` sees them."""
     with torch.no_grad():
-        before = renderer.render(completion.context, camera).image
-        after = renderer.render(completion.scene, camera).image
-    return Images(before, after, truth)
+        frozen = renderer.freeze(completion.context, camera)
+        if completion.num_kept == len(completion.context):
+            after = frozen.extended(completion.added).context
+        else:  # some of the context was set aside
+            after = renderer.render(completion.scene, camera)
+    return Images(frozen.context.image, after.image, truth)
 
 
 def summarize(
