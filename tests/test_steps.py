@@ -92,6 +92,14 @@ def few_clusters():
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_holes():
+    """Those of this room have some 45 to 60 pixels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(steps, "MIN_PIXELS", 32)
+        yield
+
+
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory) -> Prepared:
     return prepare(walk(), tmp_path_factory.mktemp("walk"), CONFIG)
