@@ -266,7 +266,7 @@ def test_a_plan_of_depths_is_the_composite_at_these_depths():
     context, new = context_and_new()
     frozen, left = CPU.freeze(context, CAMERA), torch.zeros(48, 48, dtype=torch.bool)
     left[:, :16] = True
-    before = z_depths(new, CAMERA)
+    before = z_depths(new.means, CAMERA)
     for ratio in (torch.ones(len(new)), torch.linspace(0.5, 2.0, len(new))):
         depths = before * ratio
         truth, expected = depth_gradient(

@@ -75,12 +75,12 @@ def slide(
 
 def at_depths(gaussians: Gaussians, camera: Camera, depths: Float[Tensor, "n"]) -> Gaussians:
     """`gaussians` on the same rays of `camera` at other z-depths, with a constant footprint."""
-    return slide(gaussians, camera, depths / z_depths(gaussians, camera), "constant")
+    return slide(gaussians, camera, depths / z_depths(gaussians.means, camera), "constant")
 
 
-def z_depths(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n"]:
-    """How far Gaussians stand from `camera` along its axis, in scene units."""
-    return (gaussians.means - camera.center) @ camera.forward
+def z_depths(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n"]:
+    """How far points stand from `camera` along its axis, in scene units."""
+    return (points - camera.center) @ camera.forward
 
 
 def rotation_between(a: Camera, b: Camera) -> float:

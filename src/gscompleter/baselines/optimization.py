@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from gscompleter.geometry import rotations_from
+from gscompleter.geometry import rotations_from, z_depths
 from gscompleter.progress import track
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, View, merge
@@ -157,7 +157,7 @@ def image_slopes(
     if slope is None:
         return torch.zeros_like(means[:, 0]), torch.zeros_like(means[:, 0])
     with torch.no_grad():
-        z = (means - camera.center) @ camera.forward
+        z = z_depths(means, camera)
         across = slope @ camera.c2w[:3, :2]
         focal = torch.stack([camera.K[0, 0], camera.K[1, 1]])
         halves = focal.new_tensor([camera.width / 2, camera.height / 2])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gscompleter.coverage import COVERED
 from gscompleter.frames.drift import drift
+from gscompleter.geometry import z_depths
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, Render, View
 
@@ -107,7 +108,7 @@ def frame_fit(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> Fr
 
 def seen_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
     """The render of `scene`, in the unit of its own depths, which no camera need know yet."""
-    z = (scene.means - camera.center) @ camera.forward
+    z = z_depths(scene.means, camera)
     unit = z[z > 0].median().item() if (z > 0).any() else 1.0
     with torch.no_grad():
         return renderer.render(scene, replace(camera, near=0.1 * unit))

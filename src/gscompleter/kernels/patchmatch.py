@@ -4,10 +4,50 @@ Every pixel reads the field of the previous round only and draws its own random 
 hash, so that the result does not depend on the number of threads.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from gscompleter.kernels.sharing import share
+
+
+class Matched(NamedTuple):
+    """What is matched with what."""
+
+    image: np.ndarray
+    """float32 [h, w, 3]: what is being completed."""
+    weight: np.ndarray
+    """float32 [h, w]: how much each of its pixels counts."""
+    queries: np.ndarray
+    """Pixels (y, x) whose patches are matched [q, 2]."""
+    query_at: np.ndarray
+    """For each pixel the index of its query, or -1 [h, w]."""
+    expected: np.ndarray
+    """float32 [q]: logarithm of the depth that each query should have."""
+    sources: np.ndarray
+    """float32 [s, H, W, 3]: images that patches are taken from."""
+    usable: np.ndarray
+    """bool [s, H, W]: the centres that a patch may have there."""
+    log_depth: np.ndarray
+    """float32 [s, H, W]: logarithm of the depths there."""
+
+
+class Costs(NamedTuple):
+    """What a match costs, besides its difference."""
+
+    radius: int
+    """Of a patch, in pixels."""
+    max_bias: np.float32
+    """Largest shift of a colour channel between two patches."""
+    bias_penalty: np.float32
+    """Cost of such a shift, squared."""
+    depth_penalty: np.float32
+    """Largest cost of a source that lies before the expected depth."""
+    distance_penalty: np.float32
+    """Largest cost of a source far away in the image."""
+    diagonal: np.float32
+    """Pixels that are far away."""
 
 
 @njit(cache=True, inline="always")
@@ -19,12 +59,14 @@ def _hash(value):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _patch_cost(image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias):
+def _patch_cost(matched, costs, y, x, s, sy, sx, bias):
     """Mean squared difference of two patches after the best small shift of each colour channel.
 
     The shift is written to `bias`. Pixels of the patch outside of the image do not count.
     """
-    h, w = image.shape[0], image.shape[1]
+    image, weight, sources = matched.image, matched.weight, matched.sources
+    radius, max_bias, bias_penalty = costs.radius, costs.max_bias, costs.bias_penalty
+    h, w = weight.shape
     total = square = np.float32(0)
     d0 = d1 = d2 = np.float32(0)
     for dy in range(max(-radius, -y), min(radius, h - 1 - y) + 1):
@@ -53,43 +95,20 @@ def _patch_cost(image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_
 
 
 @njit(cache=True, fastmath={"contract"})
-def _prior(nearer, dy, dx, diagonal, depth_penalty, distance_penalty):
+def _prior(costs, nearer, dy, dx):
     """What a source costs for lying before the expected depth, and for being far away."""
     distance = np.float32(np.sqrt(float(dy**2 + dx**2)))
     nearer = max(nearer, np.float32(0))
-    return depth_penalty * min(nearer * nearer, np.float32(1)) + (
-        distance_penalty * min(distance / diagonal, np.float32(1))
+    return costs.depth_penalty * min(nearer * nearer, np.float32(1)) + (
+        costs.distance_penalty * min(distance / costs.diagonal, np.float32(1))
     )
 
 
-def search(
-    image,
-    weight,
-    queries,
-    query_at,
-    expected,
-    sources,
-    usable,
-    log_depth,
-    field,
-    radius,
-    max_bias,
-    bias_penalty,
-    depth_penalty,
-    distance_penalty,
-    rounds,
-    max_reach,
-    seed,
-):
+def search(matched, costs, field, rounds, max_reach, seed):
     """Improve the nearest source patch of every query, by propagation and random search.
 
     Args:
-        image, weight: What is being completed [h, w, 3] and how much each pixel counts [h, w].
-        queries, query_at: Pixels (y, x) whose patches are matched [q, 2], and for each pixel the
-            index of its query or -1 [h, w].
-        expected: Logarithm of the depth each query should have [q].
-        sources, usable, log_depth: Images [s, H, W, 3], the centres a patch may be taken from,
-            and the logarithm of their depths [s, H, W].
+        matched, costs: What is matched, and what matches cost.
         field: Matches (source, y, x) [q, 3]; all of them usable. Written to.
         rounds: Passes of propagation and random search.
         max_reach: Pixels within which the random search begins; it shrinks from there.
@@ -98,93 +117,39 @@ def search(
     Returns:
         The cost of every match [q] and its shift of colour [q, 3].
     """
-    H, W = usable.shape[1:]
-    diagonal = np.float32(np.sqrt(H * H + W * W))
-    given = (image, weight, queries, query_at, expected, sources, log_depth)
-    costs_of = (radius, max_bias, bias_penalty, diagonal, depth_penalty, distance_penalty)
-    cost, shift = np.empty(len(queries), np.float32), np.empty((len(queries), 3), np.float32)
-    share(_rate, len(queries), *given, field, *costs_of, cost, shift)
+    count = len(matched.queries)
+    cost, shift = np.empty(count, np.float32), np.empty((count, 3), np.float32)
+    share(_rate, count, matched, costs, field, cost, shift)
     for number in range(rounds):
         chance = (number, max_reach, seed)
-        found = (field.copy(), field, cost, shift)
-        share(_improve, len(queries), *given, usable, *costs_of, *chance, *found)
+        share(_improve, count, matched, costs, *chance, field.copy(), field, cost, shift)
     return cost, shift
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _rate(
-    begin,
-    end,
-    image,
-    weight,
-    queries,
-    query_at,
-    expected,
-    sources,
-    log_depth,
-    field,
-    radius,
-    max_bias,
-    bias_penalty,
-    diagonal,
-    depth_penalty,
-    distance_penalty,
-    cost,
-    shift,
-):
+def _rate(begin, end, matched, costs, field, cost, shift):
     """Fill in what the matches of the queries from `begin` to `end` cost."""
     bias = np.empty(3, np.float32)
     for i in range(begin, end):
-        y, x = queries[i, 0], queries[i, 1]
+        y, x = matched.queries[i, 0], matched.queries[i, 1]
         s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
-        cost[i] = _patch_cost(
-            image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias
-        ) + _prior(
-            expected[i] - log_depth[s, sy, sx],
-            sy - y,
-            sx - x,
-            diagonal,
-            depth_penalty,
-            distance_penalty,
-        )
+        difference = _patch_cost(matched, costs, y, x, s, sy, sx, bias)
+        nearer = matched.expected[i] - matched.log_depth[s, sy, sx]
+        cost[i] = difference + _prior(costs, nearer, sy - y, sx - x)
         for c in range(3):
             shift[i, c] = bias[c]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _improve(
-    begin,
-    end,
-    image,
-    weight,
-    queries,
-    query_at,
-    expected,
-    sources,
-    log_depth,
-    usable,
-    radius,
-    max_bias,
-    bias_penalty,
-    diagonal,
-    depth_penalty,
-    distance_penalty,
-    number,
-    max_reach,
-    seed,
-    before,
-    field,
-    cost,
-    shift,
-):
+def _improve(begin, end, matched, costs, number, max_reach, seed, before, field, cost, shift):
     """Pass `number` over the queries from `begin` to `end`; `before` is the field of the one
     before."""
+    usable, query_at = matched.usable, matched.query_at
     num_sources, H, W = usable.shape
     h, w = query_at.shape
-    penalties = (diagonal, depth_penalty, distance_penalty)
     bias = np.empty(3, np.float32)
     for i in range(begin, end):
-        y, x = queries[i, 0], queries[i, 1]
+        y, x = matched.queries[i, 0], matched.queries[i, 1]
         best = cost[i]
         state = _hash(
             np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15)
@@ -225,12 +190,11 @@ def _improve(
                 continue
             if s == field[i, 0] and sy == field[i, 1] and sx == field[i, 2]:
                 continue
-            prior = _prior(expected[i] - log_depth[s, sy, sx], sy - y, sx - x, *penalties)
+            nearer = matched.expected[i] - matched.log_depth[s, sy, sx]
+            prior = _prior(costs, nearer, sy - y, sx - x)
             if prior >= best:
                 continue
-            proposed = prior + _patch_cost(
-                image, weight, y, x, sources, s, sy, sx, radius, max_bias, bias_penalty, bias
-            )
+            proposed = prior + _patch_cost(matched, costs, y, x, s, sy, sx, bias)
             if proposed < best:
                 best = proposed
                 field[i, 0], field[i, 1], field[i, 2] = s, sy, sx

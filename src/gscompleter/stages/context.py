@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 
 from gscompleter.errors import InputError
+from gscompleter.geometry import z_depths
 from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.reconstructors import Reconstructor, reconstructed
 from gscompleter.render import Renderer
@@ -43,7 +44,7 @@ def depth_range_of_scene(
     """
     depths = []
     for camera in cameras:
-        z = (scene.means - camera.center) @ camera.forward
+        z = z_depths(scene.means, camera)
         if not (z > 0).any():
             continue
         unit = z[z > 0].median().item()

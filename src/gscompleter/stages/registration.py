@@ -90,8 +90,8 @@ def carry_into_holes(
     A hole is where `scene`, its depth at the target, is not valid. What is continued smoothly is
     the logarithm of d' / d, the correction each ray received.
     """
-    before = (coarse.means - camera.center) @ camera.forward
-    after = (registered.means - camera.center) @ camera.forward
+    before = z_depths(coarse.means, camera)
+    after = z_depths(registered.means, camera)
     error = (after / scene.depth.flatten()[pixel_index].clamp_min(1e-12) - 1).abs()
     agrees = scene.valid.flatten()[pixel_index] & (error < CARRY_TOLERANCE)
 
@@ -118,7 +118,7 @@ def apply_affine(
     paper's Eq. 9 for z-depth models and holds for models of ray distance too. A shift must not
     push anything through the camera: a tenth of its depth is the least that remains.
     """
-    z = (gaussians.means - camera.center) @ camera.forward
+    z = z_depths(gaussians.means, camera)
     ratio = ((affine.scale * z + affine.shift) / z).clamp_min(0.1)
     return slide(gaussians, camera, ratio, footprint)
 
@@ -181,7 +181,7 @@ def drawn_alone(
     if config.degrees_of_freedom == 3 or config.footprint == "fixed":
         return lambda moved: renderer.render(moved, camera)
     plan = renderer.freeze(coarse[:0], camera).plan_depths(coarse, where)
-    return lambda moved: plan(z_depths(moved, camera))
+    return lambda moved: plan(z_depths(moved.means, camera))
 
 
 @dataclass(frozen=True)

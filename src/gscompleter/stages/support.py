@@ -19,6 +19,7 @@ from torch.nn.functional import avg_pool2d, normalize
 
 from gscompleter.config import SupportConfig
 from gscompleter.generators.robust import robust_affine
+from gscompleter.geometry import z_depths
 from gscompleter.render import Renderer
 from gscompleter.types import SH_C0, Camera, Evidence, Gaussians, Render, View, observed
 
@@ -130,7 +131,7 @@ def front(
     What is unsupported is seldom a surface. Something new stands `STANDOFF` standard deviations of
     depth before the mean: nearer, photographs from aside would see it stand before the scene.
     """
-    z = ((scene.means - camera.center) @ camera.forward).clamp_min(0.0)
+    z = z_depths(scene.means, camera).clamp_min(0.0)
     unit = drawn.depth.max().clamp_min(1e-12)
     squares = composited((z / unit).clamp_max(2.0) ** 2, scene, camera, renderer)
     mean = drawn.depth / unit
@@ -168,7 +169,7 @@ def coloured(scene: Gaussians, sh: Float[Tensor, "n 1 3"]) -> Gaussians:
 
 def pixel_areas(scene: Gaussians, camera: Camera) -> Float[Tensor, "n"]:
     """The area that a pixel covers at each Gaussian, in squared scene units."""
-    z = (scene.means - camera.center) @ camera.forward
+    z = z_depths(scene.means, camera)
     return z.clamp_min(0.0) ** 2 / (camera.K[0, 0] * camera.K[1, 1])
 
 

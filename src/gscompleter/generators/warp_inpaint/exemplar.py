@@ -3,6 +3,8 @@ Completion, 2007; Barnes et al., PatchMatch, 2009; Darabi et al., Image Melding,
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -136,7 +138,8 @@ def solve(
     matches = initial_matches(queries, coarse_field, usable, seed)
     images = np.ascontiguousarray(level.sources.images.numpy())
     log_depth = np.ascontiguousarray(level.sources.log_depth.numpy())
-    expected = level.expected.numpy()[near_hole]
+    asked = (queries, query_at, level.expected.numpy()[near_hole])
+    costs = costs_in(usable.shape[1:])
 
     def voted() -> Float32[ndarray, "p 3"]:
         return patchmatch.vote(hole, query_at, votes, images, matches, shift, RADIUS)[0]
@@ -146,25 +149,8 @@ def solve(
         current[~known] = voted()
     reach = max(usable.shape) if coarse_field is None else FINE_REACH
     for number in range(rounds):
-        cost, shift = patchmatch.search(
-            current,
-            weight,
-            queries,
-            query_at,
-            expected,
-            images,
-            usable,
-            log_depth,
-            matches,
-            RADIUS,
-            np.float32(MAX_BIAS),
-            np.float32(BIAS_PENALTY),
-            np.float32(DEPTH_PENALTY),
-            np.float32(DISTANCE_PENALTY),
-            2,
-            reach,
-            seed + 31 * number,
-        )
+        matched = patchmatch.Matched(current, weight, *asked, images, usable, log_depth)
+        cost, shift = patchmatch.search(matched, costs, matches, 2, reach, seed + 31 * number)
         likely = np.exp(-cost / (2 * max(float(np.percentile(cost, 75)), 1e-6)))
         votes = (weight[near_hole] * likely).astype(np.float32)
         current[~known] = voted()
@@ -177,6 +163,12 @@ def trust(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]:
     """How much a pixel counts when patches are compared: less, the deeper it lies in the hole."""
     away = distance_to_known(known).numpy()
     return np.where(known, 1.0, np.maximum(CONFIDENCE**away, 0.05)).astype(np.float32)
+
+
+def costs_in(size: Sequence[int]) -> patchmatch.Costs:
+    """What matches cost in images of a size (height, width)."""
+    weights = MAX_BIAS, BIAS_PENALTY, DEPTH_PENALTY, DISTANCE_PENALTY, math.hypot(*size)
+    return patchmatch.Costs(RADIUS, *map(np.float32, weights))
 
 
 def usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
+from gscompleter.geometry import z_depths
 from gscompleter.reconstructors.feed_forward.depthsplat import DepthSplat
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
 from gscompleter.reconstructors.feed_forward.inputs import Crop, batch_of
@@ -114,5 +115,5 @@ def gaussians_of(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
 
 def depth_map_of(means: Float[Tensor, "n 3"], view: View, crop: Crop) -> DepthMap:
     """z-depth of the Gaussians of the crop, in the whole image."""
-    z = (means - view.camera.center) @ view.camera.forward
+    z = z_depths(means, view.camera)
     return crop.padded(z.view(crop.height, crop.width), view.camera)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32
@@ -40,7 +41,7 @@ class Sweep:
     margin: Map
     """How much more the second best costs."""
 
-    @property
+    @cached_property
     def inverse(self) -> Map:
         """Inverse depths of the best planes."""
         return inverse_at(self.planes, self.index)
