@@ -31,6 +31,13 @@ def test_when_every_view_is_turned_too_far_the_least_turned_wins_and_says_so():
     assert (choice.index, choice.fallback) == (1, True)
 
 
+def test_a_view_from_where_the_target_stands_tells_no_depth():
+    views = [view(x=0, yaw=20), view(x=1, yaw=60), view(x=2, yaw=30)]
+    assert select_anchor(TARGET, views, overlaps=[0.5, 0.1, 0.1]).index == 2
+    assert select_anchor(TARGET, views[:2]).index == 1
+    assert select_anchor(TARGET, views[:1]).index == 0
+
+
 def test_the_largest_rotation_is_a_setting():
     views = [view(x=1, yaw=10), view(x=3, yaw=40)]
     assert select_anchor(TARGET, views, AnchorConfig(max_rotation=30.0)).index == 0
@@ -115,6 +122,6 @@ def test_a_view_that_shows_something_else_loses_however_wide_its_baseline():
     views = [view_of(Room(), camera_at(x)) for x in (0.2, 0.6, 2.0)]
     assert select_anchor(target, views).index == 2
     assert select_anchor(target, views, overlaps=[0.9, 0.5, 0.1]).index == 1
-    assert select_anchor(target, views, overlaps=[0.1, 0.05, 0.0]).index == 2
+    assert select_anchor(target, views, overlaps=[0.1, 0.05, 0.0]).index == 0
     literal = AnchorConfig(min_overlap=0.0)
     assert select_anchor(target, views, literal, [0.9, 0.5, 0.0]).index == 2

@@ -124,10 +124,21 @@ def test_the_estimated_range_encloses_what_the_views_see(unit):
     assert far < 500 * unit
 
 
+def test_along_a_path_the_range_is_told_by_those_that_see_the_same():
+    hall = Room((((-3.0, -1.5, -1.0), (20.0, 1.5, 5.0)),))
+    views = [view_of(hall, camera_at(x=2.0 * i, size=160)) for i in range(8)]
+    views = [replace(v, camera=replace(v.camera, near=None, far=None)) for v in views]
+    near, far = estimate_depth_range(views)
+    assert 0.5 < near < min(view.depth.min() for view in views)
+    assert 5.0 < far < 100
+
+
 def test_without_texture_the_baseline_sets_the_range():
     flat = [replace(v, image=torch.full_like(v.image, 0.5)) for v in side_by_side()]
     near, far = estimate_depth_range(flat)
     assert 0 < near < far
+    beyond = replace(flat[1], camera=camera_at(x=50.0))
+    assert estimate_depth_range([*flat, beyond]) == pytest.approx((near, far), rel=1e-3)
 
 
 def test_what_the_camera_knows_of_the_range_is_taken_and_the_rest_estimated():

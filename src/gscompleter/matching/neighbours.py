@@ -8,16 +8,16 @@ number of photographs and not with its square.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from gscompleter.kernels.sharing import side_by_side
-from gscompleter.matching.depth_range import inverse_depths
 from gscompleter.matching.features import Pixels, features_of, matches
 from gscompleter.matching.stereo_image import StereoImage
+from gscompleter.matching.triangulation import inverse_depths
 
 COUNT = 2
 """Photographs that each one is matched with."""
@@ -45,6 +45,11 @@ class Neighbours:
     """The photographs that each one is matched with, the best one first."""
     matches: Matches
     """Features that were found in both, for all pairs that were compared."""
+
+    @property
+    def pairs(self) -> list[Pair]:
+        """Photographs i < j of which one is matched with the other."""
+        return ascending((i, j) for i, others in enumerate(self.of) for j in others)
 
     def either_way(self, number: int) -> list[int]:
         """Those that photograph `number` is matched with, or that are matched with it."""
@@ -76,6 +81,11 @@ def close_pairs(images: Sequence[StereoImage]) -> list[Pair]:
     unlike = apart / step + 2 * turned / TURN
     nearest = unlike.argsort(axis=1, kind="stable")[:, :CANDIDATES]
     pairs = {(i, int(j)) for i, row in enumerate(nearest) for j in row if np.isfinite(unlike[i, j])}
+    return ascending(pairs)
+
+
+def ascending(pairs: Iterable[Pair]) -> list[Pair]:
+    """Each of `pairs` once, the smaller number first."""
     return sorted({(min(pair), max(pair)) for pair in pairs})
 
 

@@ -1,0 +1,37 @@
+"""How far away a feature lies that two photographs share."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.matching.features import Pixels
+from gscompleter.matching.stereo_image import StereoImage, source_from_reference
+
+MAX_ERROR = 3.0
+"""Pixels that a match may lie off its epipolar line: poses are noisy."""
+MIN_PARALLAX = 1.0
+"""Pixels that a match must move to tell a depth."""
+
+
+def inverse_depths(
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> Float[np.ndarray, "k"]:
+    """Inverse z-depths in `reference` of the matches that lie on their epipolar lines.
+
+    A match that hardly moves tells nothing of depth.
+    """
+    transform = source_from_reference(reference, source).astype(np.float64)
+    at_infinity = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ transform[:, :3].T
+    b = transform[:, 3]
+    # Least squares of matched * (A p + b w)_2 = (A p + b w)_xy in w.
+    slope = b[:2] - matched * b[2]
+    offset = matched * at_infinity[:, 2:] - at_infinity[:, :2]
+    inverse = (slope * offset).sum(1) / np.maximum((slope * slope).sum(1), 1e-12)
+    at_depth = at_infinity + inverse[:, None] * b
+    ahead = (at_depth[:, 2] > 1e-6) & (at_infinity[:, 2] > 1e-6)
+    scale = np.where(ahead, at_depth[:, 2], 1.0)[:, None]
+    error = np.linalg.norm(at_depth[:, :2] / scale - matched, axis=1)
+    start = at_infinity[:, :2] / np.where(ahead, at_infinity[:, 2], 1.0)[:, None]
+    parallax = np.linalg.norm(start - matched, axis=1)
+    return inverse[ahead & (inverse > 0) & (error < MAX_ERROR) & (parallax > MIN_PARALLAX)]
