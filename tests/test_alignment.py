@@ -97,15 +97,47 @@ def test_an_affine_that_the_target_contradicts_is_fitted_there():
 
 
 def test_an_affine_that_the_target_confirms_or_cannot_judge_stays():
-    assert checked(1.0, depths() * 1.02) == DepthAffine(1.0, 0.0, 0.9, "ransac")
-    unlike = torch.rand(64, 64, generator=torch.Generator().manual_seed(5)) * 50
-    assert not checked(1.0, unlike).contradicted
+    assert checked(1.0, depths() * 1.02) == DepthAffine(1.0, 0.0, 0.9, "ransac", 1.0)
     none = DepthMap(depths(), torch.zeros(64, 64, dtype=torch.bool))
     affine = DepthAffine(3.0, 0.0, 0.9, "ransac")
     random = torch.Generator()
     assert unless_contradicted(affine, everywhere(depths()), none, random, AffineConfig()) == affine
 
 
+def unlike() -> torch.Tensor:
+    """Depths of no relation to any others."""
+    return torch.rand(64, 64, generator=torch.Generator().manual_seed(5)) * 50
+
+
+def test_where_no_affine_fits_what_the_target_sees_the_one_of_the_anchor_is_refuted():
+    affine = checked(1.0, unlike())
+    assert (affine.refuted, affine.contradicted, affine.scale) == (True, False, 1.0)
+    assert 0 < affine.agreement < 0.1
+    assert not checked(1.0, unlike(), AffineConfig(min_merged=None)).refuted
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.4])
+def test_where_enough_agrees_the_affine_is_not_refuted(share):
+    like = torch.rand(64, 64, generator=torch.Generator().manual_seed(6)) < share
+    affine = checked(1.0, torch.where(like, depths(), unlike()))
+    assert affine.refuted == (share < 0.15)
+    assert affine.agreement == pytest.approx(share, abs=0.05)
+
+
+def test_what_is_seen_of_little_refutes_nothing():
+    seen = torch.zeros(128, 128, dtype=torch.bool)
+    seen[:10, :10] = True
+    random, config = torch.Generator().manual_seed(0), AffineConfig()
+    predicted = everywhere(depths(size=128))
+    through_anchor = DepthAffine(1.0, 0.0, 0.9, "ransac")
+    for share, refuted in ((seen, False), (torch.ones_like(seen), True)):
+        context = DepthMap(unlike().repeat(2, 2), share)
+        affine = unless_contradicted(through_anchor, predicted, context, random, config)
+        assert affine.refuted == refuted
+        assert affine.agreement < 0.1
+
+
 def test_the_paper_trusts_the_anchor_always():
     config = CompleterConfig.paper().registration.affine
-    assert checked(1.2, depths() / 5, config) == DepthAffine(1.2, 0.0, 0.9, "ransac")
+    for context in (depths() / 5, unlike()):
+        assert checked(1.2, context, config) == DepthAffine(1.2, 0.0, 0.9, "ransac")

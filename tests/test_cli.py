@@ -90,7 +90,7 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
     (target,) = summary["targets"]
     assert set(target) >= {"frame", "anchor", "anchor_fallback", "hole_fraction", "affine", *scores}
     assert (target["frame"], target["anchor"], target["anchor_fallback"]) == (2, 0, False)
-    assert set(target["affine"]) == {"scale", "shift", "inliers", "method"}
+    assert set(target["affine"]) == {"scale", "shift", "inliers", "method", "agreement"}
     assert target["hole_fraction"] > 0.1
     assert target["psnr_after"] > target["psnr_before"] + 1
     for row in summary["context"]:

@@ -19,6 +19,7 @@ from gscompleter.generators import Synthesis
 from gscompleter.geometry import project
 from gscompleter.metrics.image import psnr
 from gscompleter.render.cpu import CpuRenderer
+from gscompleter.reports.completion import Target, write_report
 from gscompleter.stages.anchor import lift
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import hole_mask, is_undone
@@ -378,6 +379,55 @@ def test_what_the_photographs_contradict_is_reported_and_not_added():
     assert torch.equal(result.after.image, result.before.image)
     literal = replace(completer, config=CompleterConfig.paper())(context, target)
     assert len(literal.added) > 0
+
+
+class Confused(KnowingReconstructor):
+    """Ψ whose depths of an image that was not photographed have nothing to do with the room."""
+
+    def __call__(self, views):
+        random = torch.Generator().manual_seed(1)
+        depths = []
+        for view in views:
+            depth = view_of(Room(), view.camera).depth
+            unlike = 0.5 * 40 ** torch.rand(depth.shape, generator=random)
+            depths.append(unlike if view.frame is None else depth)
+        return reconstruction_of(views, depths)
+
+
+def test_depths_that_the_scene_contradicts_are_reported_and_not_added(tmp_path):
+    context, target = photographs(), cameras()[1]
+    completer = GSCompleter(Confused(), KnowingGenerator())
+    refused = completer(context, target)
+    (result,) = refused.targets
+    assert len(refused.added) == len(result.added) == 0
+    assert result.affine.refuted
+    assert result.losses == {}
+    assert torch.equal(result.after.image, result.before.image)
+    summary = write_report(tmp_path, refused, [Target(target)], completer.renderer, {})
+    (said,) = summary["targets"]
+    assert said["added"] == 0
+    assert said["affine"]["agreement"] < 0.1
+    assert "the scene contradicts the depths of what was synthesized" in said["notes"][0]
+    assert said["notes"][-1] == "Nothing of it was added."
+    literal = replace(completer, config=CompleterConfig.paper())(context, target)
+    assert len(literal.added) > 0
+
+
+def test_a_scene_that_is_doubted_refutes_nothing():
+    context, target = photographs(), cameras()[1]
+    completer = GSCompleter(Confused(), KnowingGenerator())
+    scene = completer.begin(context).context
+    for witnesses, refuted in ((None, True), ([], False)):
+        (result,) = completer(context, target, scene, witnesses).targets
+        assert result.affine.refuted == refuted
+        assert result.affine.agreement < 0.1
+
+
+def test_depths_that_are_a_little_wrong_are_mended_and_added():
+    (result,) = completed(CompleterConfig()).targets
+    assert not result.affine.refuted
+    assert result.affine.agreement > 0.5
+    assert len(result.added) > 0
 
 
 def test_what_photographs_make_fade_is_not_added():

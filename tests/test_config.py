@@ -48,7 +48,7 @@ def test_a_yaml_file_names_only_what_differs(tmp_path):
     file.write_text("base: paper\nholes: {dilation: 5}\nregistration: {affine: {bridge: none}}\n")
     config = load_config(str(file))
     assert config.holes == HoleConfig(dilation=5, neighbourhood=None)
-    assert config.registration.affine == AffineConfig(bridge="none", min_agreement=None)
+    assert config.registration.affine == AffineConfig("none", min_agreement=None, min_merged=None)
     assert config.registration.step == "literal"
 
 

@@ -1,6 +1,7 @@
 """The door of `complete`: sizes, chosen frames, what is said first, and a user's own file."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +14,14 @@ from command import run
 from gscompleter import InputError, load_cameras, load_ply, save_ply
 from gscompleter.cli import parsed
 from gscompleter.commands import complete as command
+from gscompleter.commands import opening
 from gscompleter.commands.evaluate import chosen_tasks
+from gscompleter.commands.opening import Opened, Task, read_task
+from gscompleter.commands.options import CompleteOptions
+from gscompleter.commands.understood import budget_line
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
+from gscompleter.memory import images_that_fit, needed_bytes
 from pose_files import write_colmap_text, write_photographs
 from scenes import camera_at, photographed
 
@@ -84,8 +90,8 @@ def test_without_a_context_the_frames_that_matter_are_taken(chosen):
     assert target["psnr_after"] > target["psnr_before"] + 1
 
 
-def test_three_lines_come_before_the_work(scene, chosen):
-    out, (opened, found, plan) = chosen
+def test_four_lines_come_before_the_work(scene, chosen):
+    out, (opened, found, plan, budget) = chosen
     assert opened == (
         f"Opened: {scene}, nerfstudio, 5 photographs, 1 camera with no lens distortion, no points."
     )
@@ -96,6 +102,62 @@ def test_three_lines_come_before_the_work(scene, chosen):
         "To do: context from frames 0, 1, 4 (chosen), completed for frame 2 by plane-sweep and "
         f"warp-inpaint on cpu, written to {out}."
     )
+    assert re.fullmatch(
+        r"Budget: at most 3 of 4 photographs for the context \(--context names others\), up to "
+        r"1 GB of [0-9,]+ GB of memory, about 1 s to reconstruct the context on two cores of 2\.8 "
+        r"GHz\.",
+        budget,
+    )
+
+
+def opened_with(scene: Path, *words: object) -> tuple[CompleteOptions, Task]:
+    """What is asked of `scene`, and what is to be done there; nothing is completed."""
+    options = parsed([str(word) for word in ("complete", scene, *words, "--out", "OUT")])
+    photographs = open_photographs(scene, near=0.5, far=20.0)
+    return options, read_task(options, Opened(photographs, "nerfstudio", 5), "cpu")
+
+
+def test_fewer_photographs_are_chosen_where_there_is_no_memory_for_more(scene, monkeypatch):
+    pixels = SIZE * SIZE
+    for fit, chosen in ((9, 3), (3, 2), (0, 2)):
+        monkeypatch.setattr(opening, "images_that_fit", lambda _pixels, fit=fit: fit)
+        options, task = opened_with(scene, "--target", TARGET)
+        assert len(task.views) == chosen
+        said = budget_line(options, task, "cpu")
+        assert said.startswith(f"at most {chosen} of 4 photographs for the context")
+        assert (", for there is no memory for 3 (" in said) == (chosen < 3)
+    for memory in (needed_bytes(pixels, 3), needed_bytes(pixels, 3) - 1):
+        monkeypatch.setattr("gscompleter.memory.memory_bytes", lambda memory=memory: memory)
+        assert images_that_fit(pixels) == (3 if memory == needed_bytes(pixels, 3) else 2)
+
+
+def test_a_context_that_is_named_is_the_one_that_is_taken(scene):
+    options, task = opened_with(scene, "--target", TARGET, "--context", 0, 4)
+    assert [view.frame for view in task.views] == [0, 4]
+    said = budget_line(options, task, "cpu")
+    assert said.startswith("2 photographs for the context, as named, up to 1 GB ")
+    assert "to reconstruct the context on two cores" in said
+    assert not budget_line(options, task, "cuda").endswith("GHz")
+
+
+def test_time_and_memory_that_are_said_grow_with_pixels_and_photographs(scene):
+    words = ("--target", TARGET, "--context")
+    _, pair = opened_with(scene, *words, 0, 4)
+    options, more = opened_with(scene, *words, 0, 1, 3, 4)
+
+    def large(task: Task, side: int) -> Task:
+        cameras = [replace(view.camera, width=side, height=side) for view in task.views]
+        views = [replace(v, camera=c) for v, c in zip(task.views, cameras, strict=True)]
+        return replace(task, views=views)
+
+    def seconds(task: Task) -> int:
+        found = re.search(r"about ([0-9,]+) s to reconstruct", budget_line(options, task, "cpu"))
+        return int(found[1].replace(",", ""))
+
+    assert seconds(large(pair, 1000)) == 40
+    assert seconds(large(more, 1000)) == 80
+    assert seconds(large(pair, 2000)) == 160
+    assert "up to 4 GB of " in budget_line(options, large(pair, 1000), "cpu")
 
 
 def test_the_summary_says_what_was_opened_and_between_which_depths(chosen):

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.config import CompleterConfig
+from gscompleter.config import CompleterConfig, RegistrationConfig
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
@@ -260,6 +260,10 @@ class GSCompleter:
             lifted = self.lift(sight, reference)
         with clock("register"):
             registration = self.register(sight, lifted, reference, frozen_views)
+        result = replace(result, affine=registration.affine)
+        if registration.affine.refuted:
+            notes = notes_of(sight.anchor.fallback, registration.affine)
+            return replace(result, notes=(*reference.notes, *notes, NOTHING_ADDED))
         with clock("integrate"):
             kept = self.keep(sight, lifted, registration, frozen_views)
             added, losses = self.refine(sight, kept, reference, frozen_views)
@@ -267,7 +271,6 @@ class GSCompleter:
         return replace(
             result,
             after=after,
-            affine=registration.affine,
             added=added,
             losses={"register": registration.losses, "refine": losses},
             notes=(
@@ -349,9 +352,17 @@ class GSCompleter:
             sight.anchor_view.camera,
             self.renderer,
             torch.Generator().manual_seed(self.seed),
-            self.config.registration,
+            self.registration(sight),
             self.config.holes.max_alpha,
         )
+
+    def registration(self, sight: Sight) -> RegistrationConfig:
+        """How candidates are registered. A scene that is doubted refutes none: where it is wrong,
+        what is right differs from it, and its photographs judge what is added."""
+        config = self.config.registration
+        if sight.believed is None:
+            return config
+        return replace(config, affine=replace(config.affine, min_merged=None))
 
     def keep(
         self,
@@ -638,6 +649,11 @@ def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
         notes.append(
             "At the target the scene contradicted the depths that fit the anchor; they were fitted "
             "there instead."
+        )
+    if affine.refuted:
+        notes.append(
+            "At the target the scene contradicts the depths of what was synthesized: with "
+            f"{affine.agreement:.0%} of what is seen of it they agree, and no other fit is better."
         )
     if affine.method == "median":
         notes.append("RANSAC found no trustworthy affine; the median depth ratio took its place.")

@@ -8,15 +8,15 @@ from pathlib import Path
 
 from gscompleter.errors import InputError, quoted
 
-PROGRAM_BYTES = 600 * 10**6
+PROGRAM_BYTES = 550 * 10**6
 """What the program holds whatever the size of the images."""
-BYTES_PER_PIXEL = 6_500
-"""What a completion holds for each pixel of the target, as it was asked for: costs of up to 256
-planes of the target widened by a quarter on every side, and of the anchor. Measured on two
-photographs: 0.75 GB at 256 x 256, 2.8 GB at 512 x 768."""
-BYTES_PER_PIXEL_OF_A_VIEW = 600
+BYTES_PER_PIXEL = 2_500
+"""What a completion holds for each pixel of the target, as it was asked for: costs of planes of the
+target widened by a quarter on every side, and of the anchor. Measured on two photographs: 0.67 GB
+at 256 x 256, 1.51 GB at 512 x 768; a wider range of depth, and so more planes, is left room for."""
+BYTES_PER_PIXEL_OF_A_VIEW = 250
 """What it holds for each pixel of each image besides: the image, its Gaussians, its renders.
-Measured on four photographs instead of two at 256 x 256."""
+Measured on eight photographs instead of two, at 256 x 256 and 480 x 480."""
 
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 """Where Linux tells what a container may hold, in its newer and its older way."""
@@ -36,7 +36,7 @@ def check_memory(pixels: int, images: int) -> None:
     if there is not None and needed > there:
         raise InputError(
             f"{quoted(f'{images:,}')} images of up to {quoted(f'{pixels:,}')} pixels need about "
-            f"{_gigabytes(needed)} of memory, and there are {_gigabytes(there)}; choose a smaller "
+            f"{gigabytes(needed)} of memory, and there are {gigabytes(there)}; choose a smaller "
             "resolution, or fewer views.",
             "resolution",
         )
@@ -45,6 +45,17 @@ def check_memory(pixels: int, images: int) -> None:
 def needed_bytes(pixels: int, images: int) -> int:
     """About how much memory a completion holds at most. Arguments as in `check_memory`."""
     return PROGRAM_BYTES + pixels * (BYTES_PER_PIXEL + images * BYTES_PER_PIXEL_OF_A_VIEW)
+
+
+def images_that_fit(pixels: int) -> int | None:
+    """How many images of so many pixels, context views and targets together, there is memory for;
+    None where nobody tells. What other programs hold is not asked: the same command has to choose
+    the same photographs."""
+    there = memory_bytes()
+    if there is None:
+        return None
+    left = there - needed_bytes(pixels, 0)
+    return max(0, left // (pixels * BYTES_PER_PIXEL_OF_A_VIEW))
 
 
 def memory_bytes() -> int | None:
@@ -63,5 +74,6 @@ def _limit(path: str) -> int | None:
     return int(word) if word.isdecimal() else None  # the newer way says "max"
 
 
-def _gigabytes(number: int) -> str:
+def gigabytes(number: int) -> str:
+    """A number of bytes in whole GB, rounded up, for a user."""
     return quoted(f"{-(-number // 10**9):,} GB")

@@ -288,8 +288,13 @@ class DepthAffine:
     """Share of the compared pixels that agree with the fit."""
     method: Literal["ransac", "median", "identity"] = "identity"
     """How the fit was found; the later ones are the fallbacks of the earlier."""
+    agreement: float | None = None
+    """Share of what the target sees of the scene that agrees with it; None where that was not
+    asked, or too little was seen."""
     contradicted: bool = False
     """True where what the target sees of the scene took the place of what the anchor sees."""
+    refuted: bool = False
+    """True where what the target sees agrees neither with it nor with any other."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from gscompleter.commands.exploring import (
     cameras_of,
     completed,
     coverage,
-    most,
     name_of,
     planned,
     tell_plan,
@@ -32,7 +31,7 @@ from gscompleter.commands.opening import (
     with_witnesses,
     with_working_range,
 )
-from gscompleter.commands.options import CompleteOptions
+from gscompleter.commands.options import CompleteOptions, most
 from gscompleter.commands.output import (
     opened_as,
     replaceable,

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.commands.opening import Opened, Task, usable_cameras
-from gscompleter.commands.options import FOUND, CompleteOptions, working_size
+from gscompleter.commands.options import CompleteOptions, most, working_size
 from gscompleter.completer import check_numbers
 from gscompleter.data.origin import frame_from_photographs
 from gscompleter.data.scene import write_cameras
@@ -26,9 +26,10 @@ from gscompleter.types import Camera, Completion
 
 TARGETS = "targets.json"
 """The file of the output with the cameras that are completed."""
-LIFTED_VIEWS = 4
+LIFTED_VIEWS = 3
 """What completing a camera takes, in photographs of the context: its wider image and the anchor's
-are reconstructed, and the result is registered and fitted."""
+are reconstructed, and the result is registered and fitted. 1.8 to 3.3 were measured
+(docs/performance.md)."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class Plan:
     """Share of the image of each target that is a hole, once those before are completed."""
     seconds: float | None
     """About what each takes; None where nothing tells."""
+    context_seconds: float
+    """What the context took."""
 
 
 def cameras_of(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:
@@ -81,7 +84,7 @@ def planned(
         choices = explorer.plan(begun, list(cameras.values()), most(options))
         task = replace(task, targets=targets_of(choices, list(cameras)))
         holes = [choice.hole for choice in choices]
-    return Plan(task, tuple(holes), seconds_of(options, begun))
+    return Plan(task, tuple(holes), seconds_of(options, begun), begun.seconds["context"])
 
 
 def seconds_of(options: CompleteOptions, begun: Completion) -> float | None:
@@ -109,7 +112,10 @@ def sentence_of(plan: Plan, out: Path) -> str:
         return "No camera was found that has much to gain; nothing is to be completed."
     said = "how long that takes shows only then"
     if plan.seconds is not None:
-        said = f"which takes about {plan.seconds * number:.0f} s after the context"
+        said = (
+            f"which takes about {plan.seconds * number:.0f} s after the context, which took "
+            f"{plan.context_seconds:.0f} s"
+        )
     counted = "1 camera" if number == 1 else f"{number} cameras"
     return f"To complete: {counted}, {said}. Edit them in {quoted(out / TARGETS)}."
 
@@ -119,11 +125,6 @@ def name_of(frame: int | None, near: int | None) -> str:
     if near is not None:
         return f"target near {near}"
     return "target" if frame is None else f"target {frame}"
-
-
-def most(options: CompleteOptions) -> int:
-    """How many targets are found."""
-    return FOUND if options.auto is None else options.auto
 
 
 def targets_of(choices: Iterable[Choice], frames: Sequence[int]) -> list[Target]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 from torch import Tensor
 
-from gscompleter.commands.options import CompleteOptions, SceneOptions, working_size
+from gscompleter.commands.options import CompleteOptions, SceneOptions, most, working_size
 from gscompleter.completer import ranged
 from gscompleter.data.formats import open_photographs, recognised
 from gscompleter.data.framing import Resolution
@@ -32,7 +32,7 @@ from gscompleter.frames.similarity import moved_camera, moved_view
 from gscompleter.io.files import SUMMARY
 from gscompleter.io.ply import drawable_rows
 from gscompleter.matching.depth_range import estimate_depth_range
-from gscompleter.memory import check_memory
+from gscompleter.memory import check_memory, images_that_fit
 from gscompleter.progress import shown_on
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.reports.completion import Brought, Target
@@ -71,6 +71,18 @@ class Opened:
 
 
 @dataclass(frozen=True)
+class ContextBudget:
+    """How many photographs a context that nobody named may be made of."""
+
+    usable: int
+    """Photographs to choose from."""
+    wanted: int
+    """As many as are worth their time."""
+    allowed: int
+    """As many of these as there is memory for, but never fewer than the work starts from."""
+
+
+@dataclass(frozen=True)
 class DepthSource:
     """Who told the depth range of a scene: given, scene, points, splat or features."""
 
@@ -100,6 +112,8 @@ class Task:
     """The same, for the user."""
     witnesses: Sequence[View] | None = None
     """The other photographs of `scene`, small: they tell what of it is supported."""
+    budget: ContextBudget | None = None
+    """How many photographs might be chosen; None where they were named."""
 
 
 def open_scene(options: SceneOptions, console: Console) -> Opened:
@@ -134,8 +148,11 @@ def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
     """
     given = opened.photographs
     targets = read_targets(given, options)
-    frames = options.context or chosen_context(options, given, targets)
-    return task_of(options, given, frames, targets, device, check_sizes)
+    if options.context:
+        return task_of(options, given, options.context, targets, device, check_sizes)
+    frames, budget = chosen_context(options, given, targets)
+    task = task_of(options, given, frames, targets, device, check_sizes)
+    return replace(task, budget=budget)
 
 
 def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task:
@@ -259,9 +276,9 @@ def needed_views(options: SceneOptions) -> int:
 
 def chosen_context(
     options: CompleteOptions, given: Photographs, targets: Sequence[Target]
-) -> tuple[int, ...]:
+) -> tuple[tuple[int, ...], ContextBudget]:
     """Frames that matter to the targets, or where there are none, that show most of the scene;
-    never a target itself, whose photograph is for scoring.
+    never a target itself, whose photograph is for scoring. And how many there might be.
 
     Raises:
         InputError: where too few photographs are left, or nothing tells how far away things are.
@@ -281,12 +298,26 @@ def chosen_context(
     points = given.points()
     if points is None or len(points) == 0:
         points = points_told(given, wanted, cameras)
+    budget = context_budget(options, candidates, targets)
     if not targets:
-        chosen = select_overview(candidates, points, CHOSEN_FOR_ALL)
+        chosen = select_overview(candidates, points, budget.allowed)
     else:
-        count = CHOSEN if options.scene is None else CHOSEN_WITH_SCENE
-        chosen = select_context(wanted, candidates, points, count)
-    return tuple(frames[index] for index in chosen)
+        chosen = select_context(wanted, candidates, points, budget.allowed)
+    return tuple(frames[index] for index in chosen), budget
+
+
+def context_budget(
+    options: CompleteOptions, candidates: Sequence[Camera], targets: Sequence[Target]
+) -> ContextBudget:
+    """How many of the photographs that `candidates` took may be chosen."""
+    wanted = CHOSEN if options.scene is None else CHOSEN_WITH_SCENE
+    if not targets:
+        wanted = CHOSEN_FOR_ALL
+    cameras = [*candidates, *(target.camera for target in targets)]
+    fit = images_that_fit(max(camera.width * camera.height for camera in cameras))
+    left = wanted if fit is None else fit - (len(targets) or most(options))
+    allowed = max(needed_views(options), min(wanted, left))
+    return ContextBudget(len(candidates), wanted, allowed)
 
 
 def usable_cameras(

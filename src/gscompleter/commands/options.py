@@ -286,6 +286,11 @@ class ModelsOptions(Settings):
     """Print everything that is known of them as JSON."""
 
 
+def most(options: CompleteOptions) -> int:
+    """How many targets are found, where none is named."""
+    return FOUND if options.auto is None else options.auto
+
+
 def working_size(given: Size) -> tuple[int, int] | int | None:
     """What `--resolution` asks for, as posed photographs take it."""
     return None if given == "full" else given

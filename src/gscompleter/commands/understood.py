@@ -1,16 +1,16 @@
-"""What was understood, in three lines before the work: opened, found out, to be done."""
+"""What was understood, in four lines before the work: opened, found out, to do, and its budget."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from gscompleter.commands.exploring import most
 from gscompleter.commands.opening import Opened, Task
-from gscompleter.commands.options import CompleteOptions, SceneOptions
+from gscompleter.commands.options import CompleteOptions, SceneOptions, most
 from gscompleter.data.formats import FORMATS
 from gscompleter.data.frame import Frame
 from gscompleter.errors import quoted
+from gscompleter.memory import gigabytes, memory_bytes, needed_bytes
 from gscompleter.types import Camera, Gaussians
 
 TOLD = {
@@ -23,11 +23,19 @@ TOLD = {
 """Who told the depth range, in words."""
 MAX_NAMED = 8
 """Frames that a line names."""
+SECONDS_PER_PIXEL = 2e-5
+"""What `plane-sweep` takes for each pixel of each photograph on two cores of 2.8 GHz. 18 to 24
+millionths were measured from 256 x 256 to 427 x 640 pixels (docs/performance.md); of three and of
+eight photographs it is the same within a third."""
 
 
 def understood(options: CompleteOptions, opened: Opened, task: Task, device: str) -> list[str]:
-    """The three lines. The cameras of `task` know the depth range that is worked in."""
-    return [*found_out(options, opened, task), f"To do: {plan_line(options, task, device)}."]
+    """The four lines. The cameras of `task` know the depth range that is worked in."""
+    return [
+        *found_out(options, opened, task),
+        f"To do: {plan_line(options, task, device)}.",
+        f"Budget: {budget_line(options, task, device)}.",
+    ]
 
 
 def found_out(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
@@ -105,6 +113,46 @@ def plan_line(options: CompleteOptions, task: Task, device: str) -> str:
         f"{' and '.join(targets)} by {options.reconstructor} and {options.synthesis.name} on "
         f"{device}, written to {quoted(options.out)}"
     )
+
+
+def budget_line(options: CompleteOptions, task: Task, device: str) -> str:
+    """How many photographs the context is made of, and about what memory and time that takes."""
+    return f"{count_line(task)}{memory_line(options, task)}{time_line(options, task, device)}"
+
+
+def count_line(task: Task) -> str:
+    """How many photographs the context may be made of, and who said so."""
+    budget = task.budget
+    if budget is None:
+        named = len(task.views)
+        return f"{named} {'photograph' if named == 1 else 'photographs'} for the context, as named"
+    limit = ""
+    if budget.allowed < budget.wanted:
+        limit = f", for there is no memory for {budget.wanted}"
+    return (
+        f"at most {budget.allowed} of {budget.usable:,} photographs for the context{limit} "
+        "(--context names others)"
+    )
+
+
+def memory_line(options: CompleteOptions, task: Task) -> str:
+    """About how much memory the completion needs, and how much there is."""
+    cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
+    pixels = max(camera.width * camera.height for camera in cameras)
+    images = len(task.views) + (len(task.targets) or most(options))
+    there = memory_bytes()
+    of = "" if there is None else f" of {gigabytes(there)}"
+    return f", up to {gigabytes(needed_bytes(pixels, images))}{of} of memory"
+
+
+def time_line(options: CompleteOptions, task: Task, device: str) -> str:
+    """About how long the context takes, as far as that was measured: not with another model, nor
+    on a GPU, nor where the context is there already."""
+    if task.scene is not None or options.reconstructor != "plane-sweep" or device != "cpu":
+        return ""
+    pixels = sum(view.camera.width * view.camera.height for view in task.views)
+    seconds = max(1, round(SECONDS_PER_PIXEL * pixels))
+    return f", about {seconds:,} s to reconstruct the context on two cores of 2.8 GHz"
 
 
 def frames_line(frames: Sequence[int | None]) -> str:

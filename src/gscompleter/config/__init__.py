@@ -36,6 +36,9 @@ class AffineConfig(Settings):
     """Smallest share of what the target sees of the scene that must agree with an affine fitted
     through the anchor, before one that is fitted at the target may take its place. None trusts the
     anchor always, as the paper does."""
+    min_merged: Share | None = 0.15
+    """Smallest share of it that must agree, where no affine fits there either, for anything to be
+    added. None adds whatever there is, as the paper does."""
 
 
 @dataclass(frozen=True)
@@ -241,7 +244,7 @@ class CompleterConfig(Settings):
                 footprint="fixed",
                 mask_occluded=False,
                 carry_into_holes=False,
-                affine=AffineConfig(min_agreement=None),
+                affine=AffineConfig(min_agreement=None, min_merged=None),
             ),
             free_space=FreeSpaceConfig(num_steps=0),
             refine=RefineConfig(iterations=30, learning_rate=0.08),

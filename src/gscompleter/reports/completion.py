@@ -100,7 +100,7 @@ def summarize(
                 "hole_fraction": result.hole_fraction,
                 "affine": {
                     key: getattr(result.affine, key)
-                    for key in ("scale", "shift", "inliers", "method")
+                    for key in ("scale", "shift", "inliers", "method", "agreement")
                 },
                 **images.scores(),
                 # the property of completed.ply that marks what this target added

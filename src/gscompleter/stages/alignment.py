@@ -21,6 +21,8 @@ MIN_INLIERS = 0.3
 """Smallest share of inliers that makes a fit trustworthy."""
 MIN_PIXELS = 64
 """Fewest comparable pixels; under it there is nothing to fit."""
+MIN_SEEN = 0.01
+"""Share of its image that the target must see of the scene, before this can refute an affine."""
 MIN_DEPTH_SPREAD = 0.05
 """Smallest spread of the predicted depths ((p95 - p5) / median) that tells scale and shift apart;
 under it only a scale is fitted."""
@@ -33,8 +35,7 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
     ratio with shift 0 takes its place, and the identity where there is nothing to compare; which
     of them was used is part of the result.
     """
-    comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
-    x, y = predicted.depth[comparable].double(), context.depth[comparable].double()
+    x, y = compared(predicted, context)
     if len(x) < MIN_PIXELS:
         return DepthAffine()
     if len(x) > MAX_PIXELS:
@@ -50,6 +51,14 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
     scale = (y / x).median().item()
     inliers = affine_inliers(x, y, scale, 0.0).double().mean().item()
     return DepthAffine(scale, 0.0, inliers, "median")
+
+
+def compared(
+    predicted: DepthMap, context: DepthMap
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Both z-depths at the pixels where both are known."""
+    comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
+    return predicted.depth[comparable].double(), context.depth[comparable].double()
 
 
 def depth_spread(depth: Float[Tensor, "n"]) -> float:
@@ -126,16 +135,18 @@ def unless_contradicted(
     """`affine`, unless the scene that the target sees has other depths and one other affine.
 
     Where a pair shares too little for stereo (hardly any overlap, poses that drift), Ψ's depths of
-    its two views need not be of one scale, and what fits the anchor is wrong at the target.
+    its two views need not be of one scale, and what fits the anchor is wrong at the target. Where
+    no other fits there either, the paper's choice stands, and is refuted if hardly anything agrees.
     """
-    comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
-    if config.min_agreement is None or comparable.sum() < MIN_PIXELS:
+    x, y = compared(predicted, context)
+    if config.min_agreement is None or len(x) < MIN_PIXELS:
         return affine
-    x, y = predicted.depth[comparable].double(), context.depth[comparable].double()
     agree = affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
+    affine = replace(affine, agreement=agree)
     if agree >= config.min_agreement:
         return affine
     own = fit_affine(predicted, context, rng)
-    # Where neither fits well, the paper's choice stands.
-    trusted = own.inliers >= max(MIN_INLIERS, 2 * agree)
-    return replace(own, contradicted=True) if trusted else affine
+    if own.inliers >= max(MIN_INLIERS, 2 * agree):
+        return replace(own, agreement=own.inliers, contradicted=True)
+    enough = len(x) >= MIN_SEEN * context.depth.numel()
+    return replace(affine, refuted=enough and agree < (config.min_merged or 0.0))

@@ -64,7 +64,7 @@ def register(
     """
     affine = fit_bridge(lift, frozen_target.context, at_anchor, rng, config.affine)
     coarse = apply_affine(lift.gaussians, affine, reference.camera, config.footprint)
-    if config.iterations == 0 or len(coarse) == 0:
+    if affine.refuted or config.iterations == 0 or len(coarse) == 0:
         return Registration(coarse, affine, ())
     registered, losses = register_along_rays(
         coarse, frozen_target, at_anchor, reference, anchor, renderer, config
