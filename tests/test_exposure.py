@@ -90,18 +90,18 @@ def test_a_channel_that_is_black_tells_nothing_and_disturbs_no_other():
 
 
 def test_gains_are_found_through_stereo(made):
-    np.testing.assert_allclose(made.gains, GAINS, rtol=0.03)
+    np.testing.assert_allclose(made.gains, GAINS, rtol=0.01)
 
 
 def test_the_scene_has_one_exposure_and_shows_places_between_better(made, uneven):
-    renderer, gains = load_renderer("cpu"), []
+    renderer, ratios = load_renderer("cpu"), []
     for x in (-0.3, 0.0, 0.3):
         truth = view_of(Room(), camera_at(x, size=SIZE))
         even, mixed = (renderer.render(m.gaussians, truth.camera).image for m in (made, uneven))
         assert at_best_gain(even, truth.image) > at_best_gain(mixed, truth.image) + 0.5
-        gains.append((even * truth.image).sum((0, 1)) / even.square().sum((0, 1)))
-    # The same everywhere, by channel.
-    assert (torch.stack(gains).amax(0) / torch.stack(gains).amin(0)).max() < 1.03
+        ratios.append((even * truth.image).sum((0, 1)) / even.square().sum((0, 1)))
+    # By channel, what is drawn is as much too dark here as there.
+    assert (torch.stack(ratios).amax(0) / torch.stack(ratios).amin(0)).max() < 1.012
 
 
 def test_each_photograph_is_what_is_drawn_times_its_gain(made):
