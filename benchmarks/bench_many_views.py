@@ -3,8 +3,9 @@
     python benchmarks/bench_many_views.py ../shared/data/fox --views 4 8 16 32
 
 Photographs are spread evenly over the scene, and scored at 256 x 256: those that were given, and
-those halfway between two of them. Time grows with the number of photographs if the seconds for each
-stay the same.
+those halfway between two of them, each after the one gain for each channel that suits it best, for
+many views have one exposure and photographs have their own. Time grows with the number of
+photographs if the seconds for each stay the same.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
+from torch import Tensor
 
 import gscompleter as gsc
 from gscompleter.matching.depth_range import depth_range_of
@@ -57,9 +60,19 @@ def ranged(views: Sequence[View], near: float, far: float) -> list[View]:
 
 
 def scores(gaussians: Gaussians, views: Sequence[View]) -> list[float]:
-    """PSNR (dB) at each of `views`."""
+    """PSNR (dB) at each of `views`, in its exposure."""
     renderer = gsc.load_renderer("cpu")
-    return [psnr(renderer.render(gaussians, v.camera).image, v.image) for v in views]
+    drawn = [renderer.render(gaussians, view.camera).image for view in views]
+    return [
+        psnr(exposed_as(v.image, image), v.image) for image, v in zip(drawn, views, strict=True)
+    ]
+
+
+def exposed_as(
+    photograph: Float[Tensor, "h w 3"], image: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w 3"]:
+    """`image` times the gain of each channel that brings it nearest to `photograph`."""
+    return image * (image * photograph).sum((0, 1)) / image.square().sum((0, 1))
 
 
 def row(name: str, make: Callable[[Sequence[View]], Gaussians], scene: Path, count: int) -> None:

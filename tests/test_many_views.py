@@ -163,7 +163,7 @@ def test_the_joint_fit_brings_every_photograph_nearer_and_repeats_itself():
     renderer = load_renderer("cpu")
     start = gaussians_of(views[1])
     start = replace(start, sh=start.sh * 0.8)
-    fitted = fit_jointly(start, views, renderer)
+    fitted = fit_jointly(start, views, torch.ones(3, 3), renderer)
 
     def errors(gaussians):
         renders = [renderer.render(gaussians, view.camera).image for view in views]
@@ -171,7 +171,7 @@ def test_the_joint_fit_brings_every_photograph_nearer_and_repeats_itself():
 
     for before, after in zip(errors(start), errors(fitted), strict=True):
         assert after < 0.7 * before
-    again = fit_jointly(start, views, renderer)
+    again = fit_jointly(start, views, torch.ones(3, 3), renderer)
     assert torch.equal(fitted.means, again.means)
     assert torch.equal(fitted.sh, again.sh)
 

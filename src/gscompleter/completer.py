@@ -205,10 +205,11 @@ class GSCompleter:
             near, far = working_range(views, scene, self.renderer)
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
-            context = init_context(self.reconstructor, views) if scene is None else scene
-            evidence = None
-            if scene is not None and witnesses is not None:
-                evidence = self.evidence(scene, (*views, *others))
+            context, evidence = scene, None
+            if context is None:
+                context, views = init_context(self.reconstructor, views)
+            elif witnesses is not None:
+                evidence = self.evidence(context, (*views, *others))
             completion = Completion(context, context, views, (), (), {}, others, evidence=evidence)
             allowed = self.allowed_errors(completion)
         return replace(completion, allowed_errors=allowed, seconds=clock.seconds)

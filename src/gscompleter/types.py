@@ -121,6 +121,10 @@ class View(Movable):
     depth: Float[Tensor, "h w"] | None = None
     """Measured z-depth in scene units, 0 where unknown. For scoring: no stage reads it."""
 
+    def evened(self, gain: Float[Tensor, "3"]) -> View:
+        """The same in an exposure that this one is brighter than by `gain`, channel by channel."""
+        return replace(self, image=(self.image / gain).clamp(0, 1))
+
 
 @dataclass(frozen=True)
 class Gaussians(Movable):
@@ -241,6 +245,9 @@ class Reconstruction:
     """For pixel-aligned models, the view each Gaussian came from; None for others."""
     pixel_index: Int[Tensor, "n"] | None = None
     """For pixel-aligned models, the row-major pixel of that view; None for others."""
+    gains: Float[Tensor, "v 3"] | None = None
+    """By how much each view is brighter than the Gaussians, which have one exposure, by channel;
+    None where the model does not tell."""
 
 
 @dataclass(frozen=True)
@@ -353,7 +360,8 @@ class Completion:
     context: Gaussians
     """The scene before its first target."""
     views: tuple[View, ...]
-    """The photographs, with the depth range that the completion works in."""
+    """The photographs, with the depth range that the completion works in, in the exposure of the
+    context where Ψ evened theirs out."""
     allowed_errors: tuple[float, ...]
     """Largest mean squared error that each photograph may have, whatever is added: of `views`, then
     of `witnesses`."""

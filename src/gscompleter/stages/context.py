@@ -15,9 +15,18 @@ from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, View
 
 
-def init_context(reconstructor: Reconstructor, views: Sequence[View]) -> Gaussians:
-    """`G_ctx = Ψ(views)`: the Gaussians of the observed regions (paper, Eq. 5)."""
-    return reconstructed(reconstructor, views).gaussians
+def init_context(
+    reconstructor: Reconstructor, views: Sequence[View]
+) -> tuple[Gaussians, tuple[View, ...]]:
+    """`G_ctx = Ψ(views)`: the Gaussians of the observed regions (paper, Eq. 5).
+
+    With them come `views` in their exposure, where Ψ evened out those of the photographs, so that
+    what is compared with the scene or added to it from now on is exposed as the scene is.
+    """
+    made = reconstructed(reconstructor, views)
+    if made.gains is None:
+        return made.gaussians, tuple(views)
+    return made.gaussians, tuple(map(View.evened, views, made.gains))
 
 
 def working_range(

@@ -67,7 +67,7 @@ def stereo_among(
     points = unproject(drawn.depth, camera)[covered]
     chosen = select_context([camera], [view.camera for view in views], points, NUM_VIEWS)
     try:
-        scene = init_context(reconstructor, [views[index] for index in chosen])
+        scene, _ = init_context(reconstructor, [views[index] for index in chosen])
     except InputError:
         return None
     evidence = gather_evidence(scene, views, renderer, config)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.descent import Adam
@@ -30,8 +31,14 @@ FAINTEST = 0.02
 """Opacity below which a Gaussian has faded."""
 
 
-def fit_jointly(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
-    """`gaussians` fitted to `views` by the squared difference."""
+def fit_jointly(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    gains: Float[Tensor, "views 3"],
+    renderer: Renderer,
+) -> Gaussians:
+    """`gaussians` fitted to `views` by the squared difference, once what is drawn is exposed as
+    each view is: brighter by its gain."""
     unknown = unknowns(gaussians)
     optimizer = Adam([(unknown[name], rate) for name, rate in RATES.items()], BETAS)
     order = order_of(len(views))
@@ -39,7 +46,7 @@ def fit_jointly(gaussians: Gaussians, views: Sequence[View], renderer: Renderer)
         view, fitted = views[number], moved_by(gaussians, unknown)
         image = renderer.render(fitted, view.camera).image
         left = 1 - (1 - LAST) * step / len(order)
-        optimizer.step((image - view.image).square().mean(), left)
+        optimizer.step((gains[number] * image - view.image).square().mean(), left)
     return moved_by(gaussians, {name: value.detach() for name, value in unknown.items()})
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.kernels.sharing import side_by_side
@@ -15,6 +15,7 @@ from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.matching.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance
 from gscompleter.reconstructors.plane_sweep.confidence import Mask
+from gscompleter.reconstructors.plane_sweep.exposure import gains_of
 from gscompleter.reconstructors.plane_sweep.fusion import (
     Layer,
     Transforms,
@@ -51,7 +52,8 @@ class PlaneSweep:
         Two views keep all of their pixels. Of more views each surface is kept once, by the view
         that sees it best, and nothing where another view sees through it; and unless they are
         small they are matched at half their size: surfaces and the joint fit find what that leaves
-        out, in an eighth of the time.
+        out, in an eighth of the time. Differences of exposure are evened out: the Gaussians have
+        the mean one.
 
         Raises:
             InputError: fewer than two views, no baseline between them, an empty depth range.
@@ -60,12 +62,13 @@ class PlaneSweep:
         rig = rig_of(views)
         layers = self.layers(rig, views)
         depths = depth_maps(layers, rig.unit, views)
-        parts = [self.splat(view, depth) for view, depth in zip(views, depths, strict=True)]
+        gains = gains_among(layers, rig.transforms)
+        device = views[0].image.device
+        even = map(View.evened, views, gains.to(device))
+        parts = [self.splat(view, depth) for view, depth in zip(even, depths, strict=True)]
         every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
         chosen = self.chosen(every, on_cpu, layers, rig.transforms)
-        fit = fit_appearance if len(views) == 2 else fit_jointly
-        fitted = fit(every[chosen], on_cpu, self.renderer)
-        device = views[0].image.device
+        fitted = self.fitted(every[chosen], on_cpu, gains)
         rows = [torch.arange(len(part)) for part in parts]
         numbers = [torch.full((len(part),), i) for i, part in enumerate(parts)]
         return Reconstruction(
@@ -73,6 +76,7 @@ class PlaneSweep:
             tuple(depths),
             torch.cat(numbers)[chosen].to(device),
             torch.cat(rows)[chosen].to(device),
+            gains.to(device),
         )
 
     def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
@@ -125,6 +129,14 @@ class PlaneSweep:
             start += gap.numel()
         return kept
 
+    def fitted(
+        self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
+    ) -> Gaussians:
+        """`gaussians` fitted to `views`, which are brighter by `gains` than they are."""
+        if len(views) == 2:
+            return fit_appearance(gaussians, views, self.renderer)
+        return fit_jointly(gaussians, views, gains, self.renderer)
+
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
         """A disc for every pixel of `view`."""
         return discs(view, depth.depth, normals_of(depth.depth, view), self.disc_sigma)
@@ -170,6 +182,12 @@ def depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> l
         confidence = torch.from_numpy(layer.confidence).to(view.image.device)
         depths.append(DepthMap(depth.to(confidence.device), confidence > 0, confidence))
     return depths
+
+
+def gains_among(layers: Sequence[Layer], transforms: Transforms) -> Float[Tensor, "views 3"]:
+    """By how much each photograph is brighter than the mean of all; two keep their exposures."""
+    gains = gains_of(layers, transforms) if len(layers) > 2 else np.ones((len(layers), 3))
+    return torch.from_numpy(gains).float()
 
 
 def as_rows(masks: Sequence[Mask]) -> Bool[Tensor, "n"]:
