@@ -16,7 +16,7 @@ from gscompleter.stages.context import init_context
 from scenes import Room, camera_at, view_of
 
 SIZE = 64
-EXPOSURES = torch.tensor([[1.15, 1.15, 1.15], [0.85, 0.85, 0.85], [1.0, 1.1, 0.9], [0.9, 1, 1.12]])
+EXPOSURES = torch.tensor([[1.2, 1.2, 1.2], [0.8, 0.8, 0.8], [1.0, 1.1, 0.9], [0.9, 1, 1.12]])
 """Of four photographs; the last two differ by their white balance, too."""
 PLACES = (-0.4, -0.2, 0.2, 0.4)
 """Where they are taken."""
@@ -69,6 +69,10 @@ def test_gains_are_told_by_what_photographs_share():
 
 def test_photographs_that_are_exposed_alike_stay_as_they_are():
     assert (found_gains(even_views()) == 1).all()
+    hardly = [
+        replace(v, image=v.image * g) for v, g in zip(even_views(), (1, 0.9, 1, 0.8), strict=True)
+    ]
+    assert (found_gains(hardly) == 1).all()
 
 
 def test_photographs_that_share_nothing_are_not_compared():
@@ -76,10 +80,10 @@ def test_photographs_that_share_nothing_are_not_compared():
     back = [view_of(Room(), camera_at(x, yaw=180.0, size=SIZE)) for x in (0.0, 0.2)]
     back = [replace(view, image=view.image * 0.8) for view in back]
     assert (found_gains([*there, *back]) == 1).all()
-    back[1] = replace(back[1], image=back[1].image * 0.8)
+    back[1] = replace(back[1], image=back[1].image * 0.6)
     gains = found_gains([*there, *back])
     np.testing.assert_allclose(gains[:2], 1.0, rtol=1e-6)
-    np.testing.assert_allclose(gains[2:, 0], [0.8**-0.5, 0.8**0.5], rtol=0.01)
+    np.testing.assert_allclose(gains[2:, 0], [0.6**-0.5, 0.6**0.5], rtol=0.02)
 
 
 def test_a_channel_that_is_black_tells_nothing_and_disturbs_no_other():
@@ -114,10 +118,7 @@ def test_each_photograph_is_what_is_drawn_times_its_gain(made):
 
 def test_two_photographs_keep_their_exposures():
     views = photographs(size=32)[:2]
-    assert (PlaneSweep()(views).gains == 1).all()
-    _, handed_on = init_context(PlaneSweep(), views)
-    for view, same in zip(views, handed_on, strict=True):
-        assert torch.equal(view.image, same.image)
+    assert init_context(PlaneSweep(), views)[1] is None
 
 
 def test_a_completion_goes_on_with_photographs_in_the_exposure_of_the_scene(made):
@@ -125,4 +126,4 @@ def test_a_completion_goes_on_with_photographs_in_the_exposure_of_the_scene(made
     mean = EXPOSURES.log().mean(dim=0).exp()
     for view, given, even in zip(begun.views, photographs(), even_views(), strict=True):
         truth = (even.image * mean).clamp(0, 1)
-        assert psnr(view.image, truth) > max(30, psnr(given.image, truth) + 2)
+        assert psnr(view.image, truth) > max(26, psnr(given.image, truth) + 2)

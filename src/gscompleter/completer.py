@@ -28,7 +28,7 @@ from gscompleter.stages.anchor import (
     synthesize_all,
 )
 from gscompleter.stages.candidates import shrunk
-from gscompleter.stages.context import init_context, working_range
+from gscompleter.stages.context import exposed_alike, init_context, working_range
 from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.integration import (
@@ -205,12 +205,15 @@ class GSCompleter:
             near, far = working_range(views, scene, self.renderer)
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
-            context, evidence = scene, None
+            context, gains, evidence = scene, None, None
             if context is None:
-                context, views = init_context(self.reconstructor, views)
+                context, gains = init_context(self.reconstructor, views)
+                views = exposed_alike(views, gains)
             elif witnesses is not None:
                 evidence = self.evidence(context, (*views, *others))
-            completion = Completion(context, context, views, (), (), {}, others, evidence=evidence)
+            completion = Completion(
+                context, context, views, (), (), {}, others, gains=gains, evidence=evidence
+            )
             allowed = self.allowed_errors(completion)
         return replace(completion, allowed_errors=allowed, seconds=clock.seconds)
 

@@ -247,7 +247,7 @@ class Reconstruction:
     """For pixel-aligned models, the row-major pixel of that view; None for others."""
     gains: Float[Tensor, "v 3"] | None = None
     """By how much each view is brighter than the Gaussians, which have one exposure, by channel;
-    None where the model does not tell."""
+    None where exposures were not evened out."""
 
 
 @dataclass(frozen=True)
@@ -374,6 +374,9 @@ class Completion:
     bystanders: tuple[Camera, ...] = ()
     """Cameras of other photographs, which are not looked at: what they see of the scene stays in
     sight."""
+    gains: Float[Tensor, "v 3"] | None = None
+    """By how much each photograph, as it was taken, is brighter than in `views`, by channel; None
+    where exposures were not evened out."""
     evidence: Evidence | None = None
     """What `views` and `witnesses` show of the context; None where a context is not doubted."""
     set_aside: Bool[Tensor, "n"] | None = None

@@ -199,6 +199,14 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
     console.print(table)
     for note in notes:
         console.print(note)
+    if completion.gains is not None:
+        darkest, brightest = completion.gains.aminmax()
+        console.print(
+            "The photographs of the context differ in exposure, by a factor of up to "
+            f"{(brightest / darkest).item():.2f}; the scene has their mean, in which they are "
+            "compared here. Those of targets are compared as they were taken.",
+            soft_wrap=True,
+        )
     origin = summary["frame"]["origin"]
     if any(origin):
         console.print(

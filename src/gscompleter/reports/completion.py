@@ -88,8 +88,10 @@ def summarize(
         "version": __version__,
         **said,
         "context": [
-            {"frame": view.frame, **images.scores()}
-            for view, images in zip(completion.views, context_images, strict=True)
+            {"frame": view.frame, **images.scores(), "gain": gain}
+            for view, images, gain in zip(
+                completion.views, context_images, gains_of(completion), strict=True
+            )
         ],
         "targets": [
             {
@@ -115,6 +117,14 @@ def summarize(
         "gaussians": counts(completion),
         "seconds": dict(completion.seconds),
     }
+
+
+def gains_of(completion: Completion) -> list[list[float] | None]:
+    """By how much each photograph is brighter than it is compared, by channel; None where exposures
+    were not evened out."""
+    if completion.gains is None:
+        return [None] * len(completion.views)
+    return completion.gains.tolist()
 
 
 def counts(completion: Completion) -> dict[str, int]:

@@ -33,6 +33,7 @@ from gscompleter.runs.store import (
     write_json,
 )
 from gscompleter.runs.tasks import Task
+from gscompleter.stages.context import exposed_alike
 from gscompleter.types import View
 
 
@@ -162,7 +163,7 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
 
     return Prepared(
         context.gaussians,
-        tuple(map(ranged, views)),
+        tuple(map(ranged, exposed_alike(views, context.gains))),
         tuple(map(ranged, targets)),
         tuple(map(ranged, neighbours)),
         models,
@@ -202,7 +203,8 @@ def context_at(path: Path, views: Sequence[View], models: Models) -> SavedContex
         camera = begun.views[0].camera
         assert camera.near is not None
         assert camera.far is not None
-        made = SavedContext(begun.scene, camera.near, camera.far, begun.seconds["total"])
+        seconds = begun.seconds["total"]
+        made = SavedContext(begun.scene, camera.near, camera.far, seconds, begun.gains)
         save_context(path, made)
 
     return kept(path, lambda: load_context(path, device), save)

@@ -161,12 +161,18 @@ class SavedContext:
     far: float
     seconds: float
     """What it took."""
+    gains: Float[Tensor, "v 3"] | None = None
+    """By how much each photograph is brighter, by channel; None where exposures were not evened
+    out."""
 
 
 def save_context(path: Path, context: SavedContext) -> None:
     """Write the scene that all methods begin with, as by `write_arrays`."""
     numbers = np.array([context.seconds, context.near, context.far], dtype=np.float64)
-    write_arrays(path, {**_arrays_of(context.gaussians), "seconds_near_far": numbers})
+    arrays = {**_arrays_of(context.gaussians), "seconds_near_far": numbers}
+    if context.gains is not None:
+        arrays["gains"] = context.gains.cpu().numpy()
+    write_arrays(path, arrays)
 
 
 def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
@@ -175,7 +181,8 @@ def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
     if arrays is None:
         return None
     seconds, near, far = arrays["seconds_near_far"].tolist()
-    return SavedContext(_gaussians_of(arrays, device), near, far, seconds)
+    gains = torch.from_numpy(arrays["gains"]).to(device) if "gains" in arrays else None
+    return SavedContext(_gaussians_of(arrays, device), near, far, seconds, gains)
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.geometry import z_depths
@@ -17,16 +19,18 @@ from gscompleter.types import Camera, Gaussians, View
 
 def init_context(
     reconstructor: Reconstructor, views: Sequence[View]
-) -> tuple[Gaussians, tuple[View, ...]]:
+) -> tuple[Gaussians, Float[Tensor, "v 3"] | None]:
     """`G_ctx = Ψ(views)`: the Gaussians of the observed regions (paper, Eq. 5).
 
-    With them come `views` in their exposure, where Ψ evened out those of the photographs, so that
-    what is compared with the scene or added to it from now on is exposed as the scene is.
+    With them comes by how much each view is brighter, by channel, where Ψ evened out exposures.
     """
     made = reconstructed(reconstructor, views)
-    if made.gains is None:
-        return made.gaussians, tuple(views)
-    return made.gaussians, tuple(map(View.evened, views, made.gains))
+    return made.gaussians, made.gains
+
+
+def exposed_alike(views: Sequence[View], gains: Float[Tensor, "v 3"] | None) -> tuple[View, ...]:
+    """`views` in the exposure of the scene: what is compared with it, or added to it, has to be."""
+    return tuple(views) if gains is None else tuple(map(View.evened, views, gains))
 
 
 def working_range(

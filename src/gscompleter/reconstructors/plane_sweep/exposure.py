@@ -7,6 +7,7 @@ of each, relative to the mean of all.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -31,8 +32,10 @@ darken towards their corners."""
 EXPOSURE, TINT = 0.3, 0.1
 """Standard deviation of the log-gains of photographs: of all channels together, and of each beside
 that. What pairs hardly tell stays near 0."""
-LEAST = 0.02
-"""Log-gain that changes anything: where no photograph has as much, all are exposed alike."""
+HALF_A_STOP = 0.5 * math.log(2)
+"""Logarithm of the ratio between the brightest and the darkest photograph, in any channel, from
+which on they are evened out. Less hardly shows, and every render would be farther from its
+photograph."""
 
 Gains = Float[np.ndarray, "views 3"]
 
@@ -52,10 +55,10 @@ def gains_of(layers: Sequence[Layer], transforms: Transforms) -> Gains:
     """Factors by which each photograph is brighter than the mean of all, by channel.
 
     They are the most likely ones, given the ratios of all pairs, and their logarithms have the mean
-    0. Where the photographs are exposed alike all of them are exactly 1.
+    0. Where the photographs are exposed about alike all of them are exactly 1.
     """
     logs = log_gains(ratios_among(layers, transforms), len(layers))
-    return np.exp(logs) if np.abs(logs).max() > LEAST else np.ones_like(logs)
+    return np.exp(logs) if np.ptp(logs, axis=0).max() > HALF_A_STOP else np.ones_like(logs)
 
 
 def log_gains(ratios: Iterable[Ratio], count: int) -> Gains:

@@ -52,8 +52,8 @@ class PlaneSweep:
         Two views keep all of their pixels. Of more views each surface is kept once, by the view
         that sees it best, and nothing where another view sees through it; and unless they are
         small they are matched at half their size: surfaces and the joint fit find what that leaves
-        out, in an eighth of the time. Differences of exposure are evened out: the Gaussians have
-        the mean one.
+        out, in an eighth of the time. Where their exposures differ clearly, they are evened out:
+        the Gaussians have the mean one.
 
         Raises:
             InputError: fewer than two views, no baseline between them, an empty depth range.
@@ -76,7 +76,7 @@ class PlaneSweep:
             tuple(depths),
             torch.cat(numbers)[chosen].to(device),
             torch.cat(rows)[chosen].to(device),
-            gains.to(device),
+            None if (gains == 1).all() else gains.to(device),
         )
 
     def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
