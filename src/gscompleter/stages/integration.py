@@ -17,7 +17,7 @@ from gscompleter.progress import track
 from gscompleter.render import FrozenView, OpacityRender
 from gscompleter.types import Camera, Gaussians, View
 
-MAX_TRIALS = 16
+MAX_TRIALS = 24
 """How often harmful Gaussians lose half of their opacity before a view that still does not hold
 loses all it sees of them."""
 
