@@ -129,6 +129,15 @@ def gaussians_of(view: View, depth: Float[Tensor, "h w"] | None = None) -> Gauss
     )
 
 
+def half_a_room_of(room: Room, camera: Camera) -> tuple[View, Gaussians, Gaussians]:
+    """What the camera sees, a context that lacks the right half of it, and the right half."""
+    view = view_of(room, camera)
+    right = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    right[:, camera.width // 2 :] = True
+    gaussians = gaussians_of(view)
+    return view, gaussians[~right.flatten()], gaussians[right.flatten()]
+
+
 def reconstruction_of(
     views: Sequence[View], depths: Sequence[Float[Tensor, "h w"]]
 ) -> Reconstruction:

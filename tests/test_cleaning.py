@@ -15,7 +15,7 @@ from gscompleter.io.ply import load_ply
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
 from gscompleter.stages.cleaning import change_without, superfluous, unwanted
-from gscompleter.stages.integration import squared_error
+from gscompleter.stages.harm import squared_error
 from gscompleter.types import View, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 

@@ -14,7 +14,7 @@ from gscompleter.geometry import inside, project
 from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
-from gscompleter.stages.integration import squared_error
+from gscompleter.stages.harm import squared_error
 from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.stereo import corrected, stereo_among

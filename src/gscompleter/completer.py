@@ -31,15 +31,8 @@ from gscompleter.stages.candidates import shrunk
 from gscompleter.stages.context import exposed_alike, init_context, working_range
 from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
-from gscompleter.stages.integration import (
-    do_no_harm,
-    error_with_loss,
-    hole_mask,
-    is_undone,
-    keep_in_holes,
-    refine_opacities,
-    squared_error,
-)
+from gscompleter.stages.harm import do_no_harm, error_with_loss, is_undone, squared_error
+from gscompleter.stages.integration import hole_mask, keep_in_holes, refine_opacities
 from gscompleter.stages.kept_views import KeptViews
 from gscompleter.stages.reconciliation import reconcile
 from gscompleter.stages.registration import Registration, register

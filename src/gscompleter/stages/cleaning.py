@@ -22,7 +22,7 @@ from torch.nn.functional import avg_pool2d
 from gscompleter.config.cleaning import CleaningConfig
 from gscompleter.progress import track
 from gscompleter.render import OpacityRender, Renderer
-from gscompleter.stages.integration import error_slope, error_with_loss
+from gscompleter.stages.harm import error_slope, error_with_loss
 from gscompleter.stages.setting_aside import error_of, without_needed
 from gscompleter.stages.support import pixel_sums
 from gscompleter.types import Gaussians, View

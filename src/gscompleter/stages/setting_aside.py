@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.render import OpacityRender, Renderer
-from gscompleter.stages.integration import error_slope, most_harmful, squared_error
+from gscompleter.stages.harm import error_slope, fewest, squared_error
 from gscompleter.types import Gaussians, View
 
 MAX_TRIALS = 16
@@ -94,7 +94,7 @@ def needed(
         if error <= allowed or not out.any():
             return back
         _, slope = error_slope(plan, photograph, torch.where(out, FADED, 1.0) * opacities)
-        back = back | most_harmful(torch.where(out, -slope * opacities, 0.0), error - allowed)
+        back = back | fewest(torch.where(out, -slope * opacities, 0.0), error - allowed)
     return back | (missing & (slope != 0))
 
 

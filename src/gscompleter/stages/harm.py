@@ -1,0 +1,153 @@
+"""Stage 4: what is added makes no photograph worse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config import HarmConfig
+from gscompleter.masks import dilate
+from gscompleter.render import FrozenView, OpacityRender
+from gscompleter.stages.integration import falling_on
+from gscompleter.types import Gaussians, View
+
+HALVINGS = 16
+"""How often harmful Gaussians lose half of their opacity, before a view that still does not hold
+loses those at its worst pixels."""
+REMOVALS = 12
+"""How often it does, before it loses all that it sees of them."""
+REACH = 2
+"""Pixels around the worst ones within which Gaussians are lost."""
+
+
+def do_no_harm(
+    added: Gaussians,
+    frozen_views: Sequence[FrozenView],
+    views: Sequence[View],
+    allowed_errors: Sequence[float],
+    config: HarmConfig = HarmConfig(),
+) -> Gaussians:
+    """`added` with opacities lowered until no photograph is matched worse than allowed.
+
+    In a view that got worse, a Gaussian is harmful where less opacity would bring the view nearer
+    to its photograph. The most harmful ones are halved, no more of them than it takes. Where that
+    does not help, as of two that hide each other, those at the pixels that got worse most are
+    removed; and in the end every generated Gaussian that the view sees, which restores it.
+
+    Args:
+        added: Generated Gaussians.
+        frozen_views: The scene frozen at the camera of each of `views`.
+        views: The photographs.
+        allowed_errors: Largest mean squared error allowed in each view.
+        config: How it is checked.
+    """
+    if config.tolerance is None or len(added) == 0:
+        return added
+    checks = [
+        Check(view, frozen.context.image, frozen.plan(added), allowed)
+        for frozen, view, allowed in zip(frozen_views, views, allowed_errors, strict=True)
+    ]
+    opacities = added.opacities
+    for trial in range(HALVINGS + REMOVALS + 1):
+        drawn = [(check, check.plan(opacities).image) for check in checks]
+        worse = [(check, image) for check, image in drawn if check.excess(image) > 0]
+        if not worse:
+            break
+        lowered = [check.to_lower(trial, image, opacities, added) for check, image in worse]
+        left = 0.5 if trial < HALVINGS else 0.0
+        opacities = torch.where(torch.stack(lowered).any(dim=0), left * opacities, opacities)
+    return replace(added, opacities=opacities, encoded=None)
+
+
+@dataclass(frozen=True)
+class Check:
+    """A photograph that may not be matched worse than allowed."""
+
+    view: View
+    before: Float[Tensor, "h w 3"]
+    """What it sees of the scene without what is added."""
+    plan: OpacityRender
+    """What it sees with it."""
+    allowed: float
+    """Largest mean squared error."""
+
+    def excess(self, image: Float[Tensor, "h w 3"]) -> float:
+        """How far the mean squared error of `image` lies over what is allowed."""
+        return squared_error(image, self.view.image).item() - self.allowed
+
+    def to_lower(
+        self,
+        trial: int,
+        image: Float[Tensor, "h w 3"],
+        opacities: Float[Tensor, "n"],
+        added: Gaussians,
+    ) -> Bool[Tensor, "n"]:
+        """Which of `added`, of the opacities that gave `image`, are to give way."""
+        if HALVINGS <= trial < HALVINGS + REMOVALS:
+            return self.at_worst(image, added)
+        _, slope = error_slope(self.plan, self.view.image, opacities)
+        if trial < HALVINGS:
+            return fewest(slope * opacities / 2, self.excess(image))
+        return slope != 0
+
+    def at_worst(self, image: Float[Tensor, "h w 3"], added: Gaussians) -> Bool[Tensor, "n"]:
+        """Those of `added` at the fewest pixels of `image` that make up for its excess."""
+        errors, before = (squared_errors(i, self.view.image) for i in (image, self.before))
+        relief = (errors - before) / errors.numel()
+        pixels = fewest(relief.flatten(), self.excess(image)).view(relief.shape)
+        return falling_on(dilate(pixels, REACH), added, self.view.camera)
+
+
+def is_undone(added: Gaussians, harmless: Gaussians, config: HarmConfig = HarmConfig()) -> bool:
+    """Whether so much of the opacity of what is `added` had to go, until it was `harmless`, that
+    the photographs contradict all of it."""
+    if config.max_loss is None:
+        return False
+    left = harmless.opacities.sum() / added.opacities.sum().clamp_min(1e-12)
+    return len(added) > 0 and 1 - left.item() > config.max_loss
+
+
+def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
+    """The fewest entries whose `relief` adds up to `needed`, or to half of all relief there is.
+
+    Relief is a promise of first order. Where it cannot be enough, the worst go first and the rest
+    are judged anew without them.
+    """
+    order = relief.argsort(descending=True, stable=True)
+    positive = relief[order].clamp_min(0)
+    enough = min(needed, positive.sum().item() / 2)
+    chosen = torch.zeros_like(relief, dtype=torch.bool)
+    chosen[order] = (positive.cumsum(0) - positive < enough) & (positive > 0)
+    return chosen
+
+
+def error_slope(
+    plan: OpacityRender, photograph: Float[Tensor, "h w 3"], opacities: Float[Tensor, "n"]
+) -> tuple[float, Float[Tensor, "n"]]:
+    """Error against the photograph, and how it grows with each opacity."""
+    with torch.enable_grad():
+        variable = opacities.detach().clone().requires_grad_()
+        image = plan(variable).image
+        (slope,) = torch.autograd.grad((image - photograph).square().mean(), variable)
+    return squared_error(image.detach(), photograph).item(), slope
+
+
+def squared_error(image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]) -> Tensor:
+    """Mean squared error of the image as it is shown, clipped to [0, 1]."""
+    return (image.clamp(0, 1) - photograph).square().mean()
+
+
+def squared_errors(
+    image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w"]:
+    """The same of each pixel."""
+    return (image.clamp(0, 1) - photograph).square().mean(dim=-1)
+
+
+def error_with_loss(error: float, decibel: float) -> float:
+    """The mean squared error whose PSNR is `decibel` lower than that of `error`."""
+    return error * 10 ** (decibel / 10)

@@ -1,0 +1,79 @@
+"""Stage 4: no photograph is matched worse for what is added."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter.config import HarmConfig
+from gscompleter.render import load_renderer
+from gscompleter.stages import harm
+from gscompleter.stages.harm import do_no_harm, error_with_loss, fewest, squared_error
+from gscompleter.types import merge
+from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
+
+SIZE = 48
+ROOM = Room()
+CAMERA = camera_at(size=SIZE)
+
+
+def half_a_room():
+    """A context that lacks the right half of what the camera sees, and the right half."""
+    return half_a_room_of(ROOM, CAMERA)
+
+
+@pytest.mark.parametrize(("halvings", "removals"), [(0, 0), (0, 12), (16, 12)])
+def test_no_photograph_is_matched_worse_than_allowed(halvings, removals, monkeypatch):
+    """Gaussians of wrong colour stand in front of everything the camera sees."""
+    view = view_of(ROOM, CAMERA)
+    context = gaussians_of(view)
+    harmful = replace(gaussians_of(view, torch.full((SIZE, SIZE), 1.0)), sh=-context.sh)
+    renderer = load_renderer("cpu")
+    frozen = renderer.freeze(context, CAMERA)
+    before = squared_error(frozen.context.image, view.image).item()
+    assert squared_error(frozen.composite(harmful).image, view.image).item() > 10 * before
+
+    allowed = error_with_loss(before, 0.05)
+    monkeypatch.setattr(harm, "HALVINGS", halvings)
+    monkeypatch.setattr(harm, "REMOVALS", removals)
+    mended = do_no_harm(harmful, [frozen], [view], [allowed])
+    assert squared_error(frozen.composite(mended).image, view.image).item() <= allowed
+
+
+def test_where_halving_does_not_help_only_the_worst_pixels_are_given_up(monkeypatch):
+    """Half of the image is filled rightly; something wrong stands before the other half."""
+    view, context, added = half_a_room()
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    near = gaussians_of(view, torch.full((SIZE, SIZE), 1.0))
+    wrong = replace(near, sh=-near.sh)[: SIZE // 4]
+    allowed = error_with_loss(squared_error(frozen.composite(added).image, view.image).item(), 0.05)
+    monkeypatch.setattr(harm, "HALVINGS", 0)
+    mended = do_no_harm(merge([added, wrong]), [frozen], [view], [allowed])
+    assert squared_error(frozen.composite(mended).image, view.image).item() <= allowed
+    assert mended.opacities[: len(added)].mean() > 0.9 * added.opacities.mean()
+    assert mended.opacities[len(added) :].mean() < 0.5 * wrong.opacities.mean()
+
+
+def test_what_does_no_harm_keeps_its_opacity():
+    view, context, added = half_a_room()
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    before = squared_error(frozen.context.image, view.image).item()
+    kept = do_no_harm(added, [frozen], [view], [error_with_loss(before, 0.05)])
+    assert torch.equal(kept.opacities, added.opacities)
+
+
+def test_the_fewest_gaussians_that_suffice_are_lowered():
+    relief = torch.tensor([0.1, 0.4, -1.0, 0.3, 0.2])
+    assert fewest(relief, 0.3).tolist() == [False, True, False, False, False]
+    assert fewest(relief, 0.45).tolist() == [False, True, False, True, False]
+    assert fewest(relief, 9.0).tolist() == [False, True, False, True, False]
+
+
+def test_without_a_tolerance_nothing_is_checked():
+    view, context, added = half_a_room()
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    assert do_no_harm(added, [frozen], [view], [0.0], HarmConfig(tolerance=None)) is added
+
+
+def test_half_a_decibel_is_an_error_larger_by_an_eighth():
+    assert error_with_loss(1.0, 0.5) == pytest.approx(1.122, abs=1e-3)
