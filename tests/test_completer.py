@@ -22,7 +22,8 @@ from gscompleter.render.cpu import CpuRenderer
 from gscompleter.reports.completion import Target, write_report
 from gscompleter.stages.anchor import lift
 from gscompleter.stages.free_space import respect_free_space
-from gscompleter.stages.integration import hole_mask, is_undone
+from gscompleter.stages.harm import is_undone
+from gscompleter.stages.integration import hole_mask
 from gscompleter.stages.registration import apply_affine
 from gscompleter.types import Camera, Completion, Gaussians, View, merge
 from parity import assert_close
