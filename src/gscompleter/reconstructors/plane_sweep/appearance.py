@@ -18,7 +18,7 @@ from gscompleter.descent import Adam
 from gscompleter.render import Renderer
 from gscompleter.types import SH_C0, Gaussians, View, sh_from_rgb
 
-OPACITY_STEPS = 7
+OPACITY_STEPS = 6
 """Steps of Adam on the opacities."""
 LEARNING_RATE = 1.0
 """Step of Adam, on the logit."""
