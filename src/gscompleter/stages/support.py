@@ -89,14 +89,18 @@ def support(
     rays = normalize(scene.means - camera.center, dim=-1)
     agreeing, weights = torch.zeros_like(rays[:, 0]), torch.zeros_like(rays[:, 0])
     for k, center in enumerate(evidence.centers):
-        cosine = (normalize(scene.means - center, dim=-1) * rays).sum(-1).clamp(-1, 1)
-        turn = torch.rad2deg(torch.acos(cosine))
-        area = evidence.areas[:, k]
-        weight = area * (torch.exp(-((turn / config.max_turn) ** 2)) + LEAST)
-        agreeing += weight * evidence.agreement[:, k]
-        weights += weight
+        rows = evidence.areas[:, k].nonzero()[:, 0]
+        turn = degrees_between(normalize(scene.means[rows] - center, dim=-1), rays[rows])
+        weight = evidence.areas[rows, k] * (torch.exp(-((turn / config.max_turn) ** 2)) + LEAST)
+        agreeing.index_add_(0, rows, weight * evidence.agreement[rows, k])
+        weights.index_add_(0, rows, weight)
     share = (shown(evidence, scene, camera, renderer) / ENOUGH).clamp_max(1.0)
     return share * agreeing / weights.clamp_min(1e-20)
+
+
+def degrees_between(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Angle between unit vectors, in degrees."""
+    return torch.rad2deg(torch.acos((a * b).sum(-1).clamp(-1, 1)))
 
 
 def shown(
@@ -155,11 +159,11 @@ def pixel_sums(
     A compositing weight is the slope of a pixel's colour in the colour of the Gaussian.
     """
     weights = torch.nn.functional.pad(layers, (0, 3 - layers.shape[-1]))
+    plan = renderer.freeze(scene[:0], camera).plan_colours(scene)
     with torch.enable_grad():
-        sh = torch.zeros((len(scene), 1, 3), device=layers.device, requires_grad=True)
-        image = renderer.render(coloured(scene, sh), camera).image
-        (slope,) = torch.autograd.grad((weights * image).sum(), sh)
-    return slope[:, 0, : layers.shape[-1]] / SH_C0
+        colours = scene.means.new_full((len(scene), 3), 0.5).requires_grad_()
+        (slope,) = torch.autograd.grad((weights * plan(colours).image).sum(), colours)
+    return slope[:, : layers.shape[-1]]
 
 
 def coloured(scene: Gaussians, sh: Float[Tensor, "n 1 3"]) -> Gaussians:
