@@ -21,10 +21,12 @@ SIZE = 480.0
 """Width and height of the drawing, in the units of its viewBox."""
 YAW, PITCH = 30.0, 25.0
 """How the drawing is turned at first, in degrees."""
-DEPTH = 0.16
+DEPTH = 0.13
 """Length of a camera, in radii."""
 FARTHEST = 6.0
 """Points are shown as far from the cameras as these stand apart, times this."""
+SHOWN = 0.85
+"""Share of these points that lies within the radius."""
 
 
 @dataclass(frozen=True)
@@ -101,18 +103,25 @@ def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
 
 def frame_of(poses: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "m 3"]) -> Frame:
     """A frame around the cameras, upright as most of them are."""
-    center = poses[:, :, 3].mean(axis=0)
-    apart = np.linalg.norm(poses[:, :, 3] - center, axis=1).max()
-    away = np.linalg.norm(points - center, axis=1) if len(points) else np.array([2 * apart])
-    typical = float(np.quantile(away, 0.5))
-    radius = min(max(typical, 1.3 * apart), FARTHEST * apart) if apart > 0 else typical
+    cameras = poses[:, :, 3]
+    middle = cameras.mean(axis=0)
+    apart = distances(cameras, middle).max()
+    near = points[distances(points, middle) <= FARTHEST * apart] if apart > 0 else points
+    center = (middle + np.median(near, axis=0)) / 2 if len(near) else middle
+    around = np.quantile(distances(near, center), SHOWN) if len(near) else 0.0
+    radius = max(around, 1.1 * distances(cameras, center).max())
     up = -poses[:, :, 1].mean(axis=0)
     forward = poses[:, :, 2].mean(axis=0)
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-6:
         up, right = -poses[0, :, 1], poses[0, :, 0]
     right, up = right / np.linalg.norm(right), up / np.linalg.norm(up)
-    return Frame(center, np.stack([right, up, np.cross(right, up)]), radius or 1.0)
+    return Frame(center, np.stack([right, up, np.cross(right, up)]), float(radius) or 1.0)
+
+
+def distances(points: Float[np.ndarray, "n 3"], center: Float[np.ndarray, "3"]) -> np.ndarray:
+    """How far points lie from `center`: [n]."""
+    return np.linalg.norm(points - center, axis=1)
 
 
 def frustum(

@@ -142,7 +142,7 @@ def section(
         images=gallery.slider(name, f"Target {number}, {row.name}"),
         facts=target_facts(row),
         notes=about_target(row),
-        link=None if viewer is None else f"{viewer}#camera={name}",
+        link=None if viewer is None else f"{viewer}#camera=target-{number}",
         pictures=list(pictures_of(number, row, gallery)),
         depths=None
         if limits is None

@@ -113,7 +113,7 @@ def read_timings(path: Path) -> dict[str, Timing]:
     if not isinstance(content, Mapping):
         raise InputError(f"{quoted(path)} is not what an evaluation writes; {ADVICE}.")
     methods = {name: value for name, value in content.items() if name != "steps"}
-    return as_written(dict[str, Timing], methods, path, ADVICE)
+    return {name: as_written(Timing, value, path, ADVICE) for name, value in methods.items()}
 
 
 def score_tables(tables: Tables) -> Iterator[Table]:

@@ -6,7 +6,7 @@ Elements are built and serialized by the standard library, which escapes every t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element, SubElement, tostring
 
@@ -68,11 +68,6 @@ def number(value: object) -> str:
     return f"{round(value, 2):g}" if isinstance(value, float) else str(value)
 
 
-def finite(values: Iterable[float]) -> list[float]:
-    """Those that can be drawn."""
-    return [value for value in values if math.isfinite(value)]
-
-
 def ticks(low: float, high: float, most: int = 5) -> list[float]:
     """Round numbers from `low` to `high`."""
     raw = (high - low) / most
@@ -83,12 +78,11 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
     ]
 
 
-def span(values: Sequence[float], from_zero: bool = False) -> tuple[float, float]:
+def span(values: Sequence[float]) -> tuple[float, float]:
     """The range of an axis that shows `values`, never empty."""
     low, high = min(values), max(values)
-    low = min(low, 0.0) if from_zero else low
-    room = (high - low) or abs(high) or 1.0
-    return (low if from_zero else low - 0.05 * room), high + 0.05 * room
+    room = 0.05 * ((high - low) or abs(high) or 1.0)
+    return low - room, high + room
 
 
 def plot(
@@ -138,14 +132,14 @@ def plot(
 
 def loss_curve(title: str, losses: Sequence[float]) -> Markup | None:
     """The loss of each iteration; None where there are less than two."""
-    known = [(k, loss) for k, loss in enumerate(losses, start=1) if math.isfinite(loss)]
+    known = [(float(k), loss) for k, loss in enumerate(losses, start=1) if math.isfinite(loss)]
     if len(known) < 2:
         return None
     first, last = known[0][1], known[-1][1]
     told = f"A curve over {len(losses)} iterations, from {first:.3g} to {last:.3g}."
     svg = figure(title, told, WIDTH, HEIGHT, "plot")
     x, y = plot(
-        svg, (0, len(losses)), span([loss for _, loss in known], True), ("iteration", "loss")
+        svg, (0.0, float(len(losses))), span([loss for _, loss in known]), ("iteration", "loss")
     )
     points = " ".join(f"{x(k):.1f},{y(loss):.1f}" for k, loss in known)
     put(svg, "polyline", class_="curve", points=points)
@@ -171,7 +165,7 @@ def affine_scatter(
     told = f"{len(known)} pixels; {share:.0%} lie on the line {line}."
     svg = figure("Depths before and after the affine", told, WIDTH, HEIGHT, "plot")
     ranges = span([p for p, _, _ in known]), span([c for _, c, _ in known])
-    x, y = plot(svg, *ranges, (f"lifted depth ({unit})", f"depth of the scene ({unit})"))
+    x, y = plot(svg, *ranges, (f"lifted depth ({unit})", f"scene depth ({unit})"))
     for agrees, kind in ((False, "outlier"), (True, "inlier")):
         dots = [f"M{x(p):.1f} {y(c):.1f}h0" for p, c, fits in known if fits == agrees]
         put(svg, "path", class_=kind, d="".join(dots))
@@ -219,7 +213,16 @@ def colour_scale(limits: tuple[float, float], unit: str) -> Markup | None:
     palette, width = colours()[1:], (WIDTH - 88) / COLOURS
     for k in range(COLOURS):
         fill = "#{:02x}{:02x}{:02x}".format(*palette[round(254 * k / (COLOURS - 1))])
-        put(svg, "rect", x=k * width, y=0.0, width=width + 0.5, height=14.0, fill=fill)
+        put(
+            svg,
+            "rect",
+            x=k * width,
+            y=0.0,
+            width=width + 0.5,
+            height=14.0,
+            fill=fill,
+            shape_rendering="crispEdges",
+        )
     for share, anchor in ((0.0, "start"), (0.5, "middle"), (1.0, "end")):
         depth = near * (far / near) ** share
         label = f"{depth:.3g} {unit}" if share == 1 else f"{depth:.3g}"

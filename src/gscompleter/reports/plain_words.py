@@ -96,4 +96,5 @@ def gain(before: float | None, after: float | None, digits: int = 2) -> str:
     """By how much a score rose, with its sign."""
     if before is None or after is None or not math.isfinite(after - before):
         return "–"
-    return f"{after - before:+.{digits}f}".replace("-", "−")
+    rise = round(after - before, digits)
+    return f"{rise:+.{digits}f}".replace("-", "−") if rise else f"{0:.{digits}f}"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -134,7 +134,8 @@ def pairs_record(pairs: DepthPairs) -> Pairs:
 def pose_of(camera: Camera) -> Pose:
     """Where a camera stands, and how wide it sees."""
     focal_x, focal_y = camera.K[0, 0].item(), camera.K[1, 1].item()
-    rows = tuple(rounded(row) for row in camera.c2w[:3])
+    values = rounded(camera.c2w[:3].flatten())
+    rows = tuple(values[k : k + 4] for k in (0, 4, 8))
     return Pose(rows, (camera.width / focal_x / 2, camera.height / focal_y / 2))
 
 
@@ -149,7 +150,10 @@ def points_of(completion: Completion) -> Points:
 def places(gaussians: Gaussians) -> list[tuple[float, ...]]:
     """Where some of the opaque ones of `gaussians` lie."""
     opaque = gaussians.means[gaussians.opacities >= OPAQUE]
-    return [rounded(mean) for mean in spread(opaque, MAX_POINTS)]
+    order = torch.randperm(len(opaque), generator=torch.Generator().manual_seed(0))
+    chosen = opaque[order[:MAX_POINTS].to(opaque.device)]
+    values = rounded(chosen.flatten())
+    return [values[k : k + 3] for k in range(0, len(values), 3)]
 
 
 def most_changed(looks: Sequence[Look]) -> list[Look]:
@@ -159,17 +163,14 @@ def most_changed(looks: Sequence[Look]) -> list[Look]:
     return [looks[i] for i in order[:MAX_LOOKS] if changes[i] >= NOTICEABLE]
 
 
-S = TypeVar("S", Sequence[Camera], Tensor)
-
-
-def spread(items: S, most: int) -> S:
+def spread(items: Sequence[Camera], most: int) -> Sequence[Camera]:
     """Every n-th of `items`, at most `most` of them."""
     return items[:: max(1, -(-len(items) // most))]
 
 
 def as_json(record: Record) -> str:
     """The content of the file."""
-    return json.dumps(asdict(record), separators=(",", ":")) + "\n"
+    return json.dumps(record, default=vars, separators=(",", ":")) + "\n"
 
 
 def write_record(folder: Path, record: Record) -> None:
