@@ -105,7 +105,8 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
 def test_the_same_command_gives_the_same_bytes(scene, completed, tmp_path, monkeypatch):
     arguments = complete(scene, tmp_path / "out", "--near", 0.5, "--far", 20, "--quiet")
     assert run(monkeypatch, *arguments) == 0
-    for name in ("completed.ply", "context.ply", "images/target1_after.png"):
+    images = ("images/target1_after.png", "images/target1_depth_after.png")
+    for name in ("completed.ply", "context.ply", "report.json", *images):
         assert (tmp_path / "out" / name).read_bytes() == (completed / name).read_bytes(), name
 
 

@@ -51,6 +51,7 @@ from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.completion import Around, Target, write_report
 from gscompleter.reports.completion_page import completion_page
+from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
 from gscompleter.types import Completion, View
 
@@ -241,3 +242,4 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
         f"{out / 'completed.ply'}",
         soft_wrap=True,
     )
+    console.print(f"Before and after, on a page: {out / PAGE}", soft_wrap=True)
