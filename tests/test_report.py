@@ -254,8 +254,8 @@ def a_file(out: Path) -> None:
     [
         (broken_json, "is not JSON"),
         (other_version, "was written by version 0.0.1"),
-        (a_list, "is damaged"),
-        (wrong_type, "is damaged (targets.0.hole_fraction"),
+        (a_list, "does not hold what a report needs"),
+        (wrong_type, "does not hold what a report needs (targets.0.hole_fraction"),
         (no_summary, "has no summary.json"),
         (no_record, "has no report.json"),
         (other_record, "differ in cameras"),
@@ -424,5 +424,5 @@ def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypat
 @pytest.mark.parametrize("name", ["tables.json", "timings.json"])
 def test_damaged_tables_are_refused(evaluated, name):
     (evaluated / name).write_text('{"methods": 5}')
-    with pytest.raises(InputError, match="is damaged"):
+    with pytest.raises(InputError, match="does not hold what a report needs"):
         evaluation_page(evaluated)

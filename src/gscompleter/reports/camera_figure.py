@@ -7,8 +7,10 @@ these as `projected` does.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +27,8 @@ DEPTH = 0.13
 """Length of a camera, in radii."""
 FARTHEST = 6.0
 """Points are shown as far from the cameras as these stand apart, times this."""
+EDGE = 1.2
+"""How far from the middle points are drawn, in radii."""
 SHOWN = 0.85
 """Share of these points that lies within the radius."""
 
@@ -60,45 +64,40 @@ def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
     poses = [np.array(camera.pose.c2w) for camera in cameras]
     if not poses or not all(p.shape == (3, 4) and np.isfinite(p).all() for p in poses):
         return None
-    places = np.array(points.means).reshape(-1, 3)
-    frame = frame_of(np.stack(poses), places)
+    places = [place for place in zip(points.means, points.added, strict=False) if finite(place[0])]
+    means = np.array([mean for mean, _ in places]).reshape(-1, 3)
+    frame = frame_of(np.stack(poses), means)
     targets = sum(camera.kind == "target" for camera in cameras)
     told = f"{len(cameras)} cameras, {targets} of them targets, among {len(places)} points."
     svg = figure("Cameras in space", told, SIZE, SIZE, "space")
-    shown = frame(places)
-    near = (np.abs(shown) <= 1.2).all(axis=1)
-    for place, added in zip(shown[near], np.array(points.added, bool)[near], strict=True):
-        at = place[None]
-        x, y = projected(at)[0]
-        put(
-            svg,
-            "circle",
-            class_="added" if added else "seen",
-            r=1.6,
-            cx=x,
-            cy=y,
-            data_points=text_of(at),
-        )
+    for point, (_, added) in zip(frame(means), places, strict=True):
+        if np.abs(point).max() <= EDGE:
+            draw_point(svg, point, "added" if added else "seen")
     for camera, pose in zip(cameras, poses, strict=True):
-        corners = frame(frustum(pose, camera.pose.opening, DEPTH * frame.radius))
-        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in projected(corners))
-        drawn = put(svg, "polyline", class_=camera.kind, points=line, data_points=text_of(corners))
-        put(drawn, "title", camera.name)
-        if camera.label:
-            at = corners[:1]
-            x, y = projected(at)[0]
-            put(
-                svg,
-                "text",
-                camera.label,
-                class_=camera.kind,
-                x=x,
-                y=y,
-                dx=6,
-                dy=-6,
-                data_points=text_of(at),
-            )
+        draw_camera(svg, camera, frame(frustum(pose, camera.pose.opening, DEPTH * frame.radius)))
     return markup(svg)
+
+
+def finite(numbers: Sequence[float]) -> bool:
+    """Whether all of them can be drawn."""
+    return all(map(math.isfinite, numbers))
+
+
+def draw_point(svg: Element, point: Float[np.ndarray, "3"], kind: str) -> None:
+    """Draw a place on a surface, told in the frame of the drawing."""
+    (x, y), told = projected(point[None])[0], text_of(point[None])
+    put(svg, "circle", class_=kind, r=1.6, cx=x, cy=y, data_points=told)
+
+
+def draw_camera(svg: Element, camera: Placed, corners: Float[np.ndarray, "11 3"]) -> None:
+    """Draw a camera whose line from its centre along its edges is `corners`."""
+    line = " ".join(f"{x:.1f},{y:.1f}" for x, y in projected(corners))
+    drawn = put(svg, "polyline", class_=camera.kind, points=line, data_points=text_of(corners))
+    put(drawn, "title", camera.name)
+    if camera.label:
+        (x, y), told = projected(corners[:1])[0], text_of(corners[:1])
+        beside = {"dx": 6, "dy": -6, "data_points": told}
+        put(svg, "text", camera.label, class_=camera.kind, x=x, y=y, **beside)
 
 
 def frame_of(poses: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "m 3"]) -> Frame:

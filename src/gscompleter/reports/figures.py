@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element, SubElement, tostring
 
+import numpy as np
 from markupsafe import Markup
 
 from gscompleter.reports.depth_picture import NONE, colours
@@ -89,45 +90,25 @@ def plot(
     svg: Element, x: tuple[float, float], y: tuple[float, float], names: Sequence[str]
 ) -> list[Axis]:
     """Draw the two axes called `names` with their grid; returns them."""
-    across, up = Axis(*x, LEFT, WIDTH - RIGHT), Axis(*y, HEIGHT - BOTTOM, TOP)
+    low, middle = HEIGHT - BOTTOM, (HEIGHT - BOTTOM + TOP) / 2
+    across, up = Axis(*x, LEFT, WIDTH - RIGHT), Axis(*y, low, TOP)
     for value in ticks(*x):
         at = across(value)
-        put(svg, "line", class_="grid", x1=at, x2=at, y1=TOP, y2=HEIGHT - BOTTOM)
-        put(
-            svg,
-            "text",
-            f"{value:g}",
-            class_="tick",
-            x=at,
-            y=HEIGHT - BOTTOM + 14,
-            text_anchor="middle",
-        )
+        put(svg, "line", class_="grid", x1=at, x2=at, y1=TOP, y2=low)
+        label(svg, f"{value:g}", "tick", at, low + 14, "middle")
     for value in ticks(*y):
         at = up(value)
         put(svg, "line", class_="grid", x1=LEFT, x2=WIDTH - RIGHT, y1=at, y2=at)
-        put(svg, "text", f"{value:g}", class_="tick", x=LEFT - 6, y=at + 4, text_anchor="end")
-    middle = (HEIGHT - BOTTOM + TOP) / 2
-    turned = f"rotate(-90 12 {middle:g})"
-    put(
-        svg,
-        "text",
-        names[0],
-        class_="name",
-        x=(LEFT + WIDTH - RIGHT) / 2,
-        y=HEIGHT - 6,
-        text_anchor="middle",
-    )
-    put(
-        svg,
-        "text",
-        names[1],
-        class_="name",
-        x=12.0,
-        y=middle,
-        text_anchor="middle",
-        transform=turned,
-    )
+        label(svg, f"{value:g}", "tick", LEFT - 6, at + 4, "end")
+    label(svg, names[0], "name", (LEFT + WIDTH - RIGHT) / 2, HEIGHT - 6, "middle")
+    turned = label(svg, names[1], "name", 12.0, middle, "middle")
+    turned.set("transform", f"rotate(-90 12 {middle:g})")
     return [across, up]
+
+
+def label(svg: Element, text: str, kind: str, x: float, y: float, anchor: str = "start") -> Element:
+    """Write a text whose start, middle or end lies at a place."""
+    return put(svg, "text", text, class_=kind, x=x, y=y, text_anchor=anchor)
 
 
 def loss_curve(title: str, losses: Sequence[float]) -> Markup | None:
@@ -197,9 +178,9 @@ def time_bars(title: str, seconds: Mapping[str, float]) -> Markup | None:
     svg = figure(title, f"{told}.", 2 * WIDTH, height, "bars")
     for row, (name, s) in enumerate(known.items()):
         top, width = row * (BAR + GAP), s / longest * (2 * WIDTH - 220)
-        put(svg, "text", name, class_="name", x=110.0, y=top + 13, text_anchor="end")
+        label(svg, name, "name", 110.0, top + 13, "end")
         put(svg, "rect", class_="bar", x=120.0, y=top, width=width, height=BAR, rx=2.0)
-        put(svg, "text", f"{s:.2f} s", class_="tick", x=128 + width, y=top + 13)
+        label(svg, f"{s:.2f} s", "tick", 128 + width, top + 13)
     return markup(svg)
 
 
@@ -210,32 +191,19 @@ def colour_scale(limits: tuple[float, float], unit: str) -> Markup | None:
         return None
     told = f"From {near:.3g} to {far:.3g} {unit}, by the logarithm; grey where there is no depth."
     svg = figure("Colours of depth", told, WIDTH, 44.0, "scale")
-    palette, width = colours()[1:], (WIDTH - 88) / COLOURS
-    for k in range(COLOURS):
-        fill = "#{:02x}{:02x}{:02x}".format(*palette[round(254 * k / (COLOURS - 1))])
-        put(
-            svg,
-            "rect",
-            x=k * width,
-            y=0.0,
-            width=width + 0.5,
-            height=14.0,
-            fill=fill,
-            shape_rendering="crispEdges",
-        )
+    wide = WIDTH - 88
+    for k, colour in enumerate(colours()[np.linspace(1, 255, COLOURS).astype(int)].tolist()):
+        patch(svg, k * wide / COLOURS, wide / COLOURS + 0.5, colour)
     for share, anchor in ((0.0, "start"), (0.5, "middle"), (1.0, "end")):
         depth = near * (far / near) ** share
-        label = f"{depth:.3g} {unit}" if share == 1 else f"{depth:.3g}"
-        at = share * (WIDTH - 88)
-        put(svg, "text", label, class_="tick", x=at, y=30.0, text_anchor=anchor)
-    put(
-        svg,
-        "rect",
-        x=WIDTH - 72,
-        y=0.0,
-        width=14.0,
-        height=14.0,
-        fill="rgb({},{},{})".format(*NONE),
-    )
-    put(svg, "text", "no depth", class_="tick", x=WIDTH - 54, y=12.0)
+        text = f"{depth:.3g} {unit}" if share == 1 else f"{depth:.3g}"
+        label(svg, text, "tick", share * wide, 30.0, anchor)
+    patch(svg, wide + 16, 14.0, NONE)
+    label(svg, "no depth", "tick", wide + 34, 12.0)
     return markup(svg)
+
+
+def patch(svg: Element, x: float, width: float, colour: Sequence[int]) -> None:
+    """Draw a patch of a scale of colours."""
+    fill = "#{:02x}{:02x}{:02x}".format(*colour)
+    put(svg, "rect", x=x, y=0.0, width=width, height=14.0, fill=fill, shape_rendering="crispEdges")

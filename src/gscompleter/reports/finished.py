@@ -197,5 +197,6 @@ def as_written(kind: type[T], content: Any, path: Path, advice: str = ADVICE) ->
         wrong = error.errors(include_url=False)[0]
         place = ".".join(map(str, wrong["loc"])) or "its content"
         raise InputError(
-            f"{quoted(path)} is damaged ({quoted(place)}: {quoted(wrong['msg'])}); {advice}."
+            f"{quoted(path)} does not hold what a report needs ({quoted(place)}: "
+            f"{quoted(wrong['msg'])}); {advice}."
         ) from None
