@@ -23,14 +23,14 @@ SIZE = 480.0
 """Width and height of the drawing, in the units of its viewBox."""
 YAW, PITCH = 30.0, 25.0
 """How the drawing is turned at first, in degrees."""
-DEPTH = 0.13
+DEPTH = 0.11
 """Length of a camera, in radii."""
-FARTHEST = 6.0
+FARTHEST = 15.0
 """Points are shown as far from the cameras as these stand apart, times this."""
 EDGE = 1.2
 """How far from the middle points are drawn, in radii."""
-SHOWN = 0.85
-"""Share of these points that lies within the radius."""
+SHOWN = 0.9
+"""Share of all that is shown that lies within the radius."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,10 @@ def frame_of(poses: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "m 3"]
     middle = cameras.mean(axis=0)
     apart = distances(cameras, middle).max()
     near = points[distances(points, middle) <= FARTHEST * apart] if apart > 0 else points
-    center = (middle + np.median(near, axis=0)) / 2 if len(near) else middle
-    around = np.quantile(distances(near, center), SHOWN) if len(near) else 0.0
-    radius = max(around, 1.1 * distances(cameras, center).max())
+    shown = np.concatenate([cameras, near])
+    center = np.quantile(shown, [1 - SHOWN, SHOWN], axis=0).mean(axis=0)
+    away = distances(shown, center)
+    radius = max(np.quantile(away, SHOWN), 1.1 * away[: len(cameras)].max())
     up = -poses[:, :, 1].mean(axis=0)
     forward = poses[:, :, 2].mean(axis=0)
     right = np.cross(forward, up)

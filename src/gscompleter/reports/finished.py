@@ -68,7 +68,7 @@ class TargetRow(Scores):
         """What the report calls it besides its number."""
         if self.near is not None:
             return f"near photograph {self.near}"
-        return "a camera" if self.frame is None else f"photograph {self.frame}"
+        return "a given camera" if self.frame is None else f"photograph {self.frame}"
 
 
 @dataclass(frozen=True)
