@@ -21,6 +21,8 @@ LEFT, BOTTOM, TOP, RIGHT = 52.0, 40.0, 12.0, 12.0
 """Margins around the axes."""
 BAR, GAP = 16.0, 10.0
 """Height of a bar, and the space below it."""
+NAMES, LONGEST = 96.0, 230.0
+"""Width of what stands before bars, and of the longest bar."""
 COLOURS = 48
 """Patches of a scale of colours."""
 
@@ -175,12 +177,12 @@ def time_bars(title: str, seconds: Mapping[str, float]) -> Markup | None:
         return None
     told = ", ".join(f"{name} {s:.2f} s" for name, s in known.items())
     height = len(known) * (BAR + GAP)
-    svg = figure(title, f"{told}.", 2 * WIDTH, height, "bars")
+    svg = figure(title, f"{told}.", NAMES + LONGEST + 60, height, "bars")
     for row, (name, s) in enumerate(known.items()):
-        top, width = row * (BAR + GAP), s / longest * (2 * WIDTH - 220)
-        label(svg, name, "name", 110.0, top + 13, "end")
-        put(svg, "rect", class_="bar", x=120.0, y=top, width=width, height=BAR, rx=2.0)
-        label(svg, f"{s:.2f} s", "tick", 128 + width, top + 13)
+        top, width = row * (BAR + GAP), s / longest * LONGEST
+        label(svg, name, "name", NAMES - 8, top + 13, "end")
+        put(svg, "rect", class_="bar", x=NAMES, y=top, width=width, height=BAR, rx=2.0)
+        label(svg, f"{s:.2f} s", "tick", NAMES + width + 8, top + 13)
     return markup(svg)
 
 
