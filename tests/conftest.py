@@ -22,6 +22,27 @@ install_import_hook([f"gscompleter.{name}" for name in CHECKED], "beartype.beart
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+@pytest.fixture(scope="session")
+def room(tmp_path_factory) -> Path:
+    """A synthetic room photographed from three places; frame 2 sees what 0 and 1 do not."""
+    from scenes import camera_at, photographed
+
+    cameras = [camera_at(x, yaw=yaw, size=64) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
+    return photographed(tmp_path_factory.mktemp("room"), cameras)
+
+
+@pytest.fixture(scope="session")
+def completed_room(room, tmp_path_factory) -> Path:
+    """The output of one plain run on the room. Whoever changes it copies it first."""
+    from command import run
+
+    out = tmp_path_factory.mktemp("runs") / "out"
+    frames = ("--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        assert run(monkeypatch, "complete", room, *frames, "--out", out, "--quiet") == 0
+    return out
+
+
 @pytest.fixture
 def shared() -> Path:
     """Real photographs and files for development, where they lie beside the project."""

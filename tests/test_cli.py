@@ -28,17 +28,15 @@ from gscompleter.config.generators import (
     WarpInpaintSettings,
 )
 from gscompleter.data.scene import write_cameras
-from scenes import camera_at, photographed
+from scenes import camera_at
 
 SIZE = 64
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    """A synthetic room photographed from three places; frame 2 sees what 0 and 1 do not."""
-    folder = tmp_path_factory.mktemp("room")
-    cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
-    return photographed(folder, cameras)
+def scene(room) -> Path:
+    """Photographs of a room from three places; frame 2 sees what 0 and 1 do not."""
+    return room
 
 
 def complete(scene, out, *more, context=(0, 1), target=(2,)) -> list:
@@ -50,12 +48,9 @@ SMALL = ("--resolution", 32, "--near", 0.5, "--far", 20, "--quiet")
 
 
 @pytest.fixture(scope="module")
-def completed(scene, tmp_path_factory) -> Path:
+def completed(completed_room) -> Path:
     """The output of one plain run."""
-    out = tmp_path_factory.mktemp("runs") / "out"
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        assert run(monkeypatch, *complete(scene, out, "--near", 0.5, "--far", 20, "--quiet")) == 0
-    return out
+    return completed_room
 
 
 def test_out_holds_all_that_the_contract_names(completed):
@@ -64,13 +59,16 @@ def test_out_holds_all_that_the_contract_names(completed):
         "context.ply",
         "generated.ply",
         "images",
+        "report.html",
+        "report.json",
         "summary.json",
         "targets.json",
     }
-    names = ("before", "after", "reference", "hole_mask", "truth")
-    assert {p.name for p in (completed / "images").iterdir()} == {
-        f"target1_{name}.png" for name in names
-    }
+    names = ("before", "after", "reference", "hole_mask", "truth", "depth_before", "depth_after")
+    images = {p.name for p in (completed / "images").iterdir()}
+    assert {n for n in images if n.startswith("target")} == {f"target1_{n}.png" for n in names}
+    around = {f"around{number}_{when}.png" for number in (1, 2) for when in ("before", "after")}
+    assert around <= images
 
 
 def test_what_was_added_lies_beside_the_scene_alone(completed):
@@ -107,7 +105,8 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
 def test_the_same_command_gives_the_same_bytes(scene, completed, tmp_path, monkeypatch):
     arguments = complete(scene, tmp_path / "out", "--near", 0.5, "--far", 20, "--quiet")
     assert run(monkeypatch, *arguments) == 0
-    for name in ("completed.ply", "context.ply", "images/target1_after.png"):
+    images = ("images/target1_after.png", "images/target1_depth_after.png")
+    for name in ("completed.ply", "context.ply", "report.json", *images):
         assert (tmp_path / "out" / name).read_bytes() == (completed / name).read_bytes(), name
 
 

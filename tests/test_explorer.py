@@ -8,7 +8,7 @@ import torch
 from gscompleter import CompleterConfig, GSCompleter
 from gscompleter.config import AffineConfig, ExplorationConfig, RegistrationConfig
 from gscompleter.explorer import Explorer, with_bystanders
-from gscompleter.metrics.coverage import coverage_of, covered, held_out_cameras
+from gscompleter.metrics.coverage import coverage_of, covered, held_out_cameras, looks_of
 from gscompleter.render import load_renderer
 from gscompleter.stages.exploration import gain, miniature, overlap_of, stand_ins
 from gscompleter.types import Camera, Completion, Gaussians, Render, View
@@ -68,7 +68,7 @@ def test_cameras_are_found_until_little_is_left_and_the_scene_covers_more(begun)
     assert len(completion.targets) == len(choices)
     assert all(choice.gain >= 0.01 for choice in choices)
     aside = held_out_cameras(cameras(), seed=0)
-    found = coverage_of(completion, aside, load_renderer("cpu"))
+    found = coverage_of(looks_of(completion, aside, load_renderer("cpu")))
     assert found.before < 0.95
     assert found.after - found.before > 0.4 * (1 - found.before)
 

@@ -32,6 +32,7 @@ from gscompleter.commands.options import (
     TablesOptions,
 )
 from gscompleter.commands.poses import PosesOptions
+from gscompleter.commands.report import ReportOptions
 from gscompleter.commands.strip import StripOptions
 from gscompleter.commands.warmup import WarmupOptions
 from gscompleter.config import CompleterConfig, load_config
@@ -53,6 +54,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "models": (ModelsOptions, "gscompleter.commands.models", "run_models"),
     "convert": (ConvertOptions, "gscompleter.commands.convert", "run_convert"),
     "poses": (PosesOptions, "gscompleter.commands.poses", "run_poses"),
+    "report": (ReportOptions, "gscompleter.commands.report", "run_report"),
     "strip": (StripOptions, "gscompleter.commands.strip", "run_strip"),
     "warmup": (WarmupOptions, "gscompleter.commands.warmup", "run_warmup"),
 }

@@ -28,6 +28,7 @@ from gscompleter.stages.anchor import (
     synthesize_all,
 )
 from gscompleter.stages.candidates import shrunk
+from gscompleter.stages.compared_depths import compared_depths
 from gscompleter.stages.context import exposed_alike, init_context, working_range
 from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
@@ -257,7 +258,10 @@ class GSCompleter:
             lifted = self.lift(sight, reference)
         with clock("register"):
             registration = self.register(sight, lifted, reference, frozen_views)
-        result = replace(result, affine=registration.affine)
+        at_anchor = frozen_views[sight.anchor.index].context
+        fit, settings = registration.affine, self.config.registration.affine
+        pairs = compared_depths(lifted, sight.frozen.context, at_anchor, fit, settings)
+        result = replace(result, affine=fit, pairs=pairs)
         if registration.affine.refuted:
             notes = notes_of(sight.anchor.fallback, registration.affine)
             return replace(result, notes=(*reference.notes, *notes, NOTHING_ADDED))

@@ -305,6 +305,20 @@ class DepthAffine:
 
 
 @dataclass(frozen=True)
+class DepthPairs:
+    """Depths that an affine was fitted to, or as many of them as show how well it fits."""
+
+    seen_from: Literal["anchor", "target"]
+    """The camera at which they were compared."""
+    predicted: Float[Tensor, "n"]
+    """z-depth as it was lifted, in scene units."""
+    context: Float[Tensor, "n"]
+    """z-depth of the scene, in scene units."""
+    agrees: Bool[Tensor, "n"]
+    """Whether the affine brings the one to the other."""
+
+
+@dataclass(frozen=True)
 class TargetCompletion:
     """What happened at one target, kept for inspection."""
 
@@ -329,6 +343,8 @@ class TargetCompletion:
     support: Float[Tensor, "h w"] | None = None
     """How far photographs supported what the target saw of a scene that was brought, in [0, 1];
     None where it was not doubted."""
+    pairs: DepthPairs | None = None
+    """Of what the affine was fitted to; None where nothing was compared."""
 
     @property
     def hole_fraction(self) -> float:

@@ -13,7 +13,7 @@ from rich.table import Table
 from gscompleter.commands.exploring import (
     cameras_of,
     completed,
-    coverage,
+    looks_around,
     name_of,
     planned,
     tell_plan,
@@ -44,11 +44,15 @@ from gscompleter.config import CompleterConfig
 from gscompleter.explorer import Explorer
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
+from gscompleter.metrics.coverage import coverage_of
 from gscompleter.progress import shown_on
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import choose_device, load_renderer
-from gscompleter.reports.completion import Target, write_report
+from gscompleter.reports.completion import Around, Target, write_report
+from gscompleter.reports.completion_page import completion_page
+from gscompleter.reports.page import NAME as PAGE
+from gscompleter.reports.page import write_page
 from gscompleter.types import Completion, View
 
 
@@ -78,10 +82,19 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
             completion, task = completed(options, task, cameras, explorer)
         completion = replace(completion, seconds=total(completion.seconds, before))
         said = said_in_advance(options, opened, task, task.views[0].image.device.type)
-        said["coverage"] = coverage(options, completion, cameras.values(), explorer)
-        renderer = explorer.completer.renderer
-        summary = write_report(folder, completion, task.targets, renderer, said, task.brought)
+        looks = looks_around(options, completion, cameras.values(), explorer)
+        said["coverage"] = coverage_of(looks).as_summary()
+        summary = write_report(
+            folder,
+            completion,
+            task.targets,
+            explorer.completer.renderer,
+            said,
+            task.brought,
+            Around(tuple(looks), tuple(cameras.values())),
+        )
         write_targets(folder, task)
+        write_page(folder, completion_page(folder))
     return summary, completion
 
 
@@ -229,3 +242,4 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
         f"{out / 'completed.ply'}",
         soft_wrap=True,
     )
+    console.print(f"Before and after, on a page: {out / PAGE}", soft_wrap=True)

@@ -29,6 +29,8 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.progress import shown_on
 from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import choose_device
+from gscompleter.reports.evaluation_page import evaluation_page
+from gscompleter.reports.page import write_page
 from gscompleter.reports.plots import PlotsNotAvailable, plots
 from gscompleter.reports.summary import Summary
 from gscompleter.reports.tables import score_cells, tables
@@ -88,7 +90,7 @@ def run_tables(options: TablesOptions) -> None:
 
 
 def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> None:
-    """Write the tables and plots of a run, and print the former unless `quiet`.
+    """Write the tables, plots and page of a run, and print the former unless `quiet`.
 
     Where other shards finished meanwhile and all `num_rows` rows are there, it does so once more:
     of shards that end at the same moment, none can leave tables behind that lack rows of another.
@@ -98,6 +100,7 @@ def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> N
         seen = there
         summary = tables(out, with_fid)
         draw(summary, out, quiet)
+        write_page(out, evaluation_page(out))
         there = rows_there(out)
     if not quiet:
         tell(summary, out)

@@ -19,7 +19,7 @@ from gscompleter.data.scene import write_cameras
 from gscompleter.errors import quoted
 from gscompleter.explorer import Explorer
 from gscompleter.frames.similarity import moved_camera
-from gscompleter.metrics.coverage import coverage_of, held_out_cameras
+from gscompleter.metrics.coverage import Look, held_out_cameras, looks_of
 from gscompleter.reports.completion import Target
 from gscompleter.stages.exploration import Choice
 from gscompleter.types import Camera, Completion
@@ -145,12 +145,12 @@ def write_targets(folder: Path, task: Task) -> None:
     write_cameras(folder / TARGETS, [as_given(target.camera, back) for target in task.targets])
 
 
-def coverage(
+def looks_around(
     options: CompleteOptions, completion: Completion, cameras: Iterable[Camera], explorer: Explorer
-) -> dict[str, float]:
-    """How much is covered from around `cameras`, before and after, for `summary.json`."""
+) -> list[Look]:
+    """The scene before and after, as cameras around `cameras` see it."""
     aside = held_out_cameras(list(cameras), options.seed)
-    return coverage_of(completion, aside, explorer.completer.renderer).as_summary()
+    return looks_of(completion, aside, explorer.completer.renderer)
 
 
 def as_given(camera: Camera, transform: Float[np.ndarray, "4 4"]) -> Camera:

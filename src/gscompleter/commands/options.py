@@ -120,8 +120,8 @@ class CompleteOptions(SceneOptions, ModelOptions):
     """Only write targets.json, which can be edited and given to --target, and show what would be
     done."""
     out: Path
-    """Folder for completed.ply, generated.ply, context.ply, targets.json, images/ and
-    summary.json."""
+    """Folder for completed.ply, generated.ply, context.ply, targets.json, images/, report.html,
+    report.json and summary.json."""
     scene: Path | None = None
     """A file of Gaussians to complete, which is kept as it is. Without it the context is
     reconstructed from the photographs."""

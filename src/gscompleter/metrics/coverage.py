@@ -42,16 +42,30 @@ class Coverage:
         return asdict(self)
 
 
-def coverage_of(completion: Completion, cameras: Sequence[Camera], renderer: Renderer) -> Coverage:
-    """How much a scene covers, as `cameras` see it in small images."""
+@dataclass(frozen=True)
+class Look:
+    """What one camera sees of a scene in a small image, before and after it was completed."""
+
+    before: Render
+    after: Render
+
+
+def looks_of(completion: Completion, cameras: Sequence[Camera], renderer: Renderer) -> list[Look]:
+    """What `cameras` see of the scene in small images, about."""
     kept, small = KeptViews(renderer, MAX_GAUSSIANS), [shrunk(c, SIDE) for c in cameras]
     context = completion.context
     begun = replace(completion, scene=context, set_aside=None, targets=())
-    first = covered([view.context for view in kept.of(begun, small)])
+    first = [view.context for view in kept.of(begun, small)]
     if completion.set_aside is None:
         kept.grown(context, completion.scene)
-    last = covered([view.context for view in kept.of(completion, small)])
-    return Coverage(first, last, len(cameras))
+    last = [view.context for view in kept.of(completion, small)]
+    return [Look(before, after) for before, after in zip(first, last, strict=True)]
+
+
+def coverage_of(looks: Sequence[Look]) -> Coverage:
+    """How much a scene covers of what was looked at."""
+    before, after = [look.before for look in looks], [look.after for look in looks]
+    return Coverage(covered(before), covered(after), len(looks))
 
 
 def covered(renders: Sequence[Render]) -> float:

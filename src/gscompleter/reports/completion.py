@@ -15,12 +15,15 @@ from torch import Tensor
 from gscompleter import __version__
 from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
+from gscompleter.metrics.coverage import Look
 from gscompleter.metrics.image import psnr, ssim
 from gscompleter.render import Renderer
+from gscompleter.reports.depth_picture import limits_of, write_depth
+from gscompleter.reports.record import Limits, most_changed, record_of, write_record
 from gscompleter.splats.layout import save_like
 from gscompleter.splats.removed import NAME as REMOVED
 from gscompleter.splats.removed import save_removed
-from gscompleter.types import Camera, Completion, Gaussians, TargetCompletion
+from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion
 
 
 @dataclass(frozen=True)
@@ -46,16 +49,26 @@ class Brought:
 
 
 @dataclass(frozen=True)
+class Around:
+    """What surrounds a completion, for its report."""
+
+    looks: tuple[Look, ...] = ()
+    """What cameras around the photographs see before and after."""
+    photographs: tuple[Camera, ...] = ()
+    """Cameras of all photographs, in the frame of the result."""
+
+
+@dataclass(frozen=True)
 class Images:
     """One camera's view of the scene before and after."""
 
-    before: Float[Tensor, "h w 3"]
-    after: Float[Tensor, "h w 3"]
+    before: Render
+    after: Render
     truth: Float[Tensor, "h w 3"] | None
 
     def scores(self) -> dict[str, float | None]:
         """PSNR (dB) and SSIM against the photograph; None where there is none."""
-        images = {"before": self.before, "after": self.after}
+        images = {"before": self.before.image, "after": self.after.image}
         return {
             f"{metric.__name__}_{when}": None if self.truth is None else metric(image, self.truth)
             for metric in (psnr, ssim)
@@ -73,7 +86,7 @@ def compare(
             after = frozen.extended(completion.added).context
         else:  # some of the context was set aside
             after = renderer.render(completion.scene, camera)
-    return Images(frozen.context.image, after.image, truth)
+    return Images(frozen.context, after, truth)
 
 
 def summarize(
@@ -142,8 +155,9 @@ def write_report(
     renderer: Renderer,
     said: Mapping[str, Any],
     brought: Brought | None = None,
+    around: Around = Around(),
 ) -> dict[str, Any]:
-    """Write the three scenes, `images/` and `summary.json`; returns the summary.
+    """Write the three scenes, `images/`, `report.json` and `summary.json`; returns the summary.
 
     Args:
         folder: Where to.
@@ -152,6 +166,7 @@ def write_report(
         renderer: Draws the scene before and after.
         said: Settings, seed and device, for the summary.
         brought: Where the context comes from, if not from Ψ: `completed.ply` keeps its layout.
+        around: What surrounds it.
 
     Raises:
         InputError: where a file cannot be written.
@@ -169,12 +184,43 @@ def write_report(
         context, scene = completion.context, completion.scene
         save_brought(folder, context, scene, completion.set_aside, brought)
     save_ply(folder / "generated.ply", completion.added, provenance=True)
-    (folder / "images").mkdir()
-    for number, (result, images) in enumerate(zip(completion.targets, target_images, strict=True)):
-        for name, image in pictures(result, images).items():
-            write_image(folder / "images" / f"target{number + 1}_{name}.png", image)
+    shown, pictured = most_changed(around.looks), folder / "images"
+    pictured.mkdir()
+    results = zip(completion.targets, target_images, strict=True)
+    limits = [write_pictures(pictured, n, *pair) for n, pair in enumerate(results, start=1)]
+    write_looks(pictured, shown)
+    write_record(folder, record_of(completion, limits, shown, around.photographs))
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     return summary
+
+
+def write_pictures(
+    folder: Path, number: int, result: TargetCompletion, images: Images
+) -> Limits | None:
+    """Write the pictures of a target; returns the ends of the colours of its depths.
+
+    Raises:
+        InputError: where a file cannot be written.
+    """
+    for name, image in pictures(result, images).items():
+        write_image(folder / f"target{number}_{name}.png", image)
+    depths = {"before": images.before.depth_map(), "after": images.after.depth_map()}
+    limits = limits_of(list(depths.values()))
+    if limits is not None:
+        for when, depth in depths.items():
+            write_depth(folder / f"target{number}_depth_{when}.png", depth, limits)
+    return limits
+
+
+def write_looks(folder: Path, looks: Sequence[Look]) -> None:
+    """Write what cameras around the photographs see before and after.
+
+    Raises:
+        InputError: where a file cannot be written.
+    """
+    for number, look in enumerate(looks, start=1):
+        write_image(folder / f"around{number}_before.png", look.before.image)
+        write_image(folder / f"around{number}_after.png", look.after.image)
 
 
 def save_brought(
@@ -208,7 +254,11 @@ def save_brought(
 
 def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:
     """The pictures of one target by name: colour [h, w, 3], or a mask [h, w]."""
-    found = {"before": images.before, "after": images.after, "hole_mask": result.hole_mask.float()}
+    found = {
+        "before": images.before.image,
+        "after": images.after.image,
+        "hole_mask": result.hole_mask.float(),
+    }
     if result.support is not None:
         found["support"] = result.support
     if result.reference is not None:

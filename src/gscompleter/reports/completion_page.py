@@ -1,0 +1,299 @@
+"""The page on a completion, made of nothing but what lies in its output folder."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from gscompleter.data.formats import FORMATS
+from gscompleter.reports.camera_figure import PITCH, YAW, camera_figure, placed_cameras
+from gscompleter.reports.figures import affine_scatter, colour_scale, loss_curve, time_bars
+from gscompleter.reports.finished import Affine, Finished, Scores, Summary, TargetRow, read_finished
+from gscompleter.reports.page import Gallery, Picture, Slider, Table, gallery_of, rendered
+from gscompleter.reports.plain_words import about_scene, about_target, gain, percent, shown
+from gscompleter.reports.record import TargetRecord
+
+VIEWER = "view.html"
+"""The page of the viewer, where it lies beside the report."""
+PICTURES = {
+    "reference": "The image that was synthesized",
+    "hole_mask": "Where the scene had a hole (white)",
+    "support": "How far photographs support what the target saw (white: fully)",
+    "truth": "The photograph, used for scores only",
+}
+"""By their names in `images/`, the pictures of a target besides before and after."""
+CURVES = {
+    "register": "Loss of the registration along the rays",
+    "refine": "Loss of the refinement",
+}
+"""By their names in the record, the optimisations of a target."""
+METHODS = {
+    "ransac": "RANSAC fitted scene depth = {scale} × lifted depth {shift}; {inliers} of the pixels "
+    "agree",
+    "median": "The median ratio of depths was taken, scene depth = {scale} × lifted depth; "
+    "{inliers} of the pixels agree",
+    "identity": "Depths were left as they were lifted",
+}
+"""By how the affine of a target was found, what is said of it."""
+SCORES = ("camera", "PSNR before", "PSNR after", "change", "SSIM before", "SSIM after", "change")
+"""The head of a table of scores."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """What the page shows of a target."""
+
+    number: int
+    name: str
+    images: Slider
+    facts: Sequence[tuple[str, str]]
+    notes: Sequence[str]
+    link: str | None
+    pictures: Sequence[tuple[Picture, str]]
+    depths: Slider | None
+    scale: Markup | None
+    fit: str
+    scatter: Markup | None
+    seen_from: str
+    curves: Sequence[tuple[Markup, str]]
+
+
+def completion_page(folder: Path) -> str:
+    """The page on the completion in `folder`.
+
+    Raises:
+        InputError: where it holds none, or one of another version, or a damaged one.
+    """
+    found = read_finished(folder)
+    summary, record = found.summary, found.record
+    gallery, viewer = gallery_of(folder / "images"), viewer_of(folder)
+    sections = zip(summary.targets, record.targets, strict=True)
+    return rendered(
+        "completion.html",
+        {
+            "title": title_of(summary),
+            "facts": facts_of(summary),
+            "notes": about_scene(summary),
+            "targets": [
+                section(number, row, kept, gallery, unit_of(summary), viewer)
+                for number, (row, kept) in enumerate(sections, start=1)
+            ],
+            "coverage": coverage_sentence(summary),
+            "around": list(around(found, gallery)),
+            "cameras": cameras_of(found),
+            "cameras_caption": cameras_caption(found),
+            "yaw": YAW,
+            "pitch": PITCH,
+            "scores": score_tables(summary),
+            "bars": time_bars("Seconds by stage", stages_of(summary)),
+            "total": f"{shown(summary.seconds.get('total'), 1)} s in all, on {summary.device}.",
+            "settings": settings_table(summary),
+            "viewer": viewer,
+        },
+    )
+
+
+def viewer_of(folder: Path) -> str | None:
+    """The address of the viewer's page, where there is one."""
+    return VIEWER if os.path.isfile(folder / VIEWER) else None
+
+
+def title_of(summary: Summary) -> str:
+    """What the scene is called: the name of its folder, or of the splat that was brought."""
+    path = summary.scene.splat or str(summary.settings.get("folder") or "")
+    return Path(path).name or "Scene"
+
+
+def unit_of(summary: Summary) -> str:
+    """What lengths are in: metres where the format says so and no splat has a frame of its own."""
+    format = FORMATS.get(summary.scene.format)
+    known = format is not None and format.unit is not None and summary.frame.method == "given"
+    return str(format.unit) if format is not None and known else "scene units"
+
+
+def facts_of(summary: Summary) -> list[tuple[str, str]]:
+    """The numbers at the head of the page."""
+    covered = summary.coverage
+    facts = [
+        ("covered around the photographs", f"{percent(covered.before)} → {percent(covered.after)}"),
+        ("Gaussians added", f"{summary.gaussians.get('added', 0):,}"),
+        ("targets", str(len(summary.targets))),
+        ("time", f"{shown(summary.seconds.get('total'), 1)} s"),
+    ]
+    removed = summary.gaussians.get("removed")
+    return facts if not removed else [*facts, ("Gaussians set aside", f"{removed:,}")]
+
+
+def section(
+    number: int, row: TargetRow, kept: TargetRecord, gallery: Gallery, unit: str, viewer: str | None
+) -> Section:
+    """What the page shows of a target."""
+    name = f"target{number}"
+    limits = kept.depth_limits
+    return Section(
+        number=number,
+        name=row.name,
+        images=gallery.slider(name, f"Target {number}, {row.name}"),
+        facts=target_facts(row),
+        notes=about_target(row),
+        link=None if viewer is None else f"{viewer}#camera=target-{number}",
+        pictures=list(pictures_of(number, row, gallery)),
+        depths=None
+        if limits is None
+        else gallery.slider(f"{name}_depth", f"Depth at target {number}", True),
+        scale=None if limits is None else colour_scale(limits, unit),
+        fit=fit_sentence(row.affine, unit),
+        scatter=scatter_of(row.affine, kept, unit),
+        seen_from="the anchor"
+        if kept.pairs is None or kept.pairs.seen_from == "anchor"
+        else "the target",
+        curves=list(curves_of(kept)),
+    )
+
+
+def target_facts(row: TargetRow) -> list[tuple[str, str]]:
+    """The numbers below the image of a target."""
+    facts = [("hole", percent(row.hole_fraction)), ("Gaussians added", f"{row.added:,}")]
+    if row.anchor is not None:
+        facts.append(("anchor", f"photograph {row.anchor}"))
+    if row.psnr_after is not None:
+        facts.append(("PSNR", f"{shown(row.psnr_before)} → {shown(row.psnr_after)} dB"))
+        facts.append(("SSIM", f"{shown(row.ssim_before, 3)} → {shown(row.ssim_after, 3)}"))
+    return facts
+
+
+def pictures_of(number: int, row: TargetRow, gallery: Gallery) -> Iterator[tuple[Picture, str]]:
+    """The pictures of a target besides before and after, as far as it has them."""
+    for name, caption in PICTURES.items():
+        file = f"target{number}_{name}.png"
+        expected = name == "hole_mask" or (name == "truth" and row.psnr_after is not None)
+        if expected or (gallery.folder / file).is_file():
+            embed = gallery.exact if name in ("hole_mask", "support") else gallery.photo
+            yield embed(file, f"{caption}, at target {number}"), caption
+
+
+def fit_sentence(affine: Affine, unit: str) -> str:
+    """How the lifted depths were brought to the scene's."""
+    sign = "−" if affine.shift < 0 else "+"
+    shift = f"{sign} {shown(abs(affine.shift), 3)} {unit}"
+    words = METHODS.get(affine.method, "Depths were fitted by an unknown method")
+    said = words.format(
+        scale=shown(affine.scale, 3), shift=shift, inliers=percent(affine.inliers, 0)
+    )
+    if affine.agreement is None:
+        return f"{said}."
+    return (
+        f"{said}. At the target {percent(affine.agreement, 0)} of what is seen of the scene agree."
+    )
+
+
+def scatter_of(affine: Affine, kept: TargetRecord, unit: str) -> Markup | None:
+    """The depths that the affine was fitted to; None where none were kept."""
+    if kept.pairs is None:
+        return None
+    pairs = zip(kept.pairs.predicted, kept.pairs.context, kept.pairs.agrees, strict=False)
+    return affine_scatter(list(pairs), affine.scale, affine.shift, unit)
+
+
+def curves_of(kept: TargetRecord) -> Iterator[tuple[Markup, str]]:
+    """The losses of a target, as far as there are any."""
+    for name, caption in CURVES.items():
+        curve = loss_curve(caption, kept.losses.get(name, ()))
+        if curve is not None:
+            yield curve, caption
+
+
+def coverage_sentence(summary: Summary) -> str:
+    """How much is covered, before and after."""
+    covered = summary.coverage
+    return (
+        f"{covered.cameras} cameras around the photographs, which nothing was completed for, see "
+        f"{percent(covered.before)} of their images covered before and "
+        f"{percent(covered.after)} after."
+    )
+
+
+def around(found: Finished, gallery: Gallery) -> Iterator[tuple[Slider, str]]:
+    """What cameras around the photographs see, those that changed most."""
+    for number, look in enumerate(found.record.around, start=1):
+        slider = gallery.slider(f"around{number}", f"Camera {number} around the photographs")
+        yield slider, f"{percent(look.before, 0)} → {percent(look.after, 0)} covered"
+
+
+def cameras_of(found: Finished) -> Markup | None:
+    """The cameras in space."""
+    summary, record = found.summary, found.record
+    frames = [row.frame for row in summary.context]
+    cameras = placed_cameras(
+        list(zip(record.context, frames, strict=True)),
+        [row.anchor for row in summary.targets if row.anchor is not None],
+        [kept.camera for kept in record.targets],
+        record.photographs,
+    )
+    return camera_figure(list(cameras), record.points)
+
+
+def cameras_caption(found: Finished) -> str:
+    """How many cameras the drawing shows."""
+    record = found.record
+    drawn, count = len(record.photographs), record.num_photographs
+    of = f"{count} photographs" if drawn == count else f"{drawn} of {count} photographs"
+    return f"{of}, {len(record.context)} of the context. Drag the drawing to turn it."
+
+
+def score_tables(summary: Summary) -> list[Table]:
+    """The scores at the targets and at the photographs of the context."""
+    targets = [score_row(f"{n}: {row.name}", row) for n, row in enumerate(summary.targets, start=1)]
+    context = [score_row(f"photograph {row.frame}", row) for row in summary.context]
+    tables = [
+        Table("At the targets", SCORES, targets),
+        Table("At the photographs of the context", SCORES, context),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def score_row(name: str, row: Scores) -> list[str]:
+    """A line of a table of scores."""
+    psnr, ssim = (row.psnr_before, row.psnr_after), (row.ssim_before, row.ssim_after)
+    return [
+        name,
+        *(shown(value) for value in psnr),
+        gain(*psnr),
+        *(shown(value, 3) for value in ssim),
+        gain(*ssim, 3),
+    ]
+
+
+def stages_of(summary: Summary) -> dict[str, float]:
+    """Seconds of each stage."""
+    return {name: seconds for name, seconds in summary.seconds.items() if name != "total"}
+
+
+def settings_table(summary: Summary) -> Table:
+    """Everything that decided the result."""
+    told = {
+        "version": summary.version,
+        "format": summary.scene.format,
+        "near": summary.depth_range.near,
+        "far": summary.depth_range.far,
+        "seed": summary.seed,
+        "device": summary.device,
+    }
+    rows = [*flat({"settings": summary.settings}), *flat({"found": told})]
+    return Table("Everything that decided the result", ("setting", "value"), rows)
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Settings in settings as one list of names with dots, and values as JSON."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+            yield f"{prefix}{name}", "–" if value is None else text

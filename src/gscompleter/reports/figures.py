@@ -1,0 +1,211 @@
+"""Figures of a report as SVG elements: curves, dots, bars, a scale of colours, cameras in space.
+
+Elements are built and serialized by the standard library, which escapes every text in them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+import numpy as np
+from markupsafe import Markup
+
+from gscompleter.reports.depth_picture import NONE, colours
+
+WIDTH, HEIGHT = 360.0, 220.0
+"""Of a plot, in the units of its viewBox."""
+LEFT, BOTTOM, TOP, RIGHT = 52.0, 40.0, 12.0, 12.0
+"""Margins around the axes."""
+BAR, GAP = 16.0, 10.0
+"""Height of a bar, and the space below it."""
+NAMES, LONGEST = 96.0, 230.0
+"""Width of what stands before bars, and of the longest bar."""
+COLOURS = 48
+"""Patches of a scale of colours."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A linear axis: the values at both ends, and where these are drawn."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+
+    def __call__(self, value: float) -> float:
+        """Where `value` is drawn."""
+        return self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start)
+
+
+def figure(title: str, description: str, width: float, height: float, kind: str) -> Element:
+    """An empty drawing with its texts for those who do not see it."""
+    svg = Element(
+        "svg", {"viewBox": f"0 0 {width:g} {height:g}", "role": "img", "class": f"figure {kind}"}
+    )
+    SubElement(svg, "title").text = title
+    SubElement(svg, "desc").text = description
+    return svg
+
+
+def markup(svg: Element) -> Markup:
+    """A drawing as part of a page."""
+    return Markup(tostring(svg, encoding="unicode"))
+
+
+def put(parent: Element, tag: str, text: str | None = None, **attributes: object) -> Element:
+    """A new element; numbers are written with two decimals, `class_` as class."""
+    written = {
+        name.rstrip("_").replace("_", "-"): number(value) for name, value in attributes.items()
+    }
+    element = SubElement(parent, tag, written)
+    element.text = text
+    return element
+
+
+def number(value: object) -> str:
+    """A number of an attribute, or its text."""
+    return f"{round(value, 2):g}" if isinstance(value, float) else str(value)
+
+
+def ticks(low: float, high: float, most: int = 5) -> list[float]:
+    """Round numbers from `low` to `high`."""
+    raw = (high - low) / most
+    size = 10.0 ** math.floor(math.log10(raw))
+    step = next(size * factor for factor in (1, 2, 5, 10) if size * factor >= raw * (1 - 1e-9))
+    return [
+        k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+    ]
+
+
+def span(values: Sequence[float]) -> tuple[float, float]:
+    """The range of an axis that shows `values`, never empty."""
+    low, high = min(values), max(values)
+    room = 0.05 * ((high - low) or abs(high) or 1.0)
+    return low - room, high + room
+
+
+def plot(
+    svg: Element, x: tuple[float, float], y: tuple[float, float], names: Sequence[str]
+) -> list[Axis]:
+    """Draw the two axes called `names` with their grid; returns them."""
+    low, middle = HEIGHT - BOTTOM, (HEIGHT - BOTTOM + TOP) / 2
+    across, up = Axis(*x, LEFT, WIDTH - RIGHT), Axis(*y, low, TOP)
+    for value in ticks(*x):
+        at = across(value)
+        put(svg, "line", class_="grid", x1=at, x2=at, y1=TOP, y2=low)
+        label(svg, f"{value:g}", "tick", at, low + 14, "middle")
+    for value in ticks(*y):
+        at = up(value)
+        put(svg, "line", class_="grid", x1=LEFT, x2=WIDTH - RIGHT, y1=at, y2=at)
+        label(svg, f"{value:g}", "tick", LEFT - 6, at + 4, "end")
+    label(svg, names[0], "name", (LEFT + WIDTH - RIGHT) / 2, HEIGHT - 6, "middle")
+    turned = label(svg, names[1], "name", 12.0, middle, "middle")
+    turned.set("transform", f"rotate(-90 12 {middle:g})")
+    return [across, up]
+
+
+def label(svg: Element, text: str, kind: str, x: float, y: float, anchor: str = "start") -> Element:
+    """Write a text whose start, middle or end lies at a place."""
+    return put(svg, "text", text, class_=kind, x=x, y=y, text_anchor=anchor)
+
+
+def loss_curve(title: str, losses: Sequence[float]) -> Markup | None:
+    """The loss of each iteration; None where there are less than two."""
+    known = [(float(k), loss) for k, loss in enumerate(losses, start=1) if math.isfinite(loss)]
+    if len(known) < 2:
+        return None
+    first, last = known[0][1], known[-1][1]
+    told = f"A curve over {len(losses)} iterations, from {first:.3g} to {last:.3g}."
+    svg = figure(title, told, WIDTH, HEIGHT, "plot")
+    x, y = plot(
+        svg, (0.0, float(len(losses))), span([loss for _, loss in known]), ("iteration", "loss")
+    )
+    points = " ".join(f"{x(k):.1f},{y(loss):.1f}" for k, loss in known)
+    put(svg, "polyline", class_="curve", points=points)
+    return markup(svg)
+
+
+def affine_scatter(
+    pairs: Sequence[tuple[float, float, bool]], scale: float, shift: float, unit: str
+) -> Markup | None:
+    """Lifted against scene depths with the affine through them; None where there are none.
+
+    Args:
+        pairs: Lifted depth, depth of the scene, and whether the affine brings one to the other.
+        scale: Of the affine.
+        shift: Of the affine.
+        unit: What depths are in.
+    """
+    known = [pair for pair in pairs if math.isfinite(pair[0] + pair[1])]
+    if not known or not math.isfinite(scale + shift):
+        return None
+    share = sum(agrees for *_, agrees in known) / len(known)
+    line = f"{scale:.3f} times depth plus {shift:.3g}"
+    told = f"{len(known)} pixels; {share:.0%} lie on the line {line}."
+    svg = figure("Depths before and after the affine", told, WIDTH, HEIGHT, "plot")
+    ranges = span([p for p, _, _ in known]), span([c for _, c, _ in known])
+    x, y = plot(svg, *ranges, (f"lifted depth ({unit})", f"scene depth ({unit})"))
+    for agrees, kind in ((False, "outlier"), (True, "inlier")):
+        dots = [f"M{x(p):.1f} {y(c):.1f}h0" for p, c, fits in known if fits == agrees]
+        put(svg, "path", class_=kind, d="".join(dots))
+    ends = line_within(scale, shift, *ranges)
+    if ends is not None:
+        (x1, y1), (x2, y2) = ends
+        put(svg, "line", class_="fit", x1=x(x1), y1=y(y1), x2=x(x2), y2=y(y2))
+    return markup(svg)
+
+
+def line_within(
+    scale: float, shift: float, x: tuple[float, float], y: tuple[float, float]
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """The ends of the part of a rising line that lies in a rectangle; None where there is none."""
+    if scale <= 0:
+        return None
+    low, high = max(x[0], (y[0] - shift) / scale), min(x[1], (y[1] - shift) / scale)
+    return ((low, scale * low + shift), (high, scale * high + shift)) if low < high else None
+
+
+def time_bars(title: str, seconds: Mapping[str, float]) -> Markup | None:
+    """A bar for each stage, with its seconds; None where nothing took any."""
+    known = {name: s for name, s in seconds.items() if math.isfinite(s) and s >= 0}
+    longest = max(known.values(), default=0.0)
+    if longest <= 0:
+        return None
+    told = ", ".join(f"{name} {s:.2f} s" for name, s in known.items())
+    height = len(known) * (BAR + GAP)
+    svg = figure(title, f"{told}.", NAMES + LONGEST + 60, height, "bars")
+    for row, (name, s) in enumerate(known.items()):
+        top, width = row * (BAR + GAP), s / longest * LONGEST
+        label(svg, name, "name", NAMES - 8, top + 13, "end")
+        put(svg, "rect", class_="bar", x=NAMES, y=top, width=width, height=BAR, rx=2.0)
+        label(svg, f"{s:.2f} s", "tick", NAMES + width + 8, top + 13)
+    return markup(svg)
+
+
+def colour_scale(limits: tuple[float, float], unit: str) -> Markup | None:
+    """The colours of pictures of depth, with the depths that they stand for."""
+    near, far = limits
+    if not 0 < near < far < math.inf:
+        return None
+    told = f"From {near:.3g} to {far:.3g} {unit}, by the logarithm; grey where there is no depth."
+    svg = figure("Colours of depth", told, WIDTH, 44.0, "scale")
+    wide = WIDTH - 88
+    for k, colour in enumerate(colours()[np.linspace(1, 255, COLOURS).astype(int)].tolist()):
+        patch(svg, k * wide / COLOURS, wide / COLOURS + 0.5, colour)
+    for share, anchor in ((0.0, "start"), (0.5, "middle"), (1.0, "end")):
+        depth = near * (far / near) ** share
+        text = f"{depth:.3g} {unit}" if share == 1 else f"{depth:.3g}"
+        label(svg, text, "tick", share * wide, 30.0, anchor)
+    patch(svg, wide + 16, 14.0, NONE)
+    label(svg, "no depth", "tick", wide + 34, 12.0)
+    return markup(svg)
+
+
+def patch(svg: Element, x: float, width: float, colour: Sequence[int]) -> None:
+    """Draw a patch of a scale of colours."""
+    fill = "#{:02x}{:02x}{:02x}".format(*colour)
+    put(svg, "rect", x=x, y=0.0, width=width, height=14.0, fill=fill, shape_rendering="crispEdges")

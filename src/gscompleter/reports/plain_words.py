@@ -1,0 +1,100 @@
+"""What was done otherwise than usual, in plain words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from gscompleter.reports.finished import Summary, TargetRow
+
+PLACED = {
+    "given": None,
+    "cameras": "The splat lies in the frame of its cameras.json, not in that of the photographs.",
+    "dataparser": "The splat lies in the frame that its trainer's dataparser made.",
+    "normalised": "The splat lies in a frame that its trainer normalised.",
+    "similarity": "The splat lay in a frame of its own; it was found by matching features.",
+}
+"""By how the frame of a splat was found, what is said of it."""
+
+
+def about_target(row: TargetRow) -> list[str]:
+    """Fallbacks at a target: the notes of the completion, and what no note says."""
+    said = " ".join(row.notes)
+    found = list(row.notes)
+    if row.anchor_fallback and "least-turned" not in said:
+        found.append("Every photograph is turned too far; the least-turned one is the anchor.")
+    if row.affine.method == "median" and "median" not in said:
+        found.append("RANSAC found no trustworthy fit; the median depth ratio took its place.")
+    if row.added == 0 and "nothing" not in said.lower():
+        found.append("Nothing was added here.")
+    return found
+
+
+def about_scene(summary: Summary) -> list[str]:
+    """What concerns the whole completion."""
+    return [*opened(summary), *compared(summary), *came_of_it(summary)]
+
+
+def opened(summary: Summary) -> Iterator[str]:
+    """Of the photographs and the frame that they share with the result."""
+    placed = PLACED.get(summary.frame.method, "The splat lies in a frame of its own.")
+    if placed is not None:
+        yield f"{placed} summary.json has the transform from the photographs to the result."
+    if any(summary.frame.origin):
+        yield (
+            "The coordinates are large against the distances between the cameras, so the result is "
+            "relative to a local origin; summary.json has it."
+        )
+    if summary.settings.get("context") is None:
+        yield (
+            f"Nobody named the photographs to work with: {summary.scene.used} of "
+            f"{summary.scene.photographs} were chosen."
+        )
+
+
+def compared(summary: Summary) -> Iterator[str]:
+    """Of what the scores mean."""
+    gains = [gain for row in summary.context for gain in row.gain or ()]
+    if gains and min(gains) > 0:
+        yield (
+            "The photographs of the context differ in exposure, by a factor of up to "
+            f"{max(gains) / min(gains):.2f}; the scene has their mean, in which they are compared. "
+            "Those of targets are compared as they were taken."
+        )
+    if summary.settings.get("uses_target_photographs"):
+        yield (
+            "The generator was shown the photographs of the targets, so the scores measure where "
+            "things were put and not what was synthesized."
+        )
+    if summary.targets and all(row.psnr_after is None for row in summary.targets):
+        yield "No photograph of a target exists, so nothing is scored there."
+
+
+def came_of_it(summary: Summary) -> Iterator[str]:
+    """Of the scene that came of it."""
+    removed = summary.gaussians.get("removed")
+    if removed is not None:
+        yield (
+            "The scene was brought, and counts as a hole where no photograph supports it. "
+            f"{removed:,} of its Gaussians stood in the way and were set aside."
+        )
+    if not summary.targets:
+        yield "No camera was found that has much to gain; nothing was completed."
+
+
+def shown(value: float | None, digits: int = 2) -> str:
+    """A number; a dash where there is none, or none that can be written."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def percent(share: float | None, digits: int = 1) -> str:
+    """A share of one, as a percentage."""
+    return "–" if share is None or not math.isfinite(share) else f"{100 * share:.{digits}f} %"
+
+
+def gain(before: float | None, after: float | None, digits: int = 2) -> str:
+    """By how much a score rose, with its sign."""
+    if before is None or after is None or not math.isfinite(after - before):
+        return "–"
+    rise = round(after - before, digits)
+    return f"{rise:+.{digits}f}".replace("-", "−") if rise else f"{0:.{digits}f}"

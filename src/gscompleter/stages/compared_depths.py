@@ -1,0 +1,29 @@
+"""What the coarse stage fitted its affine to: a sample of both depths, to be looked at."""
+
+from __future__ import annotations
+
+from gscompleter.config import AffineConfig
+from gscompleter.stages.alignment import affine_inliers, compared
+from gscompleter.types import DepthAffine, DepthPairs, Lift, Render
+
+MAX_PAIRS = 1000
+"""Pixels that are kept at most."""
+
+
+def compared_depths(
+    lift: Lift, at_target: Render, at_anchor: Render, affine: DepthAffine, config: AffineConfig
+) -> DepthPairs | None:
+    """Every n-th of the pixels that `affine` was fitted to; None where there are none."""
+    if config.bridge == "none":
+        return None
+    at_the_target = config.bridge == "target" or affine.contradicted
+    predicted, drawn = lift.anchor_depth, at_anchor
+    if at_the_target:
+        predicted, drawn = lift.reference_depth, at_target
+    x, y = compared(predicted, drawn.depth_map())
+    step = max(1, -(-len(x) // MAX_PAIRS))
+    x, y = x[::step], y[::step]
+    if len(x) == 0:
+        return None
+    agrees = affine_inliers(x, y, affine.scale, affine.shift)
+    return DepthPairs("target" if at_the_target else "anchor", x, y, agrees)

@@ -1,0 +1,428 @@
+"""The page on a completion and on an evaluation: what it shows, and that it needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from command import run
+from gscompleter.errors import InputError
+from gscompleter.io.image import read_pixels, write_image
+from gscompleter.metrics.coverage import Look
+from gscompleter.reports.camera_figure import projected
+from gscompleter.reports.completion_page import completion_page
+from gscompleter.reports.depth_picture import NONE, colours, limits_of, write_depth
+from gscompleter.reports.evaluation_page import evaluation_page
+from gscompleter.reports.figures import affine_scatter, colour_scale, loss_curve, ticks, time_bars
+from gscompleter.reports.finished import Affine, TargetRow
+from gscompleter.reports.page import data_uri, gallery_of
+from gscompleter.reports.plain_words import about_target, gain, percent, shown
+from gscompleter.reports.record import MAX_LOOKS, most_changed
+from gscompleter.types import DepthMap, Render
+
+VOID = {"meta", "img", "input", "link", "br", "hr"}
+HOSTILE = '</script><script>alert(1)</script><img src=x onerror="alert(2)">&\''
+
+
+class Page(HTMLParser):
+    """A page as its tags, each of which has to be closed where it was opened."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if not self.open or self.open[-1] not in ("style", "script"):
+            self.words.append(data)
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+    def said(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture
+def out(completed_room, tmp_path) -> Path:
+    """A completion that may be changed."""
+    return Path(shutil.copytree(completed_room, tmp_path / "out"))
+
+
+def changed(path: Path, change) -> None:
+    """Rewrite a JSON file as `change` leaves its content."""
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_the_page_is_well_formed_and_every_target_has_its_slider(completed_room):
+    page = Page((completed_room / "report.html").read_text())
+    sliders = [i for i in page.all("input") if i["min"] == "0" and i["max"] == "100"]
+    around = len(list((completed_room / "images").glob("around*_after.png")))
+    assert len(sliders) == 1 + 1 + around  # images and depths of the target, coverage cameras
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert "target1" in ids
+    assert len(ids) == len(set(ids))
+
+
+def test_the_page_asks_for_nothing_and_runs_only_its_own_script(completed_room):
+    text = (completed_room / "report.html").read_text()
+    page = Page(text)
+    assert re.search(r"https?:|(src|href|action|data)=[\"']?//|url\(|@import", text) is None
+    assert all(image["src"].startswith("data:image/") for image in page.all("img"))
+    assert len(page.all("script")) == 1
+    assert page.all("link") == page.all("iframe") == page.all("object") == []
+    assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
+    (policy,) = [m["content"] for m in page.all("meta") if "http-equiv" in m]
+    assert policy.startswith("default-src 'none'; img-src data:")
+
+
+def test_everything_has_a_name_for_those_who_do_not_see_it(completed_room):
+    text = (completed_room / "report.html").read_text()
+    page = Page(text)
+    assert all(image["alt"] for image in page.all("img"))
+    assert len(page.all("svg")) == len(re.findall(r"<svg [^>]*><title>[^<]+</title><desc>", text))
+    assert len(page.all("label")) == len(page.all("input"))
+    assert len(page.all("caption")) == len(page.all("table")) > 1
+    assert all(head["scope"] in ("col", "row") for head in page.all("th"))
+
+
+def test_what_summary_json_has_is_on_the_page(completed_room):
+    said = Page((completed_room / "report.html").read_text()).said()
+    summary = json.loads((completed_room / "summary.json").read_text())
+    (row,) = summary["targets"]
+    expected = (
+        f"{row['psnr_before']:.2f} → {row['psnr_after']:.2f} dB",
+        f"{100 * row['hole_fraction']:.1f} %",
+        f"{row['added']:,}",
+        f"{100 * summary['coverage']['after']:.1f} %",
+        f"scene depth = {row['affine']['scale']:.3f} × lifted depth",
+        "registration.iterations",
+    )
+    assert [text for text in expected if text not in said] == []
+
+
+def test_the_same_folder_gives_the_same_bytes(completed_room, out, monkeypatch, capsys):
+    written = (completed_room / "report.html").read_bytes()
+    assert completion_page(completed_room).encode() == written
+    (out / "report.html").unlink()
+    assert run(monkeypatch, "report", out) == 0
+    assert (out / "report.html").read_bytes() == written
+    assert capsys.readouterr().out == f"{out / 'report.html'}\n"
+
+
+def test_page_and_record_are_small(completed_room):
+    assert 30_000 < (completed_room / "report.html").stat().st_size < 1_000_000
+    assert (completed_room / "report.json").stat().st_size < 200_000
+
+
+def test_hostile_words_are_words(out):
+    def poison(summary):
+        summary["settings"]["folder"] = f"/data/{HOSTILE.replace('/', '|')}"
+        summary["settings"][HOSTILE] = HOSTILE
+        summary["targets"][0]["notes"] = [HOSTILE]
+        summary["targets"][0]["affine"]["method"] = HOSTILE
+        summary["scene"]["format"] = summary["device"] = HOSTILE
+        summary["seconds"][HOSTILE] = 1.0
+
+    changed(out / "summary.json", poison)
+    changed(
+        out / "report.json", lambda kept: kept["targets"][0]["losses"].update({HOSTILE: [1, 2]})
+    )
+    text = completion_page(out)
+    page = Page(text)
+    assert len(page.all("script")) == 1
+    assert not any("onerror" in image for image in page.all("img"))
+    assert HOSTILE not in text
+    assert page.said().count("<script>alert(1)</script>") >= 4
+
+
+@pytest.mark.parametrize("nothing", [None, float("nan"), float("inf")])
+def test_numbers_that_are_none_are_dashes(out, nothing):
+    def forget(summary):
+        row = summary["targets"][0]
+        row.update({key: nothing for key in row if key.startswith(("psnr", "ssim"))})
+        row["affine"]["agreement"] = None
+        summary["context"][0]["psnr_after"] = nothing
+        summary["seconds"]["lift"] = float("nan")
+
+    changed(out / "summary.json", forget)
+    changed(
+        out / "report.json",
+        lambda kept: kept["targets"][0]["losses"].update(register=[float("nan"), 1.0, 0.5]),
+    )
+    said = Page(completion_page(out)).said()
+    assert "1: photograph 2 – – – – – –" in said
+    assert re.search(r"\b(nan|inf|None|null)\b", said.replace("–", "")) is None
+
+
+def test_numbers_in_words():
+    assert [shown(v) for v in (1.234, None, float("nan"), float("inf"))] == ["1.23", "–", "–", "–"]
+    assert [percent(v) for v in (0.125, None)] == ["12.5 %", "–"]
+    assert [gain(2.0, 3.0), gain(3.0, 2.0), gain(1.0, 0.9999), gain(None, 2.0)] == [
+        "+1.00",
+        "−1.00",
+        "0.00",
+        "–",
+    ]
+
+
+def test_a_missing_or_damaged_image_is_told_in_its_place(out):
+    (out / "images" / "target1_after.png").unlink()
+    (out / "images" / "target1_hole_mask.png").write_bytes(b"no image")
+    said = Page(completion_page(out)).said()
+    assert "target1_after.png is missing or damaged." in said
+    assert "target1_hole_mask.png is missing or damaged." in said
+
+
+def test_a_completion_without_targets_says_so(out):
+    changed(out / "summary.json", lambda summary: summary.update(targets=[]))
+    changed(out / "report.json", lambda kept: kept.update(targets=[], around=[], photographs=[]))
+    assert "nothing was completed" in Page(completion_page(out)).said()
+
+
+def test_the_viewer_is_linked_where_there_is_one(out):
+    assert "gscompleter view OUT" in Page(completion_page(out)).said()
+    (out / "view.html").write_text("")
+    links = [link["href"] for link in Page(completion_page(out)).all("a")]
+    assert links == ["view.html#camera=target-1", "view.html"]
+
+
+def broken_json(out: Path) -> None:
+    (out / "summary.json").write_text("{")
+
+
+def other_version(out: Path) -> None:
+    changed(out / "summary.json", lambda summary: summary.update(version="0.0.1"))
+
+
+def a_list(out: Path) -> None:
+    (out / "summary.json").write_text("[]")
+
+
+def wrong_type(out: Path) -> None:
+    changed(out / "summary.json", lambda s: s["targets"][0].update(hole_fraction="much"))
+
+
+def no_summary(out: Path) -> None:
+    (out / "summary.json").unlink()
+
+
+def no_record(out: Path) -> None:
+    (out / "report.json").unlink()
+
+
+def other_record(out: Path) -> None:
+    changed(out / "report.json", lambda kept: kept["targets"].append(kept["targets"][0]))
+
+
+def no_folder(out: Path) -> None:
+    shutil.rmtree(out)
+
+
+def a_file(out: Path) -> None:
+    shutil.rmtree(out)
+    out.write_text("")
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (broken_json, "is not JSON"),
+        (other_version, "was written by version 0.0.1"),
+        (a_list, "does not hold what a report needs"),
+        (wrong_type, "does not hold what a report needs (targets.0.hole_fraction"),
+        (no_summary, "has no summary.json"),
+        (no_record, "has no report.json"),
+        (other_record, "differ in cameras"),
+        (no_folder, "There is no folder"),
+        (a_file, "There is no folder"),
+    ],
+)
+def test_what_is_no_result_is_refused_in_a_sentence(out, monkeypatch, capsys, damage, sentence):
+    before = None if not (out / "report.html").exists() else (out / "report.html").read_bytes()
+    damage(out)
+    assert run(monkeypatch, "report", out) == 2
+    said = capsys.readouterr().err
+    assert sentence in said
+    assert said.startswith("gscompleter: ")
+    assert said.count("\n") == 1
+    if (out / "report.html").exists():
+        assert (out / "report.html").read_bytes() == before
+
+
+def row(**values) -> TargetRow:
+    affine = Affine(1.0, 0.0, 0.9, values.pop("method", "ransac"), None)
+    named = {"notes": (), "added": 5, "anchor_fallback": False} | values
+    scores = dict.fromkeys(("psnr_before", "psnr_after", "ssim_before", "ssim_after"))
+    return TargetRow(frame=None, anchor=0, hole_fraction=0.1, affine=affine, **scores, **named)
+
+
+def test_every_fallback_is_said_once():
+    assert about_target(row()) == []
+    assert about_target(row(notes=("It rained.",))) == ["It rained."]
+    assert len(about_target(row(anchor_fallback=True))) == 1
+    said = "Every view is turned too far; the least-turned one is the anchor."
+    assert about_target(row(anchor_fallback=True, notes=(said,))) == [said]
+    assert "median" in about_target(row(method="median"))[0]
+    assert about_target(row(added=0)) == ["Nothing was added here."]
+    assert len(about_target(row(added=0, notes=("Nothing of it was added.",)))) == 1
+
+
+def test_depths_become_colours_from_near_to_far_and_grey_where_there_are_none(tmp_path):
+    depth = torch.tensor([[1.0, 2.0, 4.0], [8.0, 3.0, float("nan")]])
+    valid = torch.tensor([[True, True, True], [True, False, True]])
+    known = DepthMap(depth, valid)
+    write_depth(tmp_path / "depth.png", known, (1.0, 4.0))
+    pixels = read_pixels(tmp_path / "depth.png")
+    palette = colours()
+    assert pixels[0, 0].tolist() == palette[1].tolist()
+    assert pixels[0, 1].tolist() == palette[128].tolist()  # half way by the logarithm
+    assert pixels[0, 2].tolist() == pixels[1, 0].tolist() == palette[255].tolist()
+    assert pixels[1, 1].tolist() == pixels[1, 2].tolist() == list(NONE)
+    brightness = palette[1:].astype(float) @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(brightness) > -1).all()
+    near, far = limits_of([known])
+    assert 1.0 <= near < 1.2
+    assert 7.5 < far <= 8.0
+    assert limits_of([DepthMap(depth, torch.zeros_like(valid))]) is None
+
+
+def test_masks_and_depths_stay_exact_in_a_page_and_pages_stay_small(tmp_path):
+    write_image(tmp_path / "mask.png", torch.eye(8) > 0)
+    mask = Image.open(tmp_path / "mask.png").convert("RGB")
+    assert data_uri(mask, exact=True).startswith("data:image/png;base64,")
+    assert gallery_of(tmp_path).scale == 1
+    Image.new("L", (6000, 4000)).save(tmp_path / "large.png")
+    large = gallery_of(tmp_path).photo("large.png", "")
+    assert 11e6 < large.width * large.height < 12.1e6
+
+
+def look(change: float) -> Look:
+    before = Render(torch.zeros(4, 4, 3), torch.ones(4, 4), torch.ones(4, 4))
+    return Look(before, Render(before.image + change, before.depth, before.alpha))
+
+
+def test_the_cameras_that_changed_most_are_kept():
+    looks = [look(change) for change in (0.1, 0.0, 0.3, 0.2, 0.15, 0.05, 0.06, 0.07)]
+    kept = most_changed(looks)
+    assert len(kept) == MAX_LOOKS
+    assert [k.after.image.mean().item() for k in kept] == sorted(
+        (k.after.image.mean().item() for k in kept), reverse=True
+    )
+    assert kept[0] is looks[2]
+    assert most_changed(looks[1:2]) == []
+
+
+def test_the_record_keeps_what_the_affine_was_fitted_to(completed_room):
+    kept = json.loads((completed_room / "report.json").read_text())
+    (affine,) = [
+        t["affine"] for t in json.loads((completed_room / "summary.json").read_text())["targets"]
+    ]
+    pairs = kept["targets"][0]["pairs"]
+    x, y = np.array(pairs["predicted"]), np.array(pairs["context"])
+    agrees = np.array(pairs["agrees"])
+    assert 100 < len(x) == len(y) == len(agrees) <= 1000
+    residual = np.abs(affine["scale"] * x + affine["shift"] - y)
+    assert (residual[agrees] < 0.0501 * y[agrees]).all()
+    assert (residual[~agrees] > 0.0499 * y[~agrees]).all()
+    assert agrees.mean() == pytest.approx(affine["inliers"], abs=0.05)
+    assert len(kept["targets"][0]["losses"]["register"]) == 20
+    assert len(kept["photographs"]) == kept["num_photographs"] == 3
+
+
+def test_figures_of_nothing_are_none():
+    assert loss_curve("loss", []) is loss_curve("loss", [1.0]) is None
+    assert loss_curve("loss", [float("nan"), 1.0]) is None
+    assert affine_scatter([], 1.0, 0.0, "m") is None
+    assert affine_scatter([(1.0, 1.0, True)], float("nan"), 0.0, "m") is None
+    assert time_bars("seconds", {"lift": 0.0, "total": float("nan")}) is None
+    assert colour_scale((1.0, float("inf")), "m") is None
+    assert "polyline" in loss_curve("loss", [1.0, 1.0])
+
+
+def test_ticks_are_round_and_within():
+    assert ticks(0.0, 10.0) == [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]
+    assert ticks(0.013, 0.027) == pytest.approx([0.015, 0.02, 0.025])
+    for low, high in ((-3.2, 7.9), (1e-9, 3e-9), (4e6, 4.1e6)):
+        found = ticks(low, high)
+        assert 2 <= len(found) <= 7
+        room = 1e-6 * (high - low)
+        assert low - room <= min(found) < max(found) <= high + room
+
+
+def test_what_is_up_is_drawn_above_and_what_is_near_below():
+    middle, up, toward = projected(
+        np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1]]), yaw=0.0, pitch=30.0
+    )
+    assert up[1] < middle[1] < toward[1]
+    assert up[0] == middle[0] == pytest.approx(toward[0])
+
+
+TABLES = {
+    "cases": 2,
+    "common": ["a"],
+    "methods": {
+        "full": {"finished": 1, "psnr": {"value": 24.5, "cases": 1}},
+        "reggs": {"finished": 1, "psnr": {"value": None, "cases": 0}},
+    },
+    "gain_by_distance": {"1": {"full": 2.0, "reggs": None}, "2": {"full": 1.0, "reggs": 0.5}},
+    "fid": {"values": {}, "reason": "not asked for"},
+    "failures": [{"case": "b", "method": "reggs", "reason": HOSTILE}],
+}
+TIMINGS = {
+    "full": {"seconds": {"lift": 1.0, "total": 2.0}, "peak_bytes": 2**30},
+    "reggs": {"seconds": {"total": 4.0}, "peak_bytes": None},
+    "steps": {},
+}
+
+
+@pytest.fixture
+def evaluated(tmp_path) -> Path:
+    (tmp_path / "tables.json").write_text(json.dumps(TABLES))
+    (tmp_path / "timings.json").write_text(json.dumps(TIMINGS))
+    Image.new("RGB", (40, 30), "white").save(tmp_path / "seconds.png")
+    return tmp_path
+
+
+def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypatch):
+    assert run(monkeypatch, "report", evaluated, "--quiet") == 0
+    text = (evaluated / "report.html").read_text()
+    assert text == evaluation_page(evaluated)
+    page, said = Page(text), Page(text).said()
+    assert "full 24.50 reggs –" in said
+    assert "full 2.00 1.00 reggs – 0.50" in said
+    assert "full 1.00 2.00 1.00 reggs – 4.00 –" in said
+    assert len(page.all("img")) == len(page.all("script")) == 1
+    assert "<script>alert(1)</script>" in said
+
+
+@pytest.mark.parametrize("name", ["tables.json", "timings.json"])
+def test_damaged_tables_are_refused(evaluated, name):
+    (evaluated / name).write_text('{"methods": 5}')
+    with pytest.raises(InputError, match="does not hold what a report needs"):
+        evaluation_page(evaluated)
