@@ -34,6 +34,7 @@ from gscompleter.commands.options import (
 from gscompleter.commands.poses import PosesOptions
 from gscompleter.commands.report import ReportOptions
 from gscompleter.commands.strip import StripOptions
+from gscompleter.commands.view import ViewOptions
 from gscompleter.commands.warmup import WarmupOptions
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import checked
@@ -56,6 +57,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "poses": (PosesOptions, "gscompleter.commands.poses", "run_poses"),
     "report": (ReportOptions, "gscompleter.commands.report", "run_report"),
     "strip": (StripOptions, "gscompleter.commands.strip", "run_strip"),
+    "view": (ViewOptions, "gscompleter.commands.view", "run_view"),
     "warmup": (WarmupOptions, "gscompleter.commands.warmup", "run_warmup"),
 }
 

@@ -209,10 +209,25 @@ def _smallest_three(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
 
 
 def write_spz(path: Path, gaussians: Gaussians) -> None:
-    """Write a .spz of version 3, positions as fine as their range leaves room for.
+    """Write a .spz of version 3.
 
     Raises:
         InputError: where Gaussians lie too far out for it, or the file cannot be written.
+    """
+    content = packed_spz(path, gaussians)
+    with replacing(path) as file:
+        file.write(content)
+
+
+def packed_spz(path: Path, gaussians: Gaussians) -> bytes:
+    """The bytes of a .spz of version 3, positions as fine as their range leaves room for.
+
+    Args:
+        path: What the file is called, for error messages.
+        gaussians: In the axes of a .ply; at least one.
+
+    Raises:
+        InputError: where Gaussians lie too far out for it.
     """
     turned = half_turned(gaussians, ABOUT_X)
     bits = _fractional_bits(path, turned)
@@ -231,8 +246,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
             _bytes(rest * 128 + 128),
         )
     )
-    with replacing(path) as file:
-        file.write(gzip.compress(body, compresslevel=6, mtime=0))
+    return gzip.compress(body, compresslevel=6, mtime=0)
 
 
 def _fractional_bits(path: Path, gaussians: Gaussians) -> int:

@@ -9,6 +9,7 @@ import os
 from importlib.util import find_spec
 from pathlib import Path
 
+from gscompleter.cache import cache_folder
 from gscompleter.errors import InputError
 from gscompleter.weights.published import PublishedWeights
 
@@ -49,13 +50,8 @@ def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = 
 
 
 def place_of(weights: PublishedWeights) -> Path:
-    """Where a file that was fetched by hand is looked for: `weights/MODEL/FILE` in our cache.
-
-    Our cache is the folder $GSCOMPLETER_HOME, or else ~/.cache/gscompleter.
-    """
-    home = os.environ.get("GSCOMPLETER_HOME")
-    root = Path(home).expanduser() if home else Path.home() / ".cache" / "gscompleter"
-    return root / "weights" / weights.model.lower() / weights.file
+    """Where a file that was fetched by hand is looked for: `weights/MODEL/FILE` in our cache."""
+    return cache_folder() / "weights" / weights.model.lower() / weights.file
 
 
 def cached(weights: PublishedWeights) -> Path | None:

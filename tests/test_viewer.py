@@ -1,0 +1,500 @@
+"""The page of the viewer without a browser: what it holds, what it may hold, who may read it."""
+
+import base64
+import hashlib
+import http.client
+import io
+import json
+import re
+import tarfile
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+import torch
+
+from command import run
+from gscompleter.data.scene import write_cameras
+from gscompleter.errors import InputError
+from gscompleter.io.image import write_image
+from gscompleter.io.ply import save_ply
+from gscompleter.splats.formats import load_splat
+from gscompleter.types import Gaussians, merge
+from gscompleter.viewer import page as pages
+from gscompleter.viewer.exhibit import (
+    Exhibit,
+    Shot,
+    exhibit_of_completion,
+    exhibit_of_files,
+)
+from gscompleter.viewer.packages import (
+    MODULES,
+    REGISTRY,
+    Libraries,
+    Package,
+    archive_of,
+    libraries_from,
+    load_libraries,
+    place_of,
+    read_lock,
+    write_libraries,
+)
+from gscompleter.viewer.page import Page, make_page
+from gscompleter.viewer.server import serving
+from scenes import camera_at
+from viewer_pages import LEFT, SIDE, TARGET, room_exhibit, room_from
+
+NONE = Libraries({}, {})
+"""A page without libraries draws nothing, which nobody sees without a browser."""
+
+
+def content_of(page: Page) -> dict:
+    """What the page holds for its program."""
+    found = re.findall(
+        r'<script type="application/json" id="content">(.*?)</script>', page.html.decode(), re.S
+    )
+    return json.loads(found[0])
+
+
+def gaussians_in(page: Page, layer: str, folder: Path) -> Gaussians:
+    """A layer of a page, read back."""
+    calls = re.findall(rb'gscPart\("(\w+)", "([^"]*)"\)', page.html + b"".join(page.parts.values()))
+    source = content_of(page)["layers"][layer].encode()
+    path = folder / f"{layer}.spz"
+    path.write_bytes(b"".join(base64.b64decode(text) for name, text in calls if name == source))
+    return load_splat(path)
+
+
+# ---------------------------------------------------------------------------------- packages
+
+
+@pytest.fixture
+def registry(tmp_path, monkeypatch) -> Path:
+    """The lock of a registry that is a folder, with a cache that is empty."""
+    monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv(REGISTRY, (tmp_path / "registry").as_uri())
+    files: dict[str, dict[str, str]] = {}
+    for package, file in MODULES.values():
+        files.setdefault(package, {"LICENSE": f"of {package}"})[file] = f"// {package} {file}"
+    files["three"]["build/three.module.min.js"] += ' import "./three.core.min.js";'
+    entries = {"": {}}
+    for name, contents in files.items():
+        archive = archive_in(tmp_path, Package(name, "1.2.3", ""))
+        archive.parent.mkdir(parents=True)
+        with tarfile.open(archive, "w:gz") as packed:
+            for file, text in contents.items():
+                entry = tarfile.TarInfo(f"package/{file}")
+                entry.size = len(text)
+                packed.addfile(entry, io.BytesIO(text.encode()))
+        digest = base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode()
+        entries[f"node_modules/{name}"] = {"version": "1.2.3", "integrity": f"sha512-{digest}"}
+    lock = tmp_path / "package-lock.json"
+    lock.write_text(json.dumps({"lockfileVersion": 3, "packages": entries}))
+    return lock
+
+
+def archive_in(folder: Path, package: Package) -> Path:
+    """Where the registry of a test has an archive."""
+    return folder / "registry" / package.path
+
+
+def three_of(lock: Path) -> Package:
+    return next(package for package in read_lock(lock) if package.name == "three")
+
+
+def test_the_lock_pins_every_package_by_its_hash():
+    packages = read_lock(Path(pages.__file__).with_name("package-lock.json"))
+    assert {package.name for package in packages} == {"three", "@sparkjsdev/spark", "fflate"}
+    for package in packages:
+        assert package.path.endswith(f"-{package.version}.tgz")
+        assert len(base64.b64decode(package.integrity.removeprefix("sha512-"))) == 64
+
+
+def test_modules_and_licences_come_out_of_the_archives(registry):
+    libraries = libraries_from(registry)
+    assert libraries.modules.keys() == MODULES.keys()
+    assert libraries.licences["three 1.2.3"] == "of three"
+    assert 'import "three-core"' in libraries.modules["three"]
+
+
+def test_an_archive_is_fetched_once(registry):
+    three = three_of(registry)
+    archive = archive_of(three)
+    archive_in(registry.parent, three).unlink()
+    assert place_of(three).read_bytes() == archive
+    assert archive_of(three) == archive
+
+
+def test_an_archive_that_was_tampered_with_is_refused_and_not_kept(registry):
+    three = three_of(registry)
+    source = archive_in(registry.parent, three)
+    source.write_bytes(source.read_bytes() + b"\0")
+    with pytest.raises(InputError, match="three 1.2.3 as it was pinned"):
+        archive_of(three)
+    assert not place_of(three).exists()
+
+
+def test_a_damaged_archive_in_the_cache_is_fetched_again(registry):
+    three = three_of(registry)
+    archive = archive_of(three)
+    place_of(three).write_bytes(archive[:-9])
+    assert archive_of(three) == archive
+    assert place_of(three).read_bytes() == archive
+
+
+def test_without_a_connection_a_sentence_says_where_to_put_what(registry):
+    three = three_of(registry)
+    archive_in(registry.parent, three).unlink()
+    with pytest.raises(InputError, match="cannot be reached") as refused:
+        archive_of(three)
+    assert three.path in str(refused.value)
+    assert str(place_of(three)) in str(refused.value)
+
+
+def test_npm_says_where_packages_come_from_and_without_it_a_sentence_says_what_to_do(
+    registry, tmp_path, monkeypatch
+):
+    monkeypatch.delenv(REGISTRY)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match="from its wheel"):
+        archive_of(three_of(registry))
+    npm = tmp_path / "npm"
+    npm.write_text(f"#!/bin/sh\necho {(tmp_path / 'registry').as_uri()}/\n")
+    npm.chmod(0o755)
+    assert archive_of(three_of(registry)) == archive_in(tmp_path, three_of(registry)).read_bytes()
+
+
+def test_a_wheel_needs_no_connection_and_its_libraries_are_the_same_bytes(registry, tmp_path):
+    written = [tmp_path / f"{n}.json" for n in range(2)]
+    for path in written:
+        write_libraries(path, registry)
+    assert written[0].read_bytes() == written[1].read_bytes()
+    built = load_libraries(lock=tmp_path / "nowhere", built=written[0])
+    assert built == libraries_from(registry)
+
+
+# ---------------------------------------------------------------------------------- the page
+
+
+def test_the_same_values_give_the_same_bytes():
+    assert make_page(room_exhibit(), NONE) == make_page(room_exhibit(), NONE)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_a_page_holds_the_gaussians_whatever_their_unit(tmp_path, unit):
+    camera = camera_at(size=32, unit=unit)
+    observed, generated = room_from(camera, 0, unit), room_from(camera, 1, unit)
+    page = make_page(Exhibit("room", merge([observed, generated]), None), NONE)
+    frame = content_of(page)["frame"]
+    held = gaussians_in(page, "generated", tmp_path)
+    means = held.means.double() * frame["unit"] + torch.tensor(frame["centre"])
+    scale = generated.means.abs().max()
+    assert (means - generated.means).abs().max() < 1e-4 * scale
+    ratio = held.scales * frame["unit"] / generated.scales
+    assert ratio.log().abs().max() < 1 / 16  # the steps of a .spz are 1/16
+
+
+def test_what_did_not_change_is_held_once():
+    layers = content_of(make_page(room_exhibit(), NONE))["layers"]
+    assert layers == {"before": "observed", "observed": "observed", "generated": "generated"}
+
+
+def test_what_changed_is_held_beside_what_it_became(tmp_path):
+    exhibit = room_exhibit()
+    assert exhibit.before is not None
+    page = make_page(replace(exhibit, before=exhibit.before[:100]), NONE)
+    assert len(gaussians_in(page, "before", tmp_path)) == 100
+    assert content_of(page)["layers"]["before"] == "before"
+
+
+def test_text_from_outside_cannot_leave_its_place():
+    evil = "</script><script>alert(1)</script><!--"
+    shot = Shot("target-1", evil, TARGET, notes=(evil,))
+    page = make_page(replace(room_exhibit(evil), shots=(shot,)), Libraries({}, {evil: evil}))
+    text = page.html.decode()
+    assert evil not in text
+    assert "alert(1)</script" not in text
+    content = content_of(page)
+    assert (
+        content["title"] == content["shots"][0]["title"] == content["shots"][0]["notes"][0] == evil
+    )
+    assert content["licences"] == {evil: evil}
+
+
+def test_our_program_writes_text_and_never_markup():
+    program = pages.asset("viewer.js")
+    assert "textContent" in program
+    for way in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval("):
+        assert way not in program
+
+
+def test_a_page_names_nothing_outside_of_itself():
+    text = make_page(room_exhibit(), NONE).html.decode()
+    assert "http" not in text.replace('http-equiv="Content-Security-Policy"', "")
+    assert not re.search(r"\b(src|href)=", text)
+
+
+def test_a_large_scene_lies_beside_its_page(tmp_path, monkeypatch):
+    whole = make_page(room_exhibit(), NONE)
+    monkeypatch.setattr(pages, "LARGEST_PAGE", 1000)
+    monkeypatch.setattr(pages, "PART", 20_000)
+    page = make_page(room_exhibit(), NONE, "my #page")
+    assert len(page.parts) > 2
+    assert re.findall(r'src="([^"]*)"', page.html.decode())[0] == "my%20%23page.1.js"
+    assert next(iter(page.parts)) == "my #page.1.js"
+    for layer in ("observed", "generated"):
+        assert torch.equal(
+            gaussians_in(page, layer, tmp_path).means, gaussians_in(whole, layer, tmp_path).means
+        )
+
+
+def test_floaters_beyond_all_measure_are_left_out_and_counted():
+    exhibit = room_exhibit()
+    means = exhibit.after.means.clone()
+    means[:3] = 1e9
+    page = make_page(replace(exhibit, after=replace(exhibit.after, means=means), before=None), NONE)
+    assert page.left_out == 3
+    assert content_of(page)["counts"]["observed"] == SIDE * SIDE - 3
+
+
+def test_a_scene_without_cameras_has_one_that_sees_it():
+    exhibit = replace(room_exhibit(), shots=())
+    (shot,) = content_of(make_page(exhibit, NONE))["shots"]
+    assert shot["name"] == "overview"
+    pose = np.array(shot["pose"]).reshape(4, 4)
+    # It looks along -z of the page at its origin, which is the middle of the scene.
+    assert np.array_equal(pose[:3, :3], np.eye(3))
+    assert abs(pose[2, 3] - shot["focus"]) < 0.5 * shot["focus"]
+
+
+def test_a_camera_looks_as_far_as_what_it_sees():
+    content = content_of(make_page(room_exhibit(), NONE))
+    depth = room_from(LEFT, 0).means.double() - LEFT.center
+    expected = (depth @ LEFT.forward.double()).median().item()
+    focus = content["shots"][1]["focus"] * content["frame"]["unit"]
+    assert abs(focus - expected) < 0.2 * expected
+
+
+# ---------------------------------------------------------------------------------- exhibits
+
+
+def test_a_scene_alone_is_compared_with_what_was_observed(tmp_path):
+    exhibit = room_exhibit()
+    save_ply(tmp_path / "completed.ply", exhibit.after)
+    found = exhibit_of_files(tmp_path / "completed.ply", None, drop_nonfinite=False)
+    assert found.before is not None
+    assert exhibit.before is not None
+    assert torch.equal(found.before.means, exhibit.before.means)
+
+
+@pytest.mark.parametrize("generated", [0, 1])
+def test_a_scene_of_one_kind_is_compared_with_nothing(tmp_path, generated):
+    save_ply(tmp_path / "a.ply", room_from(LEFT, generated))
+    found = exhibit_of_files(tmp_path / "a.ply", None, drop_nonfinite=False)
+    assert found.before is None
+    assert "before" not in content_of(make_page(found, NONE))["layers"]
+
+
+def completion_in(folder: Path, transform: np.ndarray, origin: np.ndarray) -> Path:
+    """An output folder of `complete` whose cameras are in another frame than its scenes."""
+    exhibit = room_exhibit()
+    folder.mkdir()
+    (folder / "images").mkdir()
+    assert exhibit.before is not None
+    save_ply(folder / "context.ply", exhibit.before)
+    save_ply(folder / "completed.ply", exhibit.after)
+    write_image(folder / "images" / "target1_after.png", torch.rand(SIDE, SIDE, 3))
+    back = np.linalg.inv(transform)
+    c2w = torch.from_numpy(back) @ TARGET.c2w.double()
+    write_cameras(folder / "targets.json", [replace(TARGET, c2w=c2w)])
+    summary = {
+        "settings": {"folder": str(folder / "gone")},
+        "frame": {"transform": transform.tolist(), "origin": origin.tolist()},
+        "context": [{"frame": 0}],
+        "targets": [{"notes": ["a <note>"]}],
+    }
+    (folder / "summary.json").write_text(json.dumps(summary))
+    return folder
+
+
+def test_the_targets_of_a_completion_are_brought_into_the_frame_of_its_scenes(tmp_path):
+    """Maps have coordinates that float32 cannot tell apart: the origin is subtracted before."""
+    origin = np.array([5e6, -3e6, 1e3])
+    transform = np.eye(4)
+    transform[:3, 3] = -origin
+    exhibit = exhibit_of_completion(completion_in(tmp_path / "out", transform, origin), False)
+    (shot,) = exhibit.shots
+    assert shot.name == "target-1"
+    assert shot.notes == ("a <note>",)
+    assert shot.thumbnail is not None
+    assert (shot.camera.c2w - TARGET.c2w).abs().max() < 1e-5
+    assert "gone" in exhibit.remarks[0]
+
+
+def test_photographs_of_a_completion_are_jumped_to(tmp_path):
+    folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
+    (folder / "gone").mkdir()
+    write_image(folder / "gone" / "0.png", torch.rand(SIDE, SIDE, 3))
+    write_cameras(folder / "gone" / "transforms.json", [LEFT], ["0.png"])
+    exhibit = exhibit_of_completion(folder, False)
+    assert [shot.name for shot in exhibit.shots] == ["target-1", "photograph-0"]
+    assert exhibit.shots[1].thumbnail is not None
+    assert exhibit.remarks == ()
+
+
+def test_a_folder_that_is_no_completion_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"has no completed\.ply"):
+        exhibit_of_completion(tmp_path, False)
+
+
+# --------------------------------------------------------------------------- the command line
+
+
+@pytest.fixture
+def packed(monkeypatch) -> None:
+    """The command finds its libraries."""
+    monkeypatch.setattr("gscompleter.viewer.packages.load_libraries", lambda: NONE)
+
+
+def test_a_page_is_saved_once(packed, tmp_path, monkeypatch, capsys):
+    save_ply(tmp_path / "a.ply", room_exhibit().after)
+    asked = ("view", tmp_path / "a.ply", "--save", tmp_path / "page.html")
+    assert run(monkeypatch, *asked) == 0
+    first = (tmp_path / "page.html").read_bytes()
+    assert run(monkeypatch, *asked) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert run(monkeypatch, *asked, "--overwrite") == 0
+    assert (tmp_path / "page.html").read_bytes() == first
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "page.html"]
+
+
+def test_the_second_scene_is_the_one_after(packed, tmp_path, monkeypatch):
+    exhibit = room_exhibit()
+    assert exhibit.before is not None
+    save_ply(tmp_path / "a.ply", exhibit.before[:50])
+    save_ply(tmp_path / "b.ply", exhibit.after)
+    page = tmp_path / "page.html"
+    assert run(monkeypatch, "view", tmp_path / "a.ply", tmp_path / "b.ply", "--save", page) == 0
+    counts = content_of(Page(page.read_bytes(), {}, 0))["counts"]
+    assert counts == {"before": 50, "observed": SIDE * SIDE, "generated": SIDE * SIDE}
+
+
+def test_cameras_bring_their_photographs_as_thumbnails(packed, tmp_path, monkeypatch):
+    save_ply(tmp_path / "a.ply", room_exhibit().after)
+    write_image(tmp_path / "left.png", torch.rand(SIDE, SIDE, 3))
+    write_cameras(tmp_path / "transforms.json", [LEFT, TARGET], ["left.png", "gone.png"])
+    page = tmp_path / "page.html"
+    cameras = ("--cameras", tmp_path / "transforms.json")
+    assert run(monkeypatch, "view", tmp_path / "a.ply", *cameras, "--save", page) == 0
+    shots = content_of(Page(page.read_bytes(), {}, 0))["shots"]
+    assert [(shot["name"], shot["title"]) for shot in shots] == [
+        ("camera-1", "left.png"),
+        ("camera-2", "gone.png"),
+    ]
+    assert shots[0]["thumbnail"] is not None
+    assert shots[1]["thumbnail"] is None
+
+
+def header_only(path: Path) -> None:
+    """A .ply without any Gaussian."""
+    save_ply(path, room_from(LEFT, 0)[:1])
+    head = path.read_bytes().split(b"end_header\n")[0].replace(b"vertex 1\n", b"vertex 0\n")
+    path.write_bytes(head + b"end_header\n")
+
+
+def with_nan(path: Path) -> None:
+    gaussians = room_from(LEFT, 0)
+    means = gaussians.means.clone()
+    means[0] = torch.nan
+    save_ply(path, replace(gaussians, means=means))
+
+
+@pytest.mark.parametrize(
+    ("write", "said"), [(header_only, "holds no Gaussian"), (with_nan, "--drop-nonfinite")]
+)
+def test_what_cannot_be_shown_gets_a_sentence(packed, tmp_path, monkeypatch, capsys, write, said):
+    write(tmp_path / "a.ply")
+    assert run(monkeypatch, "view", tmp_path / "a.ply", "--save", tmp_path / "page.html") == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_page_has_to_be_named_as_one(packed, tmp_path, monkeypatch, capsys):
+    save_ply(tmp_path / "a.ply", room_from(LEFT, 0))
+    assert run(monkeypatch, "view", tmp_path / "a.ply", "--save", tmp_path / "page.ply") == 2
+    assert "*.html" in capsys.readouterr().err
+
+
+def test_without_a_file_to_save_to_the_page_is_served_and_opened(
+    packed, tmp_path, monkeypatch, capsys
+):
+    """Ctrl-C, which ends it, comes as soon as the browser is opened."""
+    save_ply(tmp_path / "a.ply", room_exhibit().after)
+    answers = []
+
+    def opened(address: str) -> None:
+        answers.append(urlsplit(address))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("webbrowser.open", opened)
+    assert run(monkeypatch, "view", tmp_path / "a.ply") == 0
+    (address,) = answers
+    assert address.hostname == "127.0.0.1"
+    assert address.geturl() in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+# ---------------------------------------------------------------------------------- the server
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    """Where a page with one part is served."""
+    with serving(Page(b"<!doctype html>", {"my page.1.js": b"gscPart()"}, 0)) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server.server_address[1]
+        server.shutdown()
+        thread.join()
+
+
+def answer(port: int, method: str, path: str, host: str) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request(method, path, headers={"Host": host})
+    response = connection.getresponse()
+    return response.status, response.read()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:1234", "localhost", "LOCALHOST:80"])
+def test_this_machine_gets_the_page_and_its_parts(port, host):
+    assert answer(port, "GET", "/", host) == (200, b"<!doctype html>")
+    assert answer(port, "GET", "/my%20page.1.js", host) == (200, b"gscPart()")
+    assert answer(port, "HEAD", "/", host) == (200, b"")
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:80", "", "[::1]"])
+def test_a_site_that_points_its_name_here_gets_nothing(port, host):
+    status, body = answer(port, "GET", "/", host)
+    assert status == 421
+    assert b"<!doctype html>" not in body.splitlines()[:1]
+
+
+@pytest.mark.parametrize("path", ["/../pyproject.toml", "/%2e%2e/a", "/page.html", "//etc/passwd"])
+def test_nothing_else_is_served(port, path):
+    assert answer(port, "GET", path, "localhost")[0] == 404
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS"])
+def test_nothing_can_be_sent(port, method):
+    assert answer(port, method, "/", "localhost")[0] == 501
+
+
+def test_a_port_that_is_taken_gets_a_sentence(port):
+    with pytest.raises(InputError, match=f"Port {port}"):
+        serving(Page(b"", {}, 0), port)

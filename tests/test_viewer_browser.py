@@ -1,0 +1,288 @@
+"""The page of the viewer in a real browser: without any request, and beside our own renderer."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from PIL import Image
+
+from gscompleter.errors import InputError
+from gscompleter.render import load_renderer
+from gscompleter.types import Camera, Gaussians
+from gscompleter.viewer import page as pages
+from gscompleter.viewer.exhibit import Exhibit
+from gscompleter.viewer.packages import Libraries, load_libraries
+from gscompleter.viewer.page import make_page
+from viewer_pages import LEFT, SIDE, TARGET, room_exhibit
+
+pytestmark = pytest.mark.browser
+
+CHROMIUM = os.environ.get("BROWSER_FOR_TESTS") or shutil.which("chromium")
+SWITCHES = [
+    *("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+    *("--disable-gpu-vsync", "--disable-frame-rate-limit"),
+]
+"""Software WebGL 2, no traffic of the browser's own, and no screen that is waited for."""
+BARE = """
+header, aside, figcaption, #divider { display: none !important; }
+#stage { position: fixed !important; inset: 0; }
+[data-shown="side"] #before { right: 50% !important; }
+[data-shown="side"] #after { left: 50% !important; }
+"""
+"""Lets the pictures fill the window, to the pixel."""
+
+Picture = Float[np.ndarray, "h w 3"]
+
+
+def needed(reason: str) -> None:
+    """Skip for want of something; where everything has to be tested, fail."""
+    if os.environ.get("CI"):
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="module")
+def libraries() -> Libraries:
+    try:
+        return load_libraries()
+    except InputError as error:
+        needed(str(error))
+        raise
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    if CHROMIUM is None:
+        needed("needs chromium")
+    with playwright.sync_playwright() as running:
+        launched = running.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        yield launched
+        launched.close()
+
+
+class Tab:
+    """A page that was opened from its file with the network off."""
+
+    def __init__(self, browser: Any, path: Path, width: int, height: int, link: str = "") -> None:
+        self.context = browser.new_context(viewport={"width": width, "height": height})
+        self.context.set_offline(True)
+        self.page = self.context.new_page()
+        self.requests: list[str] = []
+        self.errors: list[str] = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on(
+            "console",
+            lambda said: self.errors.append(said.text) if said.type == "error" else None,
+        )
+        self.page.goto(path.as_uri() + link)
+        self.page.evaluate("gsc.ready")
+
+    def do(self, call: str) -> Any:
+        """What a call of the page's interface returns, once everything is drawn."""
+        value = self.page.evaluate(call)
+        self.page.evaluate("gsc.settled()")
+        return value
+
+    def key(self, key: str, held: bool = False) -> None:
+        (self.page.keyboard.down if held else self.page.keyboard.press)(key)
+        self.page.evaluate("gsc.settled()")
+
+    def picture(self) -> Picture:
+        """What the window shows."""
+        image = Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")
+        return np.asarray(image, dtype=np.float64) / 255
+
+
+@pytest.fixture(scope="module")
+def exhibit() -> Exhibit:
+    return room_exhibit()
+
+
+@pytest.fixture(scope="module")
+def saved(exhibit, libraries, tmp_path_factory) -> Path:
+    """The page as a file, in a folder whose name needs to be escaped."""
+    path = tmp_path_factory.mktemp("a folder #1") / "page.html"
+    path.write_bytes(make_page(exhibit, libraries).html)
+    return path
+
+
+@pytest.fixture(scope="module")
+def bare(browser, saved) -> Tab:
+    """A window with nothing but two pictures of a camera's size, or one of twice its width."""
+    tab = Tab(browser, saved, 2 * SIDE, SIDE)
+    tab.page.add_style_tag(content=BARE)
+    tab.page.evaluate("gsc.settled()")
+    return tab
+
+
+def rendered(gaussians: Gaussians, camera: Camera) -> Picture:
+    with torch.no_grad():
+        return load_renderer("cpu").render(gaussians, camera).image.clamp(0, 1).double().numpy()
+
+
+def psnr(one: Picture, other: Picture) -> float:
+    return -10 * np.log10(np.mean((one - other) ** 2))
+
+
+def distance(one: list[float], other: list[float]) -> float:
+    return float(np.linalg.norm(np.subtract(one, other)))
+
+
+def observed_of(exhibit: Exhibit) -> Gaussians:
+    return exhibit.after[exhibit.after.generated == 0]
+
+
+@pytest.mark.parametrize(("name", "camera"), [("target-1", TARGET), ("camera-1", LEFT)])
+def test_both_pictures_are_those_of_our_renderer(bare, exhibit, name, camera):
+    bare.do("gsc.setMode('side')")
+    assert bare.do(f"gsc.goTo('{name}')")
+    shown = bare.picture()
+    assert psnr(shown[:, :SIDE], rendered(exhibit.before, camera)) > 25
+    assert psnr(shown[:, SIDE:], rendered(exhibit.after, camera)) > 25
+
+
+def test_hiding_what_was_generated_brings_the_hole_back(bare, exhibit):
+    bare.do("gsc.setMode('side')")
+    bare.do("gsc.goTo('target-1')")
+    bare.do("gsc.setGenerated('hide')")
+    hidden = bare.picture()[:, SIDE:]
+    bare.do("gsc.setGenerated('tint')")
+    tinted = bare.picture()[:, SIDE:]
+    bare.do("gsc.setGenerated('show')")
+    expected = rendered(observed_of(exhibit), TARGET)
+    assert psnr(hidden, expected) > 25
+    assert psnr(bare.picture()[:, SIDE:], expected) < 15
+    hole = expected.max(axis=-1) == 0
+    assert hole.mean() > 0.2
+    # The tint takes green away, and nothing of what was observed.
+    after = rendered(exhibit.after, TARGET)
+    assert tinted[hole][:, 1].mean() < 0.7 * after[hole][:, 1].mean()
+    seen = expected.min(axis=-1) > 0.05
+    assert seen.mean() > 0.1
+
+
+def test_a_jump_moves_both_pictures_and_the_address(bare):
+    bare.do("gsc.goTo('target-1')")
+    before, there = bare.picture(), bare.do("gsc.stats()")
+    bare.do("gsc.goTo('camera-1')")
+    here = bare.do("gsc.stats()")
+    assert distance(here["eye"], LEFT.center.tolist()) < 1e-5
+    assert distance(there["eye"], TARGET.center.tolist()) < 1e-5
+    change = np.abs(bare.picture() - before)
+    assert min(change[:, :SIDE].mean(), change[:, SIDE:].mean()) > 0.02
+    assert "camera=camera-1" in bare.page.url
+    assert bare.do("gsc.goTo('nowhere')") is False
+    assert bare.do("gsc.goTo('constructor')") is False
+
+
+def test_the_slider_shows_before_on_its_left_and_after_on_its_right(bare):
+    bare.do("gsc.goTo('target-1')")
+    bare.do("gsc.setMode('before')")
+    before = bare.picture()
+    bare.do("gsc.setMode('after')")
+    after = bare.picture()
+    assert np.abs(after - before).mean() > 0.05
+    bare.do("gsc.setMode('slider')")
+    middle = bare.picture()
+    assert np.abs(middle[:, : SIDE - 2] - before[:, : SIDE - 2]).max() < 0.02
+    assert np.abs(middle[:, SIDE + 2 :] - after[:, SIDE + 2 :]).max() < 0.02
+    assert np.abs(middle[:, SIDE + 2 :] - before[:, SIDE + 2 :]).mean() > 0.05
+
+
+def test_a_held_key_shows_before_as_long_as_it_is_held(bare):
+    bare.do("gsc.goTo('target-1')")
+    bare.do("gsc.setMode('before')")
+    before = bare.picture()
+    bare.do("gsc.setMode('after')")
+    after = bare.picture()
+    bare.key("b", held=True)
+    assert np.abs(bare.picture() - before).max() < 0.02
+    bare.page.keyboard.up("b")
+    bare.do("gsc.settled()")
+    assert np.abs(bare.picture() - after).max() < 0.02
+
+
+def test_keys_and_drags_do_what_the_page_says(bare):
+    bare.do("gsc.goTo('camera-1')")
+    for key, mode in (("1", "side"), ("2", "slider"), ("3", "before"), ("4", "after")):
+        bare.page.keyboard.press(key)
+        assert bare.page.evaluate("gsc.stats()")["mode"] == mode
+    bare.page.keyboard.press("g")
+    assert bare.page.evaluate("gsc.stats()")["generated"] == "tint"
+    bare.page.evaluate("gsc.setGenerated('show')")
+    bare.page.keyboard.press("]")
+    start = bare.page.evaluate("gsc.stats()")
+    assert start["camera"] == "target-1"
+    for drag, moves in (("orbit", True), ("fly", False)):
+        bare.page.keyboard.press("r")
+        bare.page.mouse.move(SIDE, SIDE / 2)
+        bare.page.mouse.down()
+        bare.page.mouse.move(SIDE + 20, SIDE / 2)
+        bare.page.mouse.up()
+        stats = bare.page.evaluate("gsc.stats()")
+        assert stats["drag"] == drag
+        assert (distance(stats["eye"], start["eye"]) > 0.1) == moves
+        bare.page.keyboard.press("f")
+    bare.page.keyboard.press("r")
+    bare.key("w")
+    step = np.array(bare.do("gsc.stats()")["eye"]) - start["eye"]
+    assert step @ TARGET.forward.double().numpy() > 0.99 * np.linalg.norm(step) > 0
+
+
+def test_nothing_was_asked_for_and_nothing_went_wrong(bare):
+    """Last of those that share the window."""
+    assert bare.errors == []
+    assert {url.split(":", 1)[0] for url in bare.requests} <= {"file", "blob", "data"}
+    assert [url for url in bare.requests if url.startswith("file:")] == [bare.requests[0]]
+
+
+def test_a_link_opens_at_its_camera(browser, saved):
+    tab = Tab(browser, saved, 320, 240, "#camera=camera-1&mode=slider&generated=hide")
+    stats = tab.do("gsc.stats()")
+    assert (stats["camera"], stats["mode"], stats["generated"]) == ("camera-1", "slider", "hide")
+    assert tab.page.get_by_role("button", name="Left").get_attribute("aria-current") == "true"
+    divider = tab.page.get_by_role("slider")
+    divider.press("ArrowRight")
+    assert divider.get_attribute("aria-valuenow") == "52"
+    tab.context.close()
+
+
+def test_parts_beside_the_page_are_read_from_its_folder(
+    browser, exhibit, libraries, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(pages, "LARGEST_PAGE", 1000)
+    monkeypatch.setattr(pages, "PART", 100_000)
+    page = make_page(exhibit, libraries, "my #page")
+    (tmp_path / "my #page.html").write_bytes(page.html)
+    for name, part in page.parts.items():
+        (tmp_path / name).write_bytes(part)
+    tab = Tab(browser, tmp_path / "my #page.html", 320, 240)
+    assert tab.do("gsc.stats()")["frames"] > 0
+    assert tab.errors == []
+    tab.context.close()
+    (tmp_path / next(iter(page.parts))).unlink()
+    with pytest.raises(Exception, match="files that have to lie beside this page are missing"):
+        Tab(browser, tmp_path / "my #page.html", 320, 240)
+
+
+def test_text_from_outside_stays_text(browser, libraries, tmp_path):
+    evil = "</script><img src=x onerror=document.title='broken'>"
+    (tmp_path / "page.html").write_bytes(make_page(room_exhibit(evil), libraries).html)
+    tab = Tab(browser, tmp_path / "page.html", 320, 240)
+    assert tab.page.title() == evil
+    assert tab.page.locator("h1").text_content() == evil
+    assert tab.page.locator("h1 *").count() == 0
+    tab.context.close()
