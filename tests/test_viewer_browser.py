@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float
-from PIL import Image
 
+from browsing import Picture, Tab, launched, needed
 from gscompleter.errors import InputError
 from gscompleter.render import load_renderer
 from gscompleter.types import Camera, Gaussians
@@ -26,14 +22,6 @@ from viewer_pages import LEFT, SIDE, TARGET, room_exhibit
 
 pytestmark = pytest.mark.browser
 
-CHROMIUM = os.environ.get("BROWSER_FOR_TESTS") or shutil.which("chromium")
-SWITCHES = [
-    *("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-    *("--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync"),
-    *("--disable-gpu-vsync", "--disable-frame-rate-limit"),
-]
-"""Software WebGL 2, no traffic of the browser's own, and no screen that is waited for."""
 BARE = """
 header, aside, figcaption, #divider { display: none !important; }
 #stage { position: fixed !important; inset: 0; }
@@ -41,15 +29,6 @@ header, aside, figcaption, #divider { display: none !important; }
 [data-shown="side"] #after { left: 50% !important; }
 """
 """Lets the pictures fill the window, to the pixel."""
-
-Picture = Float[np.ndarray, "h w 3"]
-
-
-def needed(reason: str) -> None:
-    """Skip for want of something; where everything has to be tested, fail."""
-    if os.environ.get("CI"):
-        pytest.fail(reason)
-    pytest.skip(reason)
 
 
 @pytest.fixture(scope="module")
@@ -63,31 +42,15 @@ def libraries() -> Libraries:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    if CHROMIUM is None:
-        needed("needs chromium")
-    with playwright.sync_playwright() as running:
-        launched = running.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
-        yield launched
-        launched.close()
+    with launched() as browser:
+        yield browser
 
 
-class Tab:
-    """A page that was opened from its file with the network off."""
+class Window(Tab):
+    """A page of the viewer."""
 
-    def __init__(self, browser: Any, path: Path, width: int, height: int, link: str = "") -> None:
-        self.context = browser.new_context(viewport={"width": width, "height": height})
-        self.context.set_offline(True)
-        self.page = self.context.new_page()
-        self.requests: list[str] = []
-        self.errors: list[str] = []
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on(
-            "console",
-            lambda said: self.errors.append(said.text) if said.type == "error" else None,
-        )
-        self.page.goto(path.as_uri() + link)
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
         self.page.evaluate("gsc.ready")
 
     def do(self, call: str) -> Any:
@@ -99,11 +62,6 @@ class Tab:
     def key(self, key: str, held: bool = False) -> None:
         (self.page.keyboard.down if held else self.page.keyboard.press)(key)
         self.page.evaluate("gsc.settled()")
-
-    def picture(self) -> Picture:
-        """What the window shows."""
-        image = Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")
-        return np.asarray(image, dtype=np.float64) / 255
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +78,9 @@ def saved(exhibit, libraries, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def bare(browser, saved) -> Tab:
+def bare(browser, saved) -> Window:
     """A window with nothing but two pictures of a camera's size, or one of twice its width."""
-    tab = Tab(browser, saved, 2 * SIDE, SIDE)
+    tab = Window(browser, saved, 2 * SIDE, SIDE)
     tab.page.add_style_tag(content=BARE)
     tab.page.evaluate("gsc.settled()")
     return tab
@@ -250,7 +208,7 @@ def test_nothing_was_asked_for_and_nothing_went_wrong(bare):
 
 
 def test_a_link_opens_at_its_camera(browser, saved):
-    tab = Tab(browser, saved, 320, 240, "#camera=camera-1&mode=slider&generated=hide")
+    tab = Window(browser, saved, 320, 240, "#camera=camera-1&mode=slider&generated=hide")
     stats = tab.do("gsc.stats()")
     assert (stats["camera"], stats["mode"], stats["generated"]) == ("camera-1", "slider", "hide")
     assert tab.page.get_by_role("button", name="Left").get_attribute("aria-current") == "true"
@@ -269,19 +227,19 @@ def test_parts_beside_the_page_are_read_from_its_folder(
     (tmp_path / "my #page.html").write_bytes(page.html)
     for name, part in page.parts.items():
         (tmp_path / name).write_bytes(part)
-    tab = Tab(browser, tmp_path / "my #page.html", 320, 240)
+    tab = Window(browser, tmp_path / "my #page.html", 320, 240)
     assert tab.do("gsc.stats()")["frames"] > 0
     assert tab.errors == []
     tab.context.close()
     (tmp_path / next(iter(page.parts))).unlink()
     with pytest.raises(Exception, match="files that have to lie beside this page are missing"):
-        Tab(browser, tmp_path / "my #page.html", 320, 240)
+        Window(browser, tmp_path / "my #page.html", 320, 240)
 
 
 def test_text_from_outside_stays_text(browser, libraries, tmp_path):
     evil = "</script><img src=x onerror=document.title='broken'>"
     (tmp_path / "page.html").write_bytes(make_page(room_exhibit(evil), libraries).html)
-    tab = Tab(browser, tmp_path / "page.html", 320, 240)
+    tab = Window(browser, tmp_path / "page.html", 320, 240)
     assert tab.page.title() == evil
     assert tab.page.locator("h1").text_content() == evil
     assert tab.page.locator("h1 *").count() == 0

@@ -1,0 +1,74 @@
+"""A browser for tests of pages: Debian's chromium, with nothing of its own to send or to ask."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+from PIL import Image
+
+CHROMIUM = os.environ.get("BROWSER_FOR_TESTS") or shutil.which("chromium")
+SWITCHES = [
+    *("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+    *("--disable-gpu-vsync", "--disable-frame-rate-limit"),
+]
+"""Software WebGL 2, no traffic of the browser's own, and no screen that is waited for."""
+
+Picture = Float[np.ndarray, "h w 3"]
+
+
+def needed(reason: str) -> None:
+    """Skip for want of something; where everything has to be tested, fail."""
+    if os.environ.get("CI"):
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+@contextmanager
+def launched() -> Iterator[Any]:
+    """A browser that runs meanwhile."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    if CHROMIUM is None:
+        needed("needs chromium")
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        yield browser
+        browser.close()
+
+
+class Tab:
+    """A page that was opened from its file with the network off."""
+
+    def __init__(self, browser: Any, path: Path, width: int, height: int, link: str = "") -> None:
+        self.context = browser.new_context(viewport={"width": width, "height": height})
+        self.context.set_offline(True)
+        self.page = self.context.new_page()
+        self.requests: list[str] = []
+        self.errors: list[str] = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on(
+            "console",
+            lambda said: self.errors.append(said.text) if said.type == "error" else None,
+        )
+        self.page.goto(path.as_uri() + link)
+
+    def picture(self) -> Picture:
+        """What the window shows."""
+        return pixels_of(self.page.screenshot())
+
+
+def pixels_of(screenshot: bytes) -> Picture:
+    """The colours of a screenshot in [0, 1]."""
+    image = Image.open(io.BytesIO(screenshot)).convert("RGB")
+    return np.asarray(image, dtype=np.float64) / 255
