@@ -33,6 +33,9 @@ FEWEST_ROUNDS = 2
 """Rounds of search and vote on the finest level."""
 MOST_ROUNDS = 6
 """Rounds on the coarsest level."""
+COARSEST_PASSES, FINER_PASSES = 2, 1
+"""How often a round looks through the hole: there and back where nothing is known yet, once where
+the coarser level has found about the place."""
 CONFIDENCE = 0.85
 """Factor of the weight of an unknown pixel per pixel from the border of the hole."""
 MIN_SIZE = 80
@@ -147,10 +150,12 @@ def solve(
     current = level.image.numpy().copy()
     if coarse_field is not None:
         current[~known] = voted()
-    reach = max(usable.shape) if coarse_field is None else FINE_REACH
+    reach, passes = max(usable.shape), COARSEST_PASSES
+    if coarse_field is not None:
+        reach, passes = FINE_REACH, FINER_PASSES
     for number in range(rounds):
         matched = patchmatch.Matched(current, weight, *asked, images, usable, log_depth)
-        cost, shift = patchmatch.search(matched, costs, matches, 2, reach, seed + 31 * number)
+        cost, shift = patchmatch.search(matched, costs, matches, passes, reach, seed + 31 * number)
         likely = np.exp(-cost / (2 * max(float(np.percentile(cost, 75)), 1e-6)))
         votes = (weight[near_hole] * likely).astype(np.float32)
         current[~known] = voted()
