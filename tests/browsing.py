@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,10 @@ SWITCHES = [
     *("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
-    *("--disable-gpu-vsync", "--disable-frame-rate-limit"),
 ]
-"""Software WebGL 2, no traffic of the browser's own, and no screen that is waited for."""
+"""Software WebGL 2, and no traffic of the browser's own."""
+NO_SCREEN = ["--disable-gpu-vsync", "--disable-frame-rate-limit"]
+"""No screen is waited for. A page that draws all the time would leave no time for others."""
 
 Picture = Float[np.ndarray, "h w 3"]
 
@@ -35,13 +36,13 @@ def needed(reason: str) -> None:
 
 
 @contextmanager
-def launched() -> Iterator[Any]:
+def launched(switches: Sequence[str] = (*SWITCHES, *NO_SCREEN)) -> Iterator[Any]:
     """A browser that runs meanwhile."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
     if CHROMIUM is None:
         needed("needs chromium")
     with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        browser = running.chromium.launch(executable_path=CHROMIUM, args=list(switches))
         yield browser
         browser.close()
 

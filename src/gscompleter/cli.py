@@ -28,6 +28,7 @@ from gscompleter.commands.options import (
     DemoOptions,
     EvaluateOptions,
     IndexOptions,
+    LiveOptions,
     ModelsOptions,
     TablesOptions,
 )
@@ -46,6 +47,7 @@ from gscompleter.threads import bound_threads
 # that `--help` does not wait for torch.
 COMMANDS: dict[str, tuple[type, str, str]] = {
     "complete": (CompleteOptions, "gscompleter.commands.complete", "run_completion"),
+    "live": (LiveOptions, "gscompleter.commands.live", "run_live"),
     "clean": (CleanOptions, "gscompleter.commands.clean", "run_clean"),
     "demo": (DemoOptions, "gscompleter.commands.demo", "run_demo"),
     "evaluate": (EvaluateOptions, "gscompleter.commands.evaluate", "run_evaluation"),
@@ -142,8 +144,8 @@ class NamedConfig:
 
 
 def config_named(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[str]]:
-    """What `complete --config NAME` names, and the other words, which may change some of it."""
-    if words[:1] != ["complete"]:
+    """What `--config NAME` names, and the other words, which may change some of it."""
+    if words[:1] not in (["complete"], ["live"]):
         return CompleterConfig(), words
     named, others = tyro.cli(
         NamedConfig, prog="gscompleter", args=words, return_unknown_args=True, add_help=False

@@ -18,6 +18,7 @@ from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import project, same_camera, sample, slide, widened
 from gscompleter.masks import dilate
+from gscompleter.progress import stage_begins
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, load_renderer
 from gscompleter.stages.anchor import (
@@ -672,6 +673,7 @@ class Clock:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        stage_begins(stage)
         start = time.perf_counter()
         try:
             yield

@@ -3,7 +3,7 @@ library call stays silent."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
@@ -13,6 +13,7 @@ from rich.console import Console
 T = TypeVar("T")
 
 _console: ContextVar[Console | None] = ContextVar("console", default=None)
+_listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener", default=None)
 
 
 @contextmanager
@@ -23,6 +24,23 @@ def shown_on(console: Console | None) -> Iterator[None]:
         yield
     finally:
         _console.reset(token)
+
+
+@contextmanager
+def stages_heard_by(listener: Callable[[str], None]) -> Iterator[None]:
+    """Let `listener` hear the name of each stage that begins in everything called inside."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+def stage_begins(name: str) -> None:
+    """Say which stage begins, where somebody listens."""
+    listener = _listener.get()
+    if listener is not None:
+        listener(name)
 
 
 def tell(sentence: str) -> None:

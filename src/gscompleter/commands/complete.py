@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ from gscompleter.reports.completion import Around, Target, write_report
 from gscompleter.reports.completion_page import completion_page
 from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
-from gscompleter.types import Completion, View
+from gscompleter.types import Camera, Completion, View
 
 
 def run_completion(options: CompleteOptions) -> None:
@@ -76,26 +76,53 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
     """
     console = Console(stderr=True, quiet=options.quiet)
     opened, task, explorer, before = prepared(options, console)
+    say(console, *understood(options, opened, task))
     cameras = cameras_of(options, opened, task)
     with output_folder(options.out, replaceable(options)) as folder:
         with shown_on(None if options.quiet else console):
             completion, task = completed(options, task, cameras, explorer)
         completion = replace(completion, seconds=total(completion.seconds, before))
-        said = said_in_advance(options, opened, task, task.views[0].image.device.type)
-        looks = looks_around(options, completion, cameras.values(), explorer)
-        said["coverage"] = coverage_of(looks).as_summary()
-        summary = write_report(
-            folder,
-            completion,
-            task.targets,
-            explorer.completer.renderer,
-            said,
-            task.brought,
-            Around(tuple(looks), tuple(cameras.values())),
-        )
+        done = Done(opened, task, cameras, completion)
+        summary = write_done(folder, options, done, explorer)
         write_targets(folder, task)
-        write_page(folder, completion_page(folder))
     return summary, completion
+
+
+@dataclass(frozen=True)
+class Done:
+    """What was completed, and of what."""
+
+    opened: Opened
+    task: Task
+    """With the targets that it was completed for."""
+    cameras: Mapping[int, Camera]
+    """Those of all photographs that can be used, by their frames, in the frame of the result."""
+    completion: Completion
+
+
+def write_done(
+    folder: Path, options: CompleteOptions, done: Done, explorer: Explorer
+) -> dict[str, Any]:
+    """Write everything into `folder` but the cameras of the targets; returns the summary.
+
+    Raises:
+        InputError: where a file cannot be written.
+    """
+    task, cameras = done.task, tuple(done.cameras.values())
+    said = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
+    looks = looks_around(options, done.completion, cameras, explorer)
+    said["coverage"] = coverage_of(looks).as_summary()
+    summary = write_report(
+        folder,
+        done.completion,
+        task.targets,
+        explorer.completer.renderer,
+        said,
+        task.brought,
+        Around(tuple(looks), cameras),
+    )
+    write_page(folder, completion_page(folder))
+    return summary
 
 
 def plan_folder(options: CompleteOptions) -> None:
@@ -106,6 +133,7 @@ def plan_folder(options: CompleteOptions) -> None:
     """
     console = Console(stderr=True, quiet=options.quiet)
     opened, task, explorer, _ = prepared(options, console)
+    say(console, *understood(options, opened, task))
     cameras = cameras_of(options, opened, task)
     with output_folder(options.out, replaceable(options)) as folder:
         with shown_on(None if options.quiet else console):
@@ -138,7 +166,6 @@ def prepared(
     clock = Clock()
     with clock("context"):
         task = with_working_range(task, completer.renderer)
-    say(console, *understood(options, opened, task, device))
     return opened, task, Explorer(completer), clock.seconds
 
 

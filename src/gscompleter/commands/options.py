@@ -101,7 +101,21 @@ class SceneOptions(ComputeOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompleteOptions(SceneOptions, ModelOptions):
+class CompletingOptions(SceneOptions, ModelOptions):
+    """What every command can be told that opens a scene and completes it."""
+
+    scene: Path | None = None
+    """A file of Gaussians to complete, which is kept as it is. Without it the context is
+    reconstructed from the photographs."""
+    keep_unsupported: bool = False
+    """Never set Gaussians of the scene aside that no photograph supports."""
+    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
+    """Settings of the stages. `--config NAME` says where they start: default, paper, an ablation
+    such as no-sa, or a YAML file. Those given here are applied over it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompleteOptions(CompletingOptions):
     """Fill what the photographs never saw, as seen from the targets, and write the scene."""
 
     context: tuple[Frame, ...] | None = None
@@ -122,14 +136,30 @@ class CompleteOptions(SceneOptions, ModelOptions):
     out: Path
     """Folder for completed.ply, generated.ply, context.ply, targets.json, images/, report.html,
     report.json and summary.json."""
-    scene: Path | None = None
-    """A file of Gaussians to complete, which is kept as it is. Without it the context is
-    reconstructed from the photographs."""
-    keep_unsupported: bool = False
-    """Never set Gaussians of the scene aside that no photograph supports."""
-    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
-    """Settings of the stages. `--config NAME` says where they start: default, paper, an ablation
-    such as no-sa, or a YAML file. Those given here are applied over it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions(CompletingOptions):
+    """Complete a scene in the browser: fly to a hole, press a button, and watch it close.
+
+    Every step can be undone. What is saved is what `gscompleter complete` writes for the same
+    photographs and the cameras in OUT/targets.json.
+    """
+
+    context: tuple[Frame, ...] | None = None
+    """Numbers of the frames to start from, in the order of the sorted file paths; those that show
+    most if not given."""
+    out: Path = Path("live")
+    """Folder that the button Save writes, with the files that `complete` writes."""
+    resolution: Size = (256, 256)
+    """Height and width to work at, as `complete` has it. Smaller is faster."""
+    port: Annotated[int, Interval(ge=0, le=65535)] = 0
+    """Port to serve at; any that is free if not given."""
+    host: str = "127.0.0.1"
+    """Address to serve at. Whoever reaches it can press the buttons; the default is this machine
+    alone."""
+    no_open: bool = False
+    """Only say where the page is, and open no browser."""
 
 
 @dataclass(frozen=True, kw_only=True)

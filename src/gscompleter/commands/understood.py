@@ -29,8 +29,9 @@ millionths were measured from 256 x 256 to 427 x 640 pixels (docs/performance.md
 eight photographs it is the same within a third."""
 
 
-def understood(options: CompleteOptions, opened: Opened, task: Task, device: str) -> list[str]:
+def understood(options: CompleteOptions, opened: Opened, task: Task) -> list[str]:
     """The four lines. The cameras of `task` know the depth range that is worked in."""
+    device = task.views[0].image.device.type
     return [
         *found_out(options, opened, task),
         f"To do: {plan_line(options, task, device)}.",

@@ -1,0 +1,194 @@
+"""The command `live`: a scene in the browser, completed for what the browser shows."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from gscompleter.commands.complete import Done, prepared, write_done
+from gscompleter.commands.exploring import TARGETS, cameras_of
+from gscompleter.commands.opening import Opened, Task, say
+from gscompleter.commands.options import (
+    CompleteOptions,
+    CompletingOptions,
+    LiveOptions,
+    working_size,
+)
+from gscompleter.commands.output import replaceable, saying_what_stays
+from gscompleter.commands.understood import found_out
+from gscompleter.completer import total
+from gscompleter.data.scene import write_cameras
+from gscompleter.errors import InputError, quoted
+from gscompleter.explorer import Explorer
+from gscompleter.io.files import output_folder
+from gscompleter.live.session import Place, Session
+from gscompleter.progress import shown_on
+from gscompleter.reports.completion import Target
+from gscompleter.stages.candidates import shrunk, spread_cameras
+from gscompleter.types import Camera, Completion, View
+
+if TYPE_CHECKING:
+    from gscompleter.live.page import Page
+
+SHOWN = 40
+"""Photographs that the page shows at most, besides those that the work starts from."""
+THUMBNAIL = 160
+"""Their longer side, in pixels."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """All that is there before anything is completed."""
+
+    options: CompleteOptions
+    """What `complete` would be told, with the frames that the work starts from."""
+    opened: Opened
+    task: Task
+    explorer: Explorer
+    cameras: Mapping[int, Camera]
+    """Those of all photographs that can be used, by their frames, in the frame of the result."""
+    seconds: Mapping[str, float]
+    """What it took to find out."""
+
+
+def run_live(options: LiveOptions) -> None:
+    """Serve the page until Ctrl-C.
+
+    Raises:
+        InputError: anything about the input that the user can mend.
+    """
+    check_viser()
+    # Here, so that its want is a sentence.
+    from gscompleter.live.page import Page, Subject
+
+    console = Console(stderr=True, quiet=options.quiet)
+    with saying_what_stays(options.out):
+        ready = prepare(options, console)
+        with shown_on(None if options.quiet else console):
+            session = begin(ready)
+            photographs = photographs_of(ready)
+        saver = Saver(ready)
+        subject = Subject(session, photographs, lambda now: hole_of(ready, now), saver.save)
+        page = Page(subject, options.host, options.port)
+    serve(page, options)
+
+
+def check_viser() -> None:
+    """Refuse to go on without viser.
+
+    Raises:
+        InputError: where it is not installed.
+    """
+    if find_spec("viser") is None:
+        raise InputError(
+            "The live page needs viser, which is not installed; run "
+            "pip install 'gscompleter[live]'."
+        )
+
+
+def prepare(options: LiveOptions, console: Console) -> Prepared:
+    """Open the scene as `complete` does.
+
+    Raises:
+        InputError: as `complete_folder`.
+    """
+    asked = as_complete(options)
+    opened, task, explorer, seconds = prepared(asked, console)
+    say(console, *found_out(asked, opened, task))
+    frames = frames_of(task)
+    asked = replace(asked, context=frames, target=(str(options.out / TARGETS),))
+    return Prepared(asked, opened, task, explorer, cameras_of(asked, opened, task), seconds)
+
+
+def as_complete(options: LiveOptions) -> CompleteOptions:
+    """What `complete` would be told."""
+    shared = {field.name: getattr(options, field.name) for field in fields(CompletingOptions)}
+    return CompleteOptions(**shared)
+
+
+def frames_of(task: Task) -> tuple[int, ...]:
+    """The numbers of the photographs that the work starts from."""
+    return tuple(view.frame for view in task.views if view.frame is not None)
+
+
+def begin(ready: Prepared) -> Session:
+    """The session before anything is completed.
+
+    Raises:
+        InputError: as `GSCompleter.begin`.
+    """
+    task, completer = ready.task, ready.explorer.completer
+    origin, resolution = ready.opened.photographs.origin, working_size(ready.options.resolution)
+    begun = completer.begin(task.views, task.scene, task.witnesses)
+    return Session(completer, Place(task.frame, origin, resolution), begun)
+
+
+def photographs_of(ready: Prepared) -> list[View]:
+    """Small photographs for the page: those that the work starts from, and others that lie far
+    apart; none that cannot be read."""
+    cameras = [view.camera for view in ready.task.views]
+    known = dict(zip(frames_of(ready.task), cameras, strict=True))
+    others = [frame for frame in ready.cameras if frame not in known]
+    chosen = spread_cameras([ready.cameras[f] for f in others], SHOWN) if others else []
+    views = []
+    for frame in (*known, *(others[index] for index in chosen)):
+        camera = known[frame] if frame in known else ready.cameras[frame]
+        small = shrunk(camera, THUMBNAIL)
+        with suppress(InputError):
+            (view,) = ready.opened.photographs.views([frame], (small.height, small.width))
+            views.append(View(view.image, camera.to("cpu"), frame))
+    return views
+
+
+def hole_of(ready: Prepared, completion: Completion) -> Camera | None:
+    """The camera that the scene is most worth completing for, as `complete` finds it."""
+    choices = ready.explorer.plan(completion, list(ready.cameras.values()), 1)
+    return choices[0].camera if choices else None
+
+
+class Saver:
+    """Writes OUT; what it wrote itself it may replace."""
+
+    def __init__(self, ready: Prepared) -> None:
+        self._ready, self._wrote = ready, False
+
+    def save(self, session: Session) -> str:
+        """Write what `complete` writes; returns a sentence.
+
+        Raises:
+            InputError: where nothing was completed, or OUT cannot be written.
+        """
+        options = self._ready.options
+        if not session.steps:
+            raise InputError("Nothing has been completed; there is nothing to save.")
+        with output_folder(options.out, self._wrote or replaceable(options)) as folder:
+            write_done(folder, options, done(self._ready, session), self._ready.explorer)
+            write_cameras(folder / TARGETS, [step.told for step in session.steps])
+        self._wrote = True
+        return f"Saved in {quoted(options.out)}."
+
+
+def done(ready: Prepared, session: Session) -> Done:
+    """What `complete` would have done."""
+    now = session.now
+    completion = replace(now, seconds=total(now.seconds, ready.seconds))
+    targets = [Target(result.target) for result in now.targets]
+    return Done(ready.opened, replace(ready.task, targets=targets), ready.cameras, completion)
+
+
+def serve(page: Page, options: LiveOptions) -> None:
+    """Say where the page is, open it, and do what it asks for until Ctrl-C."""
+    address = f"http://{options.host}:{page.server.get_port()}/"
+    # Whoever waits for this line finds the server listening.
+    print(f"{address} (Ctrl-C ends it)", flush=True)
+    if not options.no_open:
+        webbrowser.open(address)
+    with suppress(KeyboardInterrupt):
+        page.work()
+    page.close()

@@ -1,0 +1,281 @@
+"""`gscompleter live`, as far as no browser is needed: steps, undo, and what is saved."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import MagicMock, Mock
+
+import numpy as np
+import pytest
+import torch
+import viser
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from command import run
+from gscompleter import save_ply
+from gscompleter.cli import parsed
+from gscompleter.commands import live
+from gscompleter.commands.options import LiveOptions
+from gscompleter.completer import STAGES
+from gscompleter.config import CompleterConfig
+from gscompleter.errors import InputError
+from gscompleter.frames.similarity import similarity
+from gscompleter.geometry import rotation_between
+from gscompleter.live.page import Page, Subject, answer, outcome, serving
+from gscompleter.live.poses import camera_of, pose_of, unit_of
+from gscompleter.live.session import Session, completed, undone
+from gscompleter.live.splat import splat_of
+from gscompleter.progress import stages_heard_by
+from gscompleter.splats.frames import moved
+from gscompleter.types import merge
+from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
+
+SIZE = 48
+CAMERAS = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.4, 4))]
+HOLES = [camera_at(0.7, 0.1, 0.05, yaw=14, size=SIZE), camera_at(-0.7, yaw=-16, size=SIZE)]
+"""Where the room has holes, to the right and to the left of what is observed."""
+ELSEWHERE = similarity(
+    0.3, Rotation.from_rotvec([0.9, -1.7, 0.4]).as_matrix(), np.array([5.0, 3.0, -2.0])
+)
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    return photographed(tmp_path_factory.mktemp("live") / "room", CAMERAS)
+
+
+def options_for(room: Path, out: Path, **others) -> LiveOptions:
+    size = (SIZE, SIZE)
+    given = {"context": (0, 1), "near": 0.5, "far": 20.0, "resolution": size, "quiet": True}
+    return LiveOptions(folder=room, out=out, **{**given, **others})
+
+
+@pytest.fixture(scope="module")
+def ready(room, tmp_path_factory) -> live.Prepared:
+    return live.prepare(options_for(room, tmp_path_factory.mktemp("outs") / "out"), QUIET)
+
+
+@pytest.fixture(scope="module")
+def begun(ready) -> Session:
+    return live.begin(ready)
+
+
+def test_undo_goes_back_and_the_same_camera_leads_to_the_same_scene(begun):
+    one, result = completed(begun, HOLES[0])
+    two, _ = completed(one, HOLES[1])
+    assert result.hole_fraction > 0.1
+    assert len(begun.now.added) < len(one.now.added) < len(two.now.added)
+    assert undone(two) == one
+    assert undone(undone(two)) == begun
+    again, _ = completed(undone(two), HOLES[1])
+    for name in ("means", "scales", "quats", "opacities", "sh", "generated"):
+        assert torch.equal(getattr(again.now.scene, name), getattr(two.now.scene, name)), name
+
+
+def test_there_is_nothing_to_undo_in_the_beginning(begun):
+    with pytest.raises(InputError, match="nothing to undo"):
+        undone(begun)
+
+
+def test_a_camera_that_adds_nothing_is_no_step(begun):
+    session, result = completed(begun, begun.now.views[0].camera)
+    assert session is begun
+    assert outcome(result, 1.0) == "The target is a context view: nothing to complete."
+
+
+def test_stages_are_heard_as_they_begin(begun):
+    heard: list[str] = []
+    with stages_heard_by(heard.append):
+        completed(begun, HOLES[0])
+    assert list(dict.fromkeys(heard)) == list(STAGES)
+    completed(begun, HOLES[0])
+    assert list(dict.fromkeys(heard)) == list(STAGES)
+
+
+def the_same_as_complete(monkeypatch, ready: live.Prepared, tmp_path: Path, *more) -> bool:
+    """Whether `complete`, told the cameras that were saved, writes the same bytes."""
+    out, other = ready.options.out, tmp_path / "by complete"
+    context = json.loads((out / "summary.json").read_text())["settings"]["context"]
+    arguments = ("--context", *context, "--target", out / "targets.json", "--out", other)
+    size = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--quiet")
+    assert run(monkeypatch, "complete", ready.options.folder, *arguments, *size, *more) == 0
+    names = ("completed.ply", "context.ply", "generated.ply", "images/target1_after.png")
+    assert {path.name for path in out.iterdir()} == {path.name for path in other.iterdir()}
+    return all((out / name).read_bytes() == (other / name).read_bytes() for name in names)
+
+
+def test_what_is_saved_is_what_complete_writes(ready, begun, tmp_path, monkeypatch):
+    saver = live.Saver(ready)
+    with pytest.raises(InputError, match="nothing to save"):
+        saver.save(begun)
+    session, _ = completed(begun, HOLES[0])
+    assert str(ready.options.out) in saver.save(session)
+    assert the_same_as_complete(monkeypatch, ready, tmp_path)
+    session, _ = completed(session, HOLES[1])
+    saver.save(session)  # it replaces what it wrote itself
+    assert len(json.loads((ready.options.out / "summary.json").read_text())["targets"]) == 2
+    assert the_same_as_complete(monkeypatch, ready, tmp_path, "--overwrite")
+
+
+def test_what_others_wrote_is_not_replaced(room, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="not empty"):
+        live.prepare(options_for(room, tmp_path / "out"), QUIET)
+
+
+def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeypatch):
+    """Cameras are written in the frame of the photographs, and lose nothing on the way."""
+    room = photographed(tmp_path / "room", CAMERAS)
+    told = {"transform": (np.diag([1 / 0.3] * 3 + [1]) @ ELSEWHERE)[:3].tolist(), "scale": 0.3}
+    (room / "dataparser_transforms.json").write_text(json.dumps(told))
+    scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[:2]])
+    save_ply(tmp_path / "splat.ply", moved(scene, torch.from_numpy(ELSEWHERE).float()))
+    options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
+    ready = live.prepare(options, QUIET)
+    assert ready.task.method == "dataparser"
+    session = live.begin(ready)
+    target = session.place.read(HOLES[0])
+    session, result = completed(session, target)
+    assert len(result.added) > 0
+    assert torch.allclose(session.steps[0].told.c2w.float(), HOLES[0].c2w, atol=1e-6)
+    assert torch.equal(session.place.read(session.steps[0].told).c2w, result.target.c2w)
+    live.Saver(ready).save(session)
+    assert the_same_as_complete(monkeypatch, ready, tmp_path, "--scene", options.scene)
+
+
+def test_the_frames_that_were_chosen_are_named(room, tmp_path):
+    ready = live.prepare(options_for(room, tmp_path / "out", context=None), QUIET)
+    assert ready.options.context == tuple(view.frame for view in ready.task.views)
+    assert len(ready.options.context) >= 2
+
+
+def test_a_hole_is_found_where_something_is_missing(ready, begun):
+    camera = live.hole_of(ready, begun.now)
+    assert camera is not None
+    _, result = completed(begun, camera)
+    assert result.hole_fraction > 0.05
+
+
+@pytest.mark.parametrize("unit", [1.0, 25.0])
+def test_a_camera_of_the_page_is_the_one_it_was_made_of(unit):
+    camera = replace(camera_at(0.3, -0.2, 0.5, yaw=200, size=SIZE), near=0.5, far=8.0)
+    back = camera_of(pose_of(camera, unit), SIZE, SIZE, unit)
+    assert rotation_between(back, camera) < 1e-3
+    assert torch.allclose(back.center, camera.center, atol=1e-6)
+    assert torch.allclose(back.K, camera.K, rtol=1e-5)
+    assert unit_of(camera) == pytest.approx(1.5)
+    assert pose_of(camera, unit).fov == pytest.approx(2 * math.atan(0.5 / 0.9))
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
+def test_a_splat_of_any_unit_survives_the_pages_precision(unit):
+    gaussians = random_gaussians(100)
+    scaled = replace(gaussians, means=unit * gaussians.means, scales=unit * gaussians.scales)
+    splat = splat_of(scaled)
+    axes = Rotation.from_quat(gaussians.quats.numpy(), scalar_first=True).as_matrix()
+    true = axes @ (gaussians.scales.numpy()[:, :, None] ** 2 * axes.transpose(0, 2, 1))
+    shown = splat.covariances.astype(np.float16).astype(np.float64) * (splat.size / unit) ** 2
+    assert np.abs(shown - true).max() < 1e-3 * np.abs(true).max()
+    assert np.allclose(splat.centers * splat.size, scaled.means, rtol=1e-5)
+
+
+def test_a_tint_changes_colours_alone():
+    plain, tinted = splat_of(random_gaussians(10)), splat_of(random_gaussians(10), tinted=True)
+    assert np.abs(plain.rgbs - tinted.rgbs).max() > 0.1
+    assert np.array_equal(plain.covariances, tinted.covariances)
+
+
+def test_an_error_is_a_sentence_and_ends_nothing(capsys):
+    def mended() -> str:
+        raise InputError("Name another one.")
+
+    def broken() -> str:
+        raise ZeroDivisionError("division by zero")
+
+    assert answer(mended) == "Name another one."
+    assert "the scene is as it was" in answer(broken)
+    assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+@pytest.fixture
+def page(begun) -> Iterator[Page]:
+    subject = Subject(begun, begun.now.views, lambda _: None, lambda _: "Saved.")
+    page = Page(subject, "127.0.0.1", 0)
+    yield page
+    page.close()
+
+
+def test_what_was_generated_is_shown_tinted_or_hidden_and_undone(page, begun):
+    client, seen = Mock(spec=viser.ClientHandle), pose_of(HOLES[0], page._unit)
+    assert "Completed" in page.complete(client, seen)
+    assert len(page._targets) == 1
+    shown = page._generated.buffer.copy()
+    assert len(shown) == len(page.session.now.added)
+    page._look.value = "hide"
+    assert page._generated is None
+    page._look.value = "tint"
+    assert len(page._generated.buffer) == len(shown)
+    assert not np.array_equal(page._generated.buffer, shown)
+    assert "0 of what was completed are left" in page.undo(client, seen)
+    assert page.session == begun
+    assert page._generated is None
+    assert page._targets == []
+
+
+def test_photographs_near_a_camera_that_is_jumped_to_make_way(page):
+    client = MagicMock(spec=viser.ClientHandle, camera=Mock())
+    first, second = (pose_of(view.camera, page._unit) for view in page.subject.photographs)
+    assert not page._photographs[0].visible  # where browsers begin
+    page._jump(client, second)
+    assert np.array_equal(client.camera.position, second.position)
+    assert not page._photographs[1].visible
+    page._jump(client, replace(first, position=first.position - 5))
+    assert all(frustum.visible for frustum in page._photographs)
+
+
+def test_what_is_said_stays_text(page):
+    page.say("<b>A</b> & B\nmore")
+    assert "<b>&lt;b&gt;A&lt;/b&gt; &amp; B</b><br>more" in page._status.content
+
+
+def test_one_thing_is_done_at_a_time(page):
+    client = Mock(spec=viser.ClientHandle)
+    client.camera = Mock(wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=1.0)
+    event = Mock(spec=viser.GuiEvent, client=client)
+    page._ask(page.undo, event)
+    assert client.add_notification.call_count == 0
+    page._ask(page.undo, event)
+    assert client.add_notification.call_count == 1
+    assert page._requests.qsize() == 1
+
+
+def test_a_port_that_is_taken_is_refused():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"port {port}"):
+            serving("127.0.0.1", port)
+
+
+def test_without_viser_a_sentence_says_what_to_install(room, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(live, "find_spec", lambda _: None)
+    assert run(monkeypatch, "live", room, "--out", tmp_path / "out") == 2
+    assert "pip install 'gscompleter[live]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_options_of_complete_are_those_of_live(room, tmp_path):
+    words = ["live", str(room), "--out", str(tmp_path / "out"), "--config", "paper"]
+    options = parsed([*words, "--config.registration.iterations", "7", "--seed", "3"])
+    asked = live.as_complete(options)
+    paper = CompleterConfig.paper()
+    registration = replace(paper.registration, iterations=7)
+    assert asked.config == replace(paper, registration=registration)
+    assert (asked.seed, asked.resolution, asked.target) == (3, (256, 256), ())
