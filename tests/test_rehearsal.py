@@ -98,7 +98,7 @@ def test_one_line_says_so_before_it_happens(marked):
         rehearsal.compile_kernels(["cpu"])
         rehearsal.compile_kernels(["cpu"])
     said = console.export_text()
-    assert said.startswith("Compiling kernels for this machine, once; about ")
+    assert said.startswith("compiling kernels for this machine, once: 0%, about ")
     assert said.count("\n") == 1
 
 

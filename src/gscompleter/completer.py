@@ -18,7 +18,7 @@ from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import project, same_camera, sample, slide, widened
 from gscompleter.masks import dilate
-from gscompleter.progress import stage_begins
+from gscompleter.progress import stage, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, load_renderer
 from gscompleter.stages.anchor import (
@@ -175,7 +175,8 @@ class GSCompleter:
         check_numbers(scene, len(targets))
         completion = self.begin(views, scene, witnesses)
         at_once = as_generator(self.generator).at_once
-        for start in range(0, len(targets), at_once):
+        counted_as = "target" if at_once == 1 else "group of targets"
+        for start in track(range(0, len(targets), at_once), counted_as):
             completion = self.advance_together(completion, targets[start : start + at_once])
         return completion
 
@@ -665,23 +666,23 @@ def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
 
 
 class Clock:
-    """Wall time by stage, and `total`."""
+    """Wall time by stage, and `total`. That a stage goes on is shown where anything is."""
 
     def __init__(self, stages: Sequence[str] = STAGES) -> None:
         self._start = time.perf_counter()
         self._seconds = dict.fromkeys(stages, 0.0)
 
     @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        stage_begins(stage)
+    def __call__(self, name: str) -> Iterator[None]:
         start = time.perf_counter()
         try:
-            yield
+            with stage(name):
+                yield
         finally:
             if torch.cuda.is_available():
                 torch.cuda.synchronize()
             spent = time.perf_counter() - start
-            self._seconds[stage] = self._seconds.get(stage, 0.0) + spent
+            self._seconds[name] = self._seconds.get(name, 0.0) + spent
 
     @property
     def seconds(self) -> dict[str, float]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from gscompleter.completer import Clock, GSCompleter
 from gscompleter.config import ExplorationConfig
 from gscompleter.geometry import same_camera
-from gscompleter.progress import track
+from gscompleter.progress import stage, track
 from gscompleter.stages.anchor import select_anchor
 from gscompleter.stages.candidates import (
     Candidate,
@@ -99,9 +99,10 @@ class Explorer:
         self, completion: Completion, cameras: Sequence[Camera], count: int, complete: Complete
     ) -> tuple[Completion, tuple[Choice, ...]]:
         """Choose a camera, complete the scene there, and choose again."""
-        offers, step = self.offers(completion, cameras)
+        with stage("finding targets"):
+            offers, step = self.offers(completion, cameras)
         chosen: list[Choice] = []
-        while len(chosen) < count:
+        for _ in track(range(count), "target"):
             choices = self.judged(completion, offers)
             choice = best(choices, [v.camera for v in completion.views], step, self.config)
             if choice is None:
@@ -128,10 +129,7 @@ class Explorer:
         """What there is to gain at each of `offers`, in the scene as it stands."""
         small = miniature(completion)
         anchors = [self.look(small, view.camera) for view in small.views]
-        return [
-            self.choice(small, anchors, offer)
-            for offer in track(offers, "looking for cameras to complete")
-        ]
+        return [self.choice(small, anchors, offer) for offer in track(offers, "finding targets")]
 
     def choice(
         self, completion: Completion, anchors: Sequence[Look], candidate: Candidate

@@ -18,7 +18,7 @@ import torch
 from gscompleter.generators import Request, load_generator
 from gscompleter.interpolation import smoothed
 from gscompleter.kernels.compiled import is_compiled, note_compiled
-from gscompleter.progress import tell
+from gscompleter.progress import expecting, stage
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.threads import threads
@@ -96,6 +96,8 @@ PARTS: dict[str, Callable[[str], None]] = {
 """The parts that have kernels, and how each is rehearsed. Of two processes the one that has the
 second to do takes about as long as the other with the first and the third."""
 
+COMPILING = "compiling kernels for this machine, once"
+"""What it is called while it goes on."""
 SECONDS = 30
 """About what all of them take together on one core."""
 
@@ -114,10 +116,9 @@ def compile_kernels(names: Sequence[str]) -> float | None:
         return None
     count = min(len(missing), threads())
     expected = SECONDS * len(missing) / len(PARTS) / count
-    tell(f"Compiling kernels for this machine, once; about {expected:.0f} s.")
     start = time.perf_counter()
     own, *others = (missing[i::count] for i in range(count))
-    with rehearsed_apart(others):
+    with expecting([(COMPILING, expected)]), stage(COMPILING), rehearsed_apart(others):
         for name in own:
             rehearse(name)
     return time.perf_counter() - start

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from gscompleter.benchmark.samples import Measured, Sample
+from gscompleter.progress import shown_on, track
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,9 @@ def in_rounds(tasks: Sequence[Task], tell: Callable[[str], None]) -> dict[str, M
         for task in tasks
         if number < task.repeats
     ]
-    for number, task in enumerate(turns, start=1):
-        sample = task.measure()
+    for number, task in enumerate(track(turns, "measuring"), start=1):
+        with shown_on(None):  # what is measured shows nothing
+            sample = task.measure()
         samples[task.name].append(sample)
         seconds, ratio = sample.seconds[task.stage], sample.ratios[task.stage]
         tell(f"{number}/{len(turns)} {task.name}: {seconds:.2f} s, {ratio:.1f} yardsticks")

@@ -38,7 +38,7 @@ from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError, quoted
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
-from gscompleter.progress import shown_on
+from gscompleter.progress import preparing, shown_on, stage
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.plots import PlotsNotAvailable
@@ -90,8 +90,9 @@ def run_bench(options: BenchOptions) -> None:
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
         manifest = chosen(manifest_of(options, Path(temporary)), options)
-        bench = prepared(options, Path(temporary))
         with shown_on(None if options.quiet else console):
+            with preparing("getting ready"):
+                bench = prepared(options, Path(temporary))
             report = measured(bench, manifest, told_on(console))
     if options.out is not None:
         write(report, options.out, options.overwrite, console)
@@ -200,7 +201,8 @@ def measured(bench: Bench, manifest: Manifest, tell: Callable[[str], None]) -> R
     names = names_of([*manifest.cases, *growing])
     if not bench.options.quick:
         tell(f"{manifest.cases[0].name}: once, uncounted")
-        bench.complete(manifest.cases[0])
+        with stage("warming up"):
+            bench.complete(manifest.cases[0])
     methods = method_tasks(bench, manifest.cases[0])
     found = in_rounds([*case_tasks(bench, names), *methods], tell)
     growth = [
@@ -254,7 +256,8 @@ def method_tasks(bench: Bench, case: BenchCase) -> list[Task]:
         return []
     start = start_of(case, bench.models, bench.device)
     if not bench.options.quick:
-        compared("full", start, bench.yardstick)
+        with stage("warming up"), shown_on(None):
+            compared("full", start, bench.yardstick)
 
     def task(name: str) -> Task:
         repeats = repeats_of(bench.options)

@@ -34,7 +34,7 @@ from gscompleter.completer import Clock
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import SUMMARY, check_output, output_folder
 from gscompleter.metrics.image import psnr
-from gscompleter.progress import shown_on
+from gscompleter.progress import preparing, shown_on, stage, track
 from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import Renderer, choose_device, load_renderer
 from gscompleter.reports.completion import save_brought
@@ -62,21 +62,25 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
     check_context(options)
     device = choose_device(options.device)
     renderer, clock = load_renderer(device), Clock(())
-    opened = open_scene(options, console)
-    task = read_photographs(options, opened, device)
     with shown_on(None if options.quiet else console):
+        opened = open_scene(options, console)
+        with preparing("reading photographs"):
+            task = read_photographs(options, opened, device)
         compile_kernels([device])
-    task = in_frame_of_splat(task, options.scene, options, opened)
-    task = with_working_range(task, renderer)
-    plan = f"judged by {len(task.views)} photographs on {device}, written to {quoted(options.out)}"
-    say(console, *found_out(options, opened, task), f"To do: {plan}.")
-    with output_folder(options.out, replaceable(options)) as folder:
-        with shown_on(None if options.quiet else console), clock("clean"):
-            taken = superfluous(splat_of(task), task.views, renderer, options.config)
-        settings = settings_of(options, options.config, targets={}, models={})
-        said = {"settings": settings, "device": device, **opened_as(options, opened, task)}
-        summary = said | scores(task, taken, renderer) | {"seconds": clock.seconds}
-        write(folder, task, taken, {"version": __version__, **summary})
+        with preparing("placing the scene"):
+            task = in_frame_of_splat(task, options.scene, options, opened)
+        task = with_working_range(task, renderer)
+        plan = f"judged by {len(task.views)} photographs on {device}"
+        plan += f", written to {quoted(options.out)}"
+        say(console, *found_out(options, opened, task), f"To do: {plan}.")
+        with output_folder(options.out, replaceable(options)) as folder:
+            with clock("clean"):
+                taken = superfluous(splat_of(task), task.views, renderer, options.config)
+            settings = settings_of(options, options.config, targets={}, models={})
+            said = {"settings": settings, "device": device, **opened_as(options, opened, task)}
+            summary = said | scores(task, taken, renderer) | {"seconds": clock.seconds}
+            with stage("writing"):
+                write(folder, task, taken, {"version": __version__, **summary})
     return summary
 
 
@@ -90,7 +94,7 @@ def scores(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str
     """How many Gaussians were taken out, and PSNR (dB) at the photographs before and after."""
     given = splat_of(task)
     rows = []
-    for view in task.views:
+    for view in track(task.views, "scores"):
         before, after = (
             psnr(renderer.render(scene, view.camera).image, view.image)
             for scene in (given, given[~taken])

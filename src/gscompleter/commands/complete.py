@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from gscompleter.commands.expected import expected
 from gscompleter.commands.exploring import (
     cameras_of,
     completed,
@@ -44,13 +45,16 @@ from gscompleter.config import CompleterConfig
 from gscompleter.explorer import Explorer
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
+from gscompleter.io.video import check_writer
 from gscompleter.metrics.coverage import coverage_of
-from gscompleter.progress import shown_on
+from gscompleter.progress import expecting, preparing, shown_on, stage
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.completion import Around, Target, write_report
 from gscompleter.reports.completion_page import completion_page
+from gscompleter.reports.film import NAME as FILM
+from gscompleter.reports.film import write_film
 from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
 from gscompleter.types import Camera, Completion, View
@@ -64,7 +68,7 @@ def run_completion(options: CompleteOptions) -> None:
             return
         summary, completion = complete_folder(options)
         if not options.quiet:
-            tell(summary, completion, options.out)
+            tell(summary, completion, options)
 
 
 def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completion]:
@@ -74,17 +78,24 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         InputError: anything about the input that the user can mend; nothing is written then but
             cameras that were found.
     """
+    if options.film:
+        check_writer()
     console = Console(stderr=True, quiet=options.quiet)
-    opened, task, explorer, before = prepared(options, console)
-    say(console, *understood(options, opened, task))
-    cameras = cameras_of(options, opened, task)
-    with output_folder(options.out, replaceable(options)) as folder:
-        with shown_on(None if options.quiet else console):
+    with shown_on(None if options.quiet else console):
+        opened, task, explorer, before = prepared(options, console)
+        say(console, *understood(options, opened, task))
+        cameras = cameras_of(options, opened, task)
+        expectation = expecting(expected(options, task, task.views[0].image.device.type))
+        with output_folder(options.out, replaceable(options)) as folder, expectation:
             completion, task = completed(options, task, cameras, explorer)
-        completion = replace(completion, seconds=total(completion.seconds, before))
-        done = Done(opened, task, cameras, completion)
-        summary = write_done(folder, options, done, explorer)
-        write_targets(folder, task)
+            completion = replace(completion, seconds=total(completion.seconds, before))
+            with stage("report"):
+                done = Done(opened, task, cameras, completion)
+                summary = write_done(folder, options, done, explorer)
+                write_targets(folder, task)
+            if options.film:
+                photographs = list(cameras.values())
+                write_film(folder, completion, photographs, explorer.completer.renderer)
     return summary, completion
 
 
@@ -103,7 +114,8 @@ class Done:
 def write_done(
     folder: Path, options: CompleteOptions, done: Done, explorer: Explorer
 ) -> dict[str, Any]:
-    """Write everything into `folder` but the cameras of the targets; returns the summary.
+    """Write everything into `folder` but the cameras of the targets and the film; returns the
+    summary.
 
     Raises:
         InputError: where a file cannot be written.
@@ -132,13 +144,13 @@ def plan_folder(options: CompleteOptions) -> None:
         InputError: as `complete_folder`.
     """
     console = Console(stderr=True, quiet=options.quiet)
-    opened, task, explorer, _ = prepared(options, console)
-    say(console, *understood(options, opened, task))
-    cameras = cameras_of(options, opened, task)
-    with output_folder(options.out, replaceable(options)) as folder:
-        with shown_on(None if options.quiet else console):
+    with shown_on(None if options.quiet else console):
+        opened, task, explorer, _ = prepared(options, console)
+        say(console, *understood(options, opened, task))
+        cameras = cameras_of(options, opened, task)
+        with output_folder(options.out, replaceable(options)) as folder:
             plan = planned(options, task, cameras, explorer)
-        write_targets(folder, plan.task)
+            write_targets(folder, plan.task)
     if not options.quiet:
         tell_plan(options, plan)
 
@@ -156,15 +168,18 @@ def prepared(
     check_targets(options)
     device = choose_device(options.device)
     opened = open_scene(options, console)
-    task = read_task(options, opened, device)
-    with shown_on(None if options.quiet else console):
-        compile_kernels((device, options.reconstructor, options.synthesis.name))
+    with preparing("reading photographs"):
+        task = read_task(options, opened, device)
+        if options.scene is not None:
+            task = with_witnesses(task, opened.photographs)
+    compile_kernels((device, options.reconstructor, options.synthesis.name))
     if options.scene is not None:
-        task = with_witnesses(task, opened.photographs)
-        task = in_frame_of_splat(task, options.scene, options, opened)
-    completer = completer_for(options, task.targets, device)
+        with preparing("placing the scene"):
+            task = in_frame_of_splat(task, options.scene, options, opened)
+    with preparing("loading models"):
+        completer = completer_for(options, task.targets, device)
     clock = Clock()
-    with clock("context"):
+    with preparing("depth range"), clock("context"):
         task = with_working_range(task, completer.renderer)
     return opened, task, Explorer(completer), clock.seconds
 
@@ -218,7 +233,7 @@ def models_of(options: CompleteOptions) -> dict[str, Any]:
     }
 
 
-def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
+def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOptions) -> None:
     """Say what was done: a row per camera, and where it lies."""
 
     def cell(value: float | None) -> str:
@@ -256,6 +271,8 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
         )
     if not summary["targets"]:
         console.print("No camera was found that has much to gain; nothing was completed.")
+    elif options.film:
+        console.print(f"On the way through the holes: {options.out / FILM}", soft_wrap=True)
     covered = summary["coverage"]
     console.print(
         f"From around the photographs {100 * covered['before']:.1f} % was covered before, and "
@@ -266,7 +283,7 @@ def tell(summary: Mapping[str, Any], completion: Completion, out: Path) -> None:
     seconds = summary["seconds"]["total"]
     console.print(
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
-        f"{out / 'completed.ply'}",
+        f"{options.out / 'completed.ply'}",
         soft_wrap=True,
     )
-    console.print(f"Before and after, on a page: {out / PAGE}", soft_wrap=True)
+    console.print(f"Before and after, on a page: {options.out / PAGE}", soft_wrap=True)

@@ -36,12 +36,18 @@ def run_convert(options: ConvertOptions) -> None:
         InputError: where A cannot be read, or B cannot be written or is there already.
     """
     # Here, so that `--help` does not wait for torch.
+    from rich.console import Console
+
+    from gscompleter.progress import preparing, shown_on
     from gscompleter.splats.formats import load_splat, save_splat, writable_format
 
     writable_format(options.out)
     check_free(options.out, options.overwrite)
-    gaussians = load_splat(options.source, options.drop_nonfinite)
-    save_splat(options.out, gaussians)
+    with shown_on(None if options.quiet else Console(stderr=True)):
+        with preparing("reading"):
+            gaussians = load_splat(options.source, options.drop_nonfinite)
+        with preparing("writing"):
+            save_splat(options.out, gaussians)
     if not options.quiet:
         generated = int((gaussians.generated > 0).sum())
         print(f"{len(gaussians):,} Gaussians, {generated:,} of them generated: {options.out}")

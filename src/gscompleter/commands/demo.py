@@ -86,7 +86,7 @@ def run_demo(options: DemoOptions) -> None:
         shown = strip([read_image(images / f"{name}.png") for name in names])
         write_image(folder / "before_after.png", shown)
     if not options.quiet:
-        tell(summary, completion, options.out / "completion")
+        tell(summary, completion, replace(asked, out=options.out / "completion"))
         Console(highlight=False).print(
             f"Before and after, beyond the left and the right camera: "
             f"{options.out / 'before_after.png'}",

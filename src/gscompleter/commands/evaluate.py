@@ -26,7 +26,7 @@ from gscompleter.data.datasets import Skipped, open_clips, usable
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.framing import check_resolution
 from gscompleter.errors import InputError, quoted
-from gscompleter.progress import shown_on
+from gscompleter.progress import preparing, shown_on
 from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import choose_device
 from gscompleter.reports.evaluation_page import evaluation_page
@@ -52,7 +52,9 @@ def run_evaluation(options: EvaluateOptions) -> None:
         check_resolution(working_size(options.resolution))
     skipped: list[Skipped] = []
     notes: list[str] = []
-    tasks = chosen_tasks(options, skipped, notes)
+    shown = None if options.quiet else console
+    with shown_on(shown), preparing("reading cases"):
+        tasks = chosen_tasks(options, skipped, notes)
     for note in dict.fromkeys(notes):
         console.print(note, markup=False, soft_wrap=True)
     tell_skipped(skipped, console)
@@ -65,13 +67,14 @@ def run_evaluation(options: EvaluateOptions) -> None:
         seed=options.seed,
         source=source_of(options),
     )
-    with shown_on(None if options.quiet else console):
+    with shown_on(shown):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.again)
-    console.print(f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}.")
-    # An empty shard, where there are more shards than cases, has nothing to show.
-    if counts.done + counts.failed + counts.skipped > 0:
-        show(options.out, options.quiet, num_rows=len(tasks) * len(methods))
+        told = f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}."
+        console.print(told)
+        # An empty shard, where there are more shards than cases, has nothing to show.
+        if counts.done + counts.failed + counts.skipped > 0:
+            show(options.out, options.quiet, num_rows=len(tasks) * len(methods))
 
 
 def source_of(options: EvaluateOptions) -> dict[str, Any]:
@@ -86,7 +89,8 @@ def source_of(options: EvaluateOptions) -> dict[str, Any]:
 
 def run_tables(options: TablesOptions) -> None:
     """Write the tables and plots of a run and print them."""
-    show(options.out, options.quiet, options.fid)
+    with shown_on(None if options.quiet else Console(stderr=True)):
+        show(options.out, options.quiet, options.fid)
 
 
 def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> None:
@@ -98,9 +102,10 @@ def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> N
     seen, there = None, rows_there(out)
     while seen is None or (there != seen and len(there) >= num_rows):
         seen = there
-        summary = tables(out, with_fid)
-        draw(summary, out, quiet)
-        write_page(out, evaluation_page(out))
+        with preparing("tables"):
+            summary = tables(out, with_fid)
+            draw(summary, out, quiet)
+            write_page(out, evaluation_page(out))
         there = rows_there(out)
     if not quiet:
         tell(summary, out)
@@ -126,7 +131,8 @@ def run_index(options: IndexOptions) -> None:
         raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
     skipped: list[Skipped] = []
     protocol = parse_protocol(options.protocol)
-    index = index_of(protocol, usable(open_clips(options.path), skipped))
+    with shown_on(None if options.quiet else Console(stderr=True)), preparing("reading clips"):
+        index = index_of(protocol, usable(open_clips(options.path), skipped))
     index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
     write_evaluation_index(options.out, index)
     console = Console(quiet=options.quiet, highlight=False)

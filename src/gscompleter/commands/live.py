@@ -69,8 +69,8 @@ def run_live(options: LiveOptions) -> None:
 
     console = Console(stderr=True, quiet=options.quiet)
     with saying_what_stays(options.out):
-        ready = prepare(options, console)
         with shown_on(None if options.quiet else console):
+            ready = prepare(options, console)
             session = begin(ready)
             photographs = photographs_of(ready)
         saver = Saver(ready)

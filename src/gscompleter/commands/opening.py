@@ -33,7 +33,6 @@ from gscompleter.io.files import SUMMARY
 from gscompleter.io.ply import drawable_rows
 from gscompleter.matching.depth_range import estimate_depth_range
 from gscompleter.memory import check_memory, images_that_fit
-from gscompleter.progress import shown_on
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.reports.completion import Brought, Target
 from gscompleter.splats.formats import format_of, load_splat
@@ -128,8 +127,7 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     if options.format is None and holds_photographs(folder) and recognised(folder) is None:
         refuse_other_exports(folder)
         ours = options.overwrite or os.path.isfile(poses / SUMMARY)
-        with shown_on(None if options.quiet else console):
-            found = find_poses(folder, poses, overwrite=ours)
+        found = find_poses(folder, poses, overwrite=ours)
         say(console, *found.notes)
         folder, number = poses, found.photographs
     given = open_photographs(folder, options.format, options.near, options.far)

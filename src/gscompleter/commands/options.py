@@ -136,6 +136,9 @@ class CompleteOptions(CompletingOptions):
     out: Path
     """Folder for completed.ply, generated.ply, context.ply, targets.json, images/, report.html,
     report.json and summary.json."""
+    film: bool = False
+    """Write film.mp4, too: about six seconds on the way through the holes, before and after side by
+    side."""
 
 
 @dataclass(frozen=True, kw_only=True)

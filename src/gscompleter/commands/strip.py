@@ -33,11 +33,15 @@ def run_strip(options: StripOptions) -> None:
         InputError: where nothing of it was given, or a file cannot be read or written.
     """
     # Here, so that `--help` does not wait for torch.
+    from rich.console import Console
+
+    from gscompleter.progress import preparing, shown_on
     from gscompleter.splats.formats import writable_format
     from gscompleter.splats.stripping import strip
 
     writable_format(options.out)
     check_free(options.out, options.overwrite)
-    given, generated = strip(options.completed, options.out)
+    with shown_on(None if options.quiet else Console(stderr=True)), preparing("stripping"):
+        given, generated = strip(options.completed, options.out)
     if not options.quiet:
         print(f"{given:,} Gaussians, {generated:,} generated ones taken out: {options.out}")

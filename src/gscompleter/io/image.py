@@ -49,10 +49,16 @@ def write_image(
     Raises:
         InputError: where the file cannot be written.
     """
-    values = image.detach().cpu().double().nan_to_num(nan=0.0).clamp(0, 1)
-    pixels = (values * 255 + 0.5).floor().to(torch.uint8).numpy()
     with replacing(path) as file:
-        Image.fromarray(pixels).save(file, format="PNG", compress_level=COMPRESSION)
+        Image.fromarray(as_pixels(image)).save(file, format="PNG", compress_level=COMPRESSION)
+
+
+def as_pixels(
+    image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"],
+) -> UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]:
+    """Values in [0, 1] as 8-bit pixels: clamped, rounded to the nearest, and NaN as black."""
+    values = image.detach().cpu().double().nan_to_num(nan=0.0).clamp(0, 1)
+    return (values * 255 + 0.5).floor().to(torch.uint8).numpy()
 
 
 def as_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:

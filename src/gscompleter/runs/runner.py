@@ -15,7 +15,7 @@ from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, load_generator
 from gscompleter.memory import check_memory
-from gscompleter.progress import shown_on, track
+from gscompleter.progress import shown_on, stage, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.runs.methods import Models, check_methods
@@ -122,8 +122,9 @@ def evaluate(
     jobs = [(task, name) for task in tasks[shard[0] :: shard[1]] for name in methods]
     missing = [job for job in jobs if is_missing(row_path(out, job[0].name, job[1]), again)]
     failed, current, prepared = 0, None, None
-    for task, method in track(missing, "Evaluating"):
-        with shown_on(None):  # one bar is enough
+    for task, method in track(missing, "evaluating"):
+        # What goes on inside would fill a log.
+        with stage(f"{task.name}, {method}"), shown_on(None):
             folder = task_folder(out, task.name)
             if prepared is None or task is not current:
                 current, prepared = task, attempt(partial(prepare, task, folder, config))

@@ -1,0 +1,231 @@
+"""The film of a completion: its way, its frames, and the file."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from command import run
+from gscompleter.errors import InputError
+from gscompleter.geometry import baseline_between, rotation_between
+from gscompleter.io.video import check_writer, write_video
+from gscompleter.progress import shown_on
+from gscompleter.render import load_renderer
+from gscompleter.reports.film import GAP, RATE, even, frame, frames, labelled, stops, write_film
+from gscompleter.reports.film_path import path_through, roll
+from gscompleter.types import Camera, Completion, DepthAffine, TargetCompletion, merge
+from scenes import Room, camera_at, half_a_room_of
+
+UP = torch.tensor([0.0, -1.0, 0.0])
+SIZE = 32
+
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+
+
+def pitched(camera: Camera, degrees: float) -> Camera:
+    """`camera` looking so much further down."""
+    angle = math.radians(degrees)
+    cos, sin = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[1, 0, 0], [0, cos, sin], [0, -sin, cos]])
+    c2w = camera.c2w.clone()
+    c2w[:3, :3] = c2w[:3, :3] @ turn.to(c2w)
+    return replace(camera, c2w=c2w)
+
+
+def on_a_circle(degrees: float) -> Camera:
+    """A camera that stands a unit away from (0, 0, 0), which it looks at."""
+    angle = math.radians(degrees)
+    return camera_at(math.sin(angle), 0, -math.cos(angle), -degrees, size=SIZE)
+
+
+@pytest.fixture(scope="module")
+def completion() -> Completion:
+    """A room of which the right half was added at a target beside the only photograph."""
+    camera = camera_at(size=SIZE)
+    view, context, right = half_a_room_of(Room(), camera)
+    target = camera_at(0.4, yaw=6, size=SIZE)
+    drawn = load_renderer("reference").render(context, target)
+    mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    made = TargetCompletion(target, drawn, drawn, mask, None, 0, False, DepthAffine(), right)
+    scene = merge([context, right])
+    return Completion(scene, context, (view,), (1.0,), (made,), {"total": 0.0})
+
+
+def decoded(path: Path) -> tuple[dict, np.ndarray]:
+    """What a file says of itself, and its frames [n, h, w, 3]."""
+    reader = imageio_ffmpeg.read_frames(str(path))
+    meta = next(reader)
+    width, height = meta["size"]
+    pixels = [np.frombuffer(f, np.uint8).reshape(height, width, 3) for f in reader]
+    return meta, np.stack(pixels)
+
+
+def test_the_way_leads_from_stop_to_stop():
+    cameras = [camera_at(size=SIZE), camera_at(1.0, yaw=20, size=SIZE), camera_at(1.0, 1.0)]
+    way = path_through(cameras, [], 12)
+    assert len(way) == 25
+    for number, stop in zip((0, 12, 24), cameras, strict=True):
+        assert baseline_between(way[number], stop) < 1e-5
+        assert rotation_between(way[number], stop) < 0.1
+
+
+def test_the_camera_rests_at_each_stop_and_jerks_nowhere():
+    way = path_through([camera_at(x, size=SIZE) for x in (0.0, 1.0, 0.0)], [], 48)
+    steps = torch.tensor([baseline_between(a, b) for a, b in pairwise(way)])
+    fastest = steps.max().item()
+    assert fastest < 2 / 48  # twice as fast as on the average, at most
+    assert max(steps[k].item() for k in (0, 47, 48, 95)) < 0.1 * fastest
+    assert (steps[1:] - steps[:-1]).abs().max().item() < 0.15 * fastest
+
+
+def test_the_horizon_stays_level_between_level_cameras():
+    first, second = (pitched(camera_at(yaw=y, size=SIZE), 30) for y in (-40, 40))
+    way = path_through([first, second], [pitched(camera_at(yaw=0, size=SIZE), -20)], 24)
+    assert max(abs(roll(camera, UP)) for camera in way) < 1e-3
+
+
+def test_the_way_goes_around_what_was_photographed_and_not_through_it():
+    photographs = [on_a_circle(degrees) for degrees in range(-90, 91, 15)]
+    ends = [on_a_circle(-90), on_a_circle(90)]
+    around, straight = path_through(ends, photographs, 48), path_through(ends, [], 48)
+    assert min(camera.center.norm().item() for camera in around) > 0.9
+    assert min(camera.center.norm().item() for camera in straight) < 0.1
+
+
+def test_sides_are_even():
+    camera = even(replace(camera_at(size=SIZE), width=33, height=31))
+    assert (camera.width, camera.height) == (32, 30)
+
+
+def test_the_film_starts_at_the_nearest_photograph(completion):
+    (view,) = completion.views
+    far = replace(view, camera=camera_at(-2.0, size=SIZE))
+    first, target = stops(replace(completion, views=(far, view)))
+    assert torch.equal(first.c2w, view.camera.c2w)
+    assert torch.equal(target.c2w, completion.targets[0].target.c2w)
+
+
+def test_a_frame_shows_before_and_after_side_by_side(completion):
+    picture = frame(completion, completion.views[0].camera, load_renderer("reference"))
+    assert picture.shape == (SIZE, 2 * SIZE + GAP, 3)
+    before, gap, after = np.split(picture, (SIZE, SIZE + GAP), axis=1)
+    assert (gap == 255).all()
+    below = slice(SIZE - 8, SIZE)  # of the labels
+    known, hole = slice(0, SIZE // 2 - 4), slice(SIZE // 2 + 4, SIZE)
+    assert np.abs(before[below, known].astype(int) - after[below, known]).max() <= 2
+    assert before[below, hole].max() < 30 < after[below, hole].max(axis=-1).min()
+
+
+def test_a_label_can_be_read_on_black_and_on_white():
+    for shade in (0, 255):
+        picture = labelled(np.full((256, 256, 3), shade, dtype=np.uint8), "before")
+        changed = np.abs(picture.astype(int) - shade).max(axis=-1) > 0
+        where = picture[changed]
+        assert 0.001 < changed.mean() < 0.05
+        assert where.max() > 240
+        assert shade == 0 or np.median(where) < 120  # of a dark field
+
+
+def test_the_way_back_is_the_way_there(completion):
+    cameras = [camera_at(x, size=SIZE) for x in (0.0, 0.1, 0.2, 0.3)]
+    drawn = list(frames(completion, cameras, load_renderer("reference")))
+    assert len(drawn) == 6
+    assert all((a == b).all() for a, b in zip(drawn[1:], drawn[:0:-1], strict=True))
+
+
+def test_the_file_holds_the_frames(tmp_path):
+    rows, columns = np.mgrid[0:48, 0:64]
+    shown = [
+        np.stack([rows * 4, columns * 3, np.full_like(rows, 20 * k)], -1).astype(np.uint8)
+        for k in range(10)
+    ]
+    write_video(tmp_path / "a.mp4", shown, RATE)
+    meta, found = decoded(tmp_path / "a.mp4")
+    assert (meta["codec"], meta["fps"], meta["size"]) == ("h264", RATE, (64, 48))
+    assert meta["pix_fmt"].startswith("yuv420p")
+    assert found.shape == (10, 48, 64, 3)
+    assert np.abs(found.astype(int) - np.stack(shown)).mean() < 0.02 * 255
+
+
+def test_a_player_meets_the_index_first(tmp_path):
+    write_video(tmp_path / "a.mp4", [np.zeros((16, 16, 3), np.uint8)] * 3, RATE)
+    content = (tmp_path / "a.mp4").read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+
+
+def test_a_film_that_cannot_be_written_says_so(tmp_path):
+    picture = np.zeros((16, 16, 3), np.uint8)
+    with pytest.raises(InputError, match="ffmpeg could not write"):
+        write_video(tmp_path / "no such folder" / "a.mp4", [picture] * 200, RATE)
+
+
+def test_whoever_stops_it_leaves_no_ffmpeg_behind(tmp_path, monkeypatch):
+    import subprocess
+
+    started = []
+    popen = subprocess.Popen
+
+    def noted(*arguments, **named):
+        started.append(popen(*arguments, **named))
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", noted)
+
+    def stopped():
+        yield np.zeros((16, 16, 3), np.uint8)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "a.mp4", stopped(), RATE)
+    assert started[-1].poll() is not None
+
+
+def test_no_film_without_a_target(completion, tmp_path):
+    nothing = replace(completion, scene=completion.context, targets=())
+    write_film(tmp_path, nothing, [completion.views[0].camera], load_renderer("reference"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_same_completion_gives_the_same_bytes(completion, tmp_path):
+    renderer, photographs = load_renderer("cpu"), [view.camera for view in completion.views]
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        with shown_on(None):
+            write_film(tmp_path / name, completion, photographs, renderer)
+    first, second = ((tmp_path / name / "film.mp4").read_bytes() for name in ("a", "b"))
+    assert first == second
+    _, found = decoded(tmp_path / "a" / "film.mp4")
+    assert found.shape == (144, SIZE, 2 * SIZE + GAP, 3)
+
+
+SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "--far", 20)
+
+
+def test_a_completion_writes_a_film_where_it_is_asked(room, tmp_path, monkeypatch, capfd):
+    out = tmp_path / "out"
+    assert run(monkeypatch, "complete", room, *SMALL, "--film", "--out", out) == 0
+    meta, found = decoded(out / "film.mp4")
+    assert meta["size"] == (68, 32)
+    assert len(found) == 144
+    said = capfd.readouterr()
+    assert "film 1 of 73" in said.err
+    assert str(out / "film.mp4") in said.out
+
+
+def test_without_the_extra_nothing_is_begun(room, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr("gscompleter.io.video.find_spec", lambda name: None)
+    with pytest.raises(InputError, match="imageio-ffmpeg"):
+        check_writer()
+    assert run(monkeypatch, "complete", room, *SMALL, "--film", "--out", tmp_path / "out") == 2
+    said = capsys.readouterr().err
+    assert "pip install gscompleter[film]" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
