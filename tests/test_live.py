@@ -27,8 +27,9 @@ from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.frames.similarity import similarity
 from gscompleter.geometry import rotation_between
-from gscompleter.live.page import Page, Subject, answer, outcome, serving
+from gscompleter.live.page import Page, Subject, answer, outcome
 from gscompleter.live.poses import camera_of, pose_of, unit_of
+from gscompleter.live.serving import serving
 from gscompleter.live.session import Session, completed, undone
 from gscompleter.live.splat import splat_of
 from gscompleter.progress import stages_heard_by
@@ -279,3 +280,19 @@ def test_the_options_of_complete_are_those_of_live(room, tmp_path):
     registration = replace(paper.registration, iterations=7)
     assert asked.config == replace(paper, registration=registration)
     assert (asked.seed, asked.resolution, asked.target) == (3, (256, 256), ())
+
+
+def test_pages_from_elsewhere_are_refused():
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    server = serving("127.0.0.1", 0)
+    try:
+        address = f"ws://127.0.0.1:{server.get_port()}"
+        for origin in ("http://elsewhere.example", "http://127.0.0.1.elsewhere.example", "null"):
+            with pytest.raises(InvalidStatus, match="403"):
+                connect(address, origin=origin, subprotocols=["viser-v0"], max_size=None)
+        own = f"http://localhost:{server.get_port()}"
+        connect(address, origin=own, subprotocols=["viser-v0"], max_size=None).close()
+    finally:
+        server.stop()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import socket
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -21,6 +20,7 @@ import viser
 from gscompleter.completer import NOTHING_ADDED, STAGES
 from gscompleter.errors import InputError
 from gscompleter.live.poses import DISTANCE, Pose, camera_of, pose_of, unit_of
+from gscompleter.live.serving import serving
 from gscompleter.live.session import Session, completed, undone
 from gscompleter.live.splat import splat_of
 from gscompleter.progress import stages_heard_by
@@ -273,23 +273,6 @@ def frustum_length(photographs: Sequence[View], unit: float) -> float:
     """How long the pyramids are that show cameras, in units of the page."""
     apart = spacing([view.camera for view in photographs]) * unit
     return min(FRUSTUM, SHARE_OF_STEP * apart) if apart > 0 else FRUSTUM
-
-
-def serving(host: str, port: int) -> viser.ViserServer:
-    """A server at an address; it runs in threads of its own.
-
-    Raises:
-        InputError: where the address cannot be had.
-    """
-    try:
-        socket.create_server((host, port)).close()
-    except OSError as error:
-        raise InputError(
-            f"Nothing can be served at {host}, port {port}: {error.strerror}; choose another port.",
-            "port",
-        ) from error
-    with redirect_stdout(StringIO()):  # viser prints a box of its own
-        return viser.ViserServer(host, port, verbose=False)
 
 
 def answer(request: Callable[[], str]) -> str:
