@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
@@ -18,14 +17,13 @@ from gscompleter.data.origin import frame_from_photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import quoted
 from gscompleter.explorer import Explorer
-from gscompleter.frames.similarity import moved_camera
+from gscompleter.frames.similarity import moved_camera, moved_exactly
+from gscompleter.io.files import TARGETS
 from gscompleter.metrics.coverage import Look, held_out_cameras, looks_of
 from gscompleter.reports.completion import Target
 from gscompleter.stages.exploration import Choice
 from gscompleter.types import Camera, Completion
 
-TARGETS = "targets.json"
-"""The file of the output with the cameras that are completed."""
 LIFTED_VIEWS = 3
 """What completing a camera takes, in photographs of the context: its wider image and the anchor's
 are reconstructed, and the result is registered and fitted. 1.8 to 3.3 were measured
@@ -142,7 +140,7 @@ def write_targets(folder: Path, task: Task) -> None:
     if not task.targets:
         return
     back = np.linalg.inv(task.frame)
-    write_cameras(folder / TARGETS, [as_given(target.camera, back) for target in task.targets])
+    write_cameras(folder / TARGETS, [moved_exactly(t.camera, back) for t in task.targets])
 
 
 def looks_around(
@@ -151,8 +149,3 @@ def looks_around(
     """The scene before and after, as cameras around `cameras` see it."""
     aside = held_out_cameras(list(cameras), options.seed)
     return looks_of(completion, aside, explorer.completer.renderer)
-
-
-def as_given(camera: Camera, transform: Float[np.ndarray, "4 4"]) -> Camera:
-    """A camera in the frame that `transform` leads to, in float64: maps have large coordinates."""
-    return moved_camera(replace(camera, c2w=camera.c2w.double()), transform)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from gscompleter.commands.complete import Done, prepared, write_done
-from gscompleter.commands.exploring import TARGETS, cameras_of
+from gscompleter.commands.exploring import cameras_of
 from gscompleter.commands.opening import Opened, Task, say
 from gscompleter.commands.options import (
     CompleteOptions,
@@ -26,7 +26,7 @@ from gscompleter.completer import total
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError, quoted
 from gscompleter.explorer import Explorer
-from gscompleter.io.files import output_folder
+from gscompleter.io.files import TARGETS, output_folder
 from gscompleter.live.session import Place, Session
 from gscompleter.progress import shown_on
 from gscompleter.reports.completion import Target

@@ -94,16 +94,13 @@ def exhibit_of(options: ViewOptions) -> Exhibit:
     from dataclasses import replace
 
     from gscompleter.viewer.exhibit import (
-        SAME,
         camera_shots,
         exhibit_of_completion,
         exhibit_of_files,
         is_completion,
-        place_of_completion,
     )
 
-    completed = options.other is None and is_completion(options.scene)
-    if completed:
+    if options.other is None and is_completion(options.scene):
         exhibit = exhibit_of_completion(options.scene, options.drop_nonfinite)
     elif options.other is None:
         exhibit = exhibit_of_files(options.scene, None, options.drop_nonfinite)
@@ -111,8 +108,7 @@ def exhibit_of(options: ViewOptions) -> Exhibit:
         exhibit = exhibit_of_files(options.other, options.scene, options.drop_nonfinite)
     if options.cameras is None:
         return exhibit
-    place = place_of_completion(options.scene) if completed else SAME
-    shots = camera_shots(options.cameras, options.resolution, place)
+    shots = camera_shots(options.cameras, options.resolution, exhibit.place)
     return replace(exhibit, shots=(*exhibit.shots, *shots))
 
 

@@ -57,6 +57,11 @@ def moved_camera(camera: Camera, transform: Matrix) -> Camera:
     return replace(camera, c2w=c2w, near=near, far=far)
 
 
+def moved_exactly(camera: Camera, transform: Matrix) -> Camera:
+    """The same in float64, for a file: maps have large coordinates."""
+    return moved_camera(replace(camera, c2w=camera.c2w.double()), transform)
+
+
 def moved_view(view: View, transform: Matrix) -> View:
     """A photograph, its camera and its measured depth in the frame that `transform` leads to."""
     if np.array_equal(transform, np.eye(4)):

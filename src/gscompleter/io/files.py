@@ -23,6 +23,10 @@ from gscompleter.io.unfinished import (
 
 SUMMARY = "summary.json"
 """The file that says a folder is complete: it leaves first and arrives last."""
+TARGETS = "targets.json"
+"""The file of a completion with the cameras that it was done for."""
+CONTEXT, COMPLETED = "context.ply", "completed.ply"
+"""The scene of a completion before and after."""
 
 _REPLACED = f"{MARK}replaced"
 """Where a draft keeps what it replaces. Once it is there, the draft is complete."""

@@ -15,7 +15,8 @@ from gscompleter.data.framing import Resolution
 from gscompleter.data.origin import frame_from_photographs
 from gscompleter.data.scene import load_cameras, write_cameras
 from gscompleter.errors import InputError
-from gscompleter.frames.similarity import moved_camera
+from gscompleter.frames.similarity import moved_camera, moved_exactly
+from gscompleter.io.files import TARGETS
 from gscompleter.types import Camera, Completion, TargetCompletion
 
 
@@ -35,13 +36,12 @@ class Place:
 
     def told(self, camera: Camera) -> Camera:
         """A camera of the result in the frame of the photographs, in float64."""
-        given = replace(camera, c2w=camera.c2w.double())
-        return moved_camera(given, np.linalg.inv(self.frame))
+        return moved_exactly(camera, np.linalg.inv(self.frame))
 
     def read(self, told: Camera) -> Camera:
         """The camera of the result that a file with `told` names."""
         with TemporaryDirectory() as folder:
-            path = Path(folder) / "targets.json"
+            path = Path(folder) / TARGETS
             write_cameras(path, [told])
             (camera,) = load_cameras(path, self.resolution, origin=self.origin.tolist())
         return moved_camera(camera, self.frame @ frame_from_photographs(-self.origin))

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter import __version__
+from gscompleter.io.files import COMPLETED, CONTEXT
 from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
 from gscompleter.metrics.coverage import Look
@@ -177,9 +178,9 @@ def write_report(
         for target, result in zip(targets, completion.targets, strict=True)
     ]
     summary = summarize(completion, targets, context_images, target_images, said)
-    save_ply(folder / "context.ply", completion.context)
+    save_ply(folder / CONTEXT, completion.context)
     if brought is None:
-        save_ply(folder / "completed.ply", completion.scene, provenance=True)
+        save_ply(folder / COMPLETED, completion.scene, provenance=True)
     else:
         context, scene = completion.context, completion.scene
         save_brought(folder, context, scene, completion.set_aside, brought)
@@ -241,7 +242,7 @@ def save_brought(
     """
     kept = brought.kept
     if aside is None or not aside.any():
-        save_like(folder / "completed.ply", scene, brought.path, kept)
+        save_like(folder / COMPLETED, scene, brought.path, kept)
         return
     rows = torch.nonzero(aside.cpu())[:, 0]
     removed = context[aside].to("cpu")
@@ -249,7 +250,7 @@ def save_brought(
     stays = ~aside.cpu()
     if kept is not None:
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
-    save_like(folder / "completed.ply", scene, brought.path, stays)
+    save_like(folder / COMPLETED, scene, brought.path, stays)
 
 
 def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:

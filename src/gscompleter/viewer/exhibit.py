@@ -20,21 +20,21 @@ from gscompleter.data.origin import frame_from_photographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.errors import InputError, quoted
 from gscompleter.frames.similarity import moved_camera
-from gscompleter.io.files import SUMMARY
+from gscompleter.io.files import COMPLETED, CONTEXT, SUMMARY, TARGETS
 from gscompleter.io.image import read_pixels
 from gscompleter.io.json_file import read_json
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.sog import META
 from gscompleter.types import Camera, Gaussians
 
-TARGETS = "targets.json"
-"""The file of a completion with the cameras that it was done for."""
-BEFORE, AFTER = "context.ply", "completed.ply"
-"""The scenes of a completion."""
 THUMBNAIL_SIDE = 160
 """Pixels of the longer side of a thumbnail, which is shown at half of that on fine screens."""
 THUMBNAIL_QUALITY = 80
 """Of the JPEG that a thumbnail is."""
+
+
+Summary = Mapping[str, Any]
+"""What lies in `summary.json`, whatever that is."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,8 @@ class Exhibit:
     shots: tuple[Shot, ...] = ()
     remarks: tuple[str, ...] = ()
     """What is missing of it, a sentence each."""
+    place: Place = SAME
+    """Where the frame lies that further cameras are given in."""
 
 
 def exhibit_of_files(after: Path, before: Path | None, drop_nonfinite: bool) -> Exhibit:
@@ -108,24 +110,35 @@ def exhibit_of_completion(folder: Path, drop_nonfinite: bool) -> Exhibit:
     Raises:
         InputError: where the folder is not one of `complete`, or a file cannot be read.
     """
-    missing = [name for name in (AFTER, BEFORE, SUMMARY) if not (folder / name).is_file()]
+    missing = [name for name in (COMPLETED, CONTEXT, SUMMARY) if not (folder / name).is_file()]
     if missing:
         raise InputError(
             f"{quoted(folder)} has no {missing[0]}; name a folder that a completion was written "
             "to, or a file of Gaussians."
         )
-    before, after = (load_splat(folder / name, drop_nonfinite) for name in (BEFORE, AFTER))
-    place = place_of_completion(folder)
-    targets, remarks = target_shots(folder, place), []
+    before, after = (load_splat(folder / name, drop_nonfinite) for name in (CONTEXT, COMPLETED))
+    summary = summary_in(folder)
+    place = place_of_completion(folder, summary)
+    targets, remarks = target_shots(folder, summary, place), []
     try:
-        photographs = context_shots(folder, place)
+        photographs = context_shots(summary, place)
     except InputError:
-        photographs, remarks = (), [_lost(folder)]
+        photographs, remarks = (), [_lost(summary)]
     name = folder.resolve().name
-    return Exhibit(name, after, before, (*targets, *photographs), tuple(remarks))
+    return Exhibit(name, after, before, (*targets, *photographs), tuple(remarks), place)
 
 
-def target_shots(folder: Path, place: Place) -> tuple[Shot, ...]:
+def summary_in(folder: Path) -> Summary:
+    """What a completion said of itself.
+
+    Raises:
+        InputError: where the file cannot be read.
+    """
+    content = read_json(folder / SUMMARY, "complete the scene again")
+    return content if isinstance(content, dict) else {}
+
+
+def target_shots(folder: Path, summary: Summary, place: Place) -> tuple[Shot, ...]:
     """The targets of a completion, with their pictures after it; none where it had none.
 
     Raises:
@@ -133,7 +146,7 @@ def target_shots(folder: Path, place: Place) -> tuple[Shot, ...]:
     """
     if not (folder / TARGETS).is_file():
         return ()
-    notes = notes_of(folder)
+    notes = notes_of(summary)
     cameras = load_cameras(folder / TARGETS, origin=place.origin.tolist())
     return tuple(
         Shot(
@@ -147,13 +160,12 @@ def target_shots(folder: Path, place: Place) -> tuple[Shot, ...]:
     )
 
 
-def context_shots(folder: Path, place: Place) -> tuple[Shot, ...]:
+def context_shots(summary: Summary, place: Place) -> tuple[Shot, ...]:
     """The photographs that a completion began with.
 
     Raises:
         InputError: where they are no more where they were, or cannot be read.
     """
-    summary = _summary(folder)
     settings, rows = _part(summary, "settings"), summary.get("context")
     photographs = open_photographs(str(settings.get("folder")), settings.get("format"))
     transform = place.transform @ frame_from_photographs(place.origin - photographs.origin)
@@ -193,13 +205,13 @@ def camera_shots(path: Path, resolution: Resolution, place: Place) -> tuple[Shot
     )
 
 
-def place_of_completion(folder: Path) -> Place:
+def place_of_completion(folder: Path, summary: Summary) -> Place:
     """Where the photographs' frame lies in that of a completion's scenes.
 
     Raises:
         InputError: where the summary does not tell it.
     """
-    frame = _part(_summary(folder), "frame")
+    frame = _part(summary, "frame")
     transform, origin = _numbers(frame.get("transform"), 4, 4), _numbers(frame.get("origin"), 3)
     if transform is None or origin is None or np.linalg.det(transform) <= 0:
         raise InputError(
@@ -209,9 +221,9 @@ def place_of_completion(folder: Path) -> Place:
     return Place(origin, transform @ frame_from_photographs(-origin))
 
 
-def notes_of(folder: Path) -> list[tuple[str, ...]]:
+def notes_of(summary: Summary) -> list[tuple[str, ...]]:
     """What a completion said of each of its targets."""
-    targets = _summary(folder).get("targets")
+    targets = summary.get("targets")
     rows = targets if isinstance(targets, list) else []
     notes = [row.get("notes") if isinstance(row, dict) else None for row in rows]
     return [tuple(map(str, said)) if isinstance(said, list) else () for said in notes]
@@ -238,13 +250,8 @@ def thumbnail_of(path: Path) -> bytes | None:
     return file.getvalue()
 
 
-def _summary(folder: Path) -> Mapping[str, Any]:
-    content = read_json(folder / SUMMARY, "complete the scene again")
-    return content if isinstance(content, dict) else {}
-
-
-def _lost(folder: Path) -> str:
-    source = _part(_summary(folder), "settings").get("folder")
+def _lost(summary: Summary) -> str:
+    source = _part(summary, "settings").get("folder")
     return (
         f"The photographs that the completion began with are not shown: {quoted(source)} does not "
         "hold them any more; name their cameras to jump to them."
