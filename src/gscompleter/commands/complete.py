@@ -57,6 +57,7 @@ from gscompleter.reports.film import NAME as FILM
 from gscompleter.reports.film import write_film
 from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
+from gscompleter.reports.plain_words import NO_TARGET
 from gscompleter.types import Camera, Completion, View
 
 
@@ -270,7 +271,7 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
             soft_wrap=True,
         )
     if not summary["targets"]:
-        console.print("No camera was found that has much to gain; nothing was completed.")
+        console.print(NO_TARGET)
     elif options.film:
         console.print(f"On the way through the holes: {options.out / FILM}", soft_wrap=True)
     covered = summary["coverage"]

@@ -18,6 +18,7 @@ from gscompleter.config.cleaning import CleaningConfig
 from gscompleter.config.settings import Seed, Settings
 
 Frame = Annotated[int, Interval(ge=0, lt=10**9)]
+Port = Annotated[int, Interval(ge=0, le=65535)]
 Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the most pixels of the longer side, or the photographs' own size."""
@@ -156,7 +157,7 @@ class LiveOptions(CompletingOptions):
     """Folder that the button Save writes, with the files that `complete` writes."""
     resolution: Size = (256, 256)
     """Height and width to work at, as `complete` has it. Smaller is faster."""
-    port: Annotated[int, Interval(ge=0, le=65535)] = 0
+    port: Port = 0
     """Port to serve at; any that is free if not given."""
     host: str = "127.0.0.1"
     """Address to serve at. Whoever reaches it can press the buttons; the default is this machine

@@ -7,17 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from annotated_types import Interval
 
 from gscompleter.commands.convert import check_free
+from gscompleter.commands.options import Port
 from gscompleter.config.settings import Settings
 from gscompleter.errors import InputError, quoted
 
 if TYPE_CHECKING:
     from gscompleter.viewer.exhibit import Exhibit
     from gscompleter.viewer.page import Page
-
-Port = Annotated[int, Interval(ge=0, le=65535)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,8 @@ PLACED = {
     "similarity": "The splat lay in a frame of its own; it was found by matching features.",
 }
 """By how the frame of a splat was found, what is said of it."""
+NO_TARGET = "No camera was found that has much to gain; nothing was completed."
+"""What is said of a completion without any target."""
 
 
 def about_target(row: TargetRow) -> list[str]:
@@ -79,7 +81,7 @@ def came_of_it(summary: Summary) -> Iterator[str]:
             f"{removed:,} of its Gaussians stood in the way and were set aside."
         )
     if not summary.targets:
-        yield "No camera was found that has much to gain; nothing was completed."
+        yield NO_TARGET
 
 
 def shown(value: float | None, digits: int = 2) -> str:
