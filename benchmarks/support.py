@@ -25,7 +25,13 @@ from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
 from gscompleter.splats.formats import load_splat
 from gscompleter.stages.context import depth_range_of_scene
-from gscompleter.stages.support import believed_alpha, difference, gather_evidence, support
+from gscompleter.stages.support import (
+    believed_alpha,
+    difference,
+    gather_evidence,
+    support,
+    weight_sums,
+)
 from gscompleter.types import Evidence, Gaussians, View
 
 LONG_SIDE = 320
@@ -56,15 +62,17 @@ def main() -> None:
 def find(scene: Gaussians, views: Sequence[View], trained: Sequence[int]) -> None:
     """How well support finds wrong pixels."""
     renderer, config = load_renderer("cpu"), SupportConfig()
-    evidence = gather_evidence(scene, views, renderer, config)
+    frozen_views = [renderer.freeze(scene, view.camera) for view in views]
+    evidence = gather_evidence(scene, views, frozen_views, config)
     for frame in sorted(set(range(len(views))) - set(trained)):
         view = views[frame]
-        drawn = renderer.render(scene, view.camera)
-        wrong = difference(drawn, view) > WRONG
+        frozen = frozen_views[frame]
+        wrong, sums = difference(frozen.context, view) > WRONG, weight_sums(frozen)
         areas = []
         for told in ([n for n in range(len(views)) if n != frame], list(trained)):
-            known = support(chosen(evidence, told), scene, view.camera, renderer, config)
-            areas.append(roc(believed_alpha(drawn, scene, known, view.camera, renderer), wrong))
+            told_of = chosen(evidence, told)
+            known = support(told_of, scene.means, sums, view.camera, config)
+            areas.append(roc(believed_alpha(frozen, known), wrong))
         share = wrong.float().mean().item()
         print(f"{frame}: wrong {share:.3f}, by all others {areas[0]:.3f}, trained {areas[1]:.3f}")
 

@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from gscompleter.geometry import at_depths, z_depths
 from gscompleter.kernels import rasterizer
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.render.cuda import CudaView
+from gscompleter.render.cuda import frozen_by
 from gscompleter.render.reference import ReferenceRenderer, ReferenceView
 from gscompleter.types import observed, sh_from_rgb
 from parity import assert_close
@@ -216,7 +217,7 @@ def test_only_tiles_that_something_new_touches_are_drawn(monkeypatch):
     found = opacity_gradient(frozen.plan(new), new.opacities)[1]
     assert drawn == [1, 1]
     assert found.abs() > 0
-    assert frozen.extended(replace(new, means=-new.means)) is frozen
+    assert frozen.extended(replace(new, means=-new.means)).frame is frozen.frame
     assert drawn == [1, 1]
 
 
@@ -417,7 +418,7 @@ def slopes_of(draw, values: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 def test_a_frozen_view_that_drops_what_its_camera_does_not_see_draws_the_same(name):
     beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
     context, new = merge([SCENES[name], beside]), random_gaussians(40, seed=5, sh_degree=1)
-    view = CudaView(SlowDrawing(), context, CAMERA)
+    view = frozen_by(SlowDrawing(), context, CAMERA)
     assert 0 < len(view.seen) < len(context) / 2 + 1
     assert view.seen.sh.shape[1] == 1
     plain = REFERENCE.freeze(context, CAMERA)
@@ -425,9 +426,26 @@ def test_a_frozen_view_that_drops_what_its_camera_does_not_see_draws_the_same(na
     assert torch.equal(view.context.image, plain.context.image)
 
 
+@pytest.mark.parametrize("freeze", [CPU.freeze, partial(frozen_by, SlowDrawing())])
+@pytest.mark.parametrize("name", ["harmonics", "strange"])
+def test_a_frozen_view_tells_what_it_shows_of_each_gaussian(name, freeze):
+    context, new = SCENES[name][::2], SCENES[name][1::2]
+    view = freeze(context, CAMERA).extended(new[:0]).extended(new)
+    plain = REFERENCE.freeze(merge([context, new]), CAMERA)
+    layers = torch.rand(
+        (CAMERA.height, CAMERA.width, 3), generator=torch.Generator().manual_seed(0)
+    )
+    ours, truth = view.sums(layers), plain.sums(layers)
+    assert (ours - truth).abs().max() <= ROUNDING * truth.abs().max()
+    assert truth.count_nonzero() > 0
+    colours = torch.rand((len(truth), 3), generator=torch.Generator().manual_seed(1))
+    ours, truth = view.repainted(colours), plain.repainted(colours)
+    assert (ours - truth).abs().max() <= ROUNDING * truth.abs().max()
+
+
 def test_a_frozen_view_of_nothing_draws_what_is_new():
     new = SCENES["random"]
-    view = CudaView(SlowDrawing(), new[:0], CAMERA)
+    view = frozen_by(SlowDrawing(), new[:0], CAMERA)
     assert torch.equal(view.composite(new).image, REFERENCE.render(new, CAMERA).image)
 
 

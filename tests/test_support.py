@@ -18,7 +18,7 @@ from gscompleter.stages.harm import squared_error
 from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.stereo import corrected, stereo_among
-from gscompleter.stages.support import believed_alpha, gather_evidence, pixel_sums, support
+from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
 from gscompleter.types import SceneContext, merge, sh_from_rgb
 from scenes import (
     Room,
@@ -51,6 +51,11 @@ def shreds():
 SHREDS = shreds()
 SCENE = merge([SURFACES, SHREDS])
 ARE_SHREDS = torch.arange(len(SCENE)) >= len(SURFACES)
+AT_TARGET = RENDERER.freeze(SCENE, TARGET)
+
+
+def frozen_at(views, scene=SCENE):
+    return [RENDERER.freeze(scene, view.camera) for view in views]
 
 
 class KnowingReconstructor:
@@ -68,9 +73,9 @@ def knowing(config=CompleterConfig()):
 
 
 def test_surfaces_are_supported_and_shreds_are_not():
-    evidence = gather_evidence(SCENE, VIEWS, RENDERER, SupportConfig())
-    found = support(evidence, SCENE, TARGET, RENDERER)
-    drawn = pixel_sums(SCENE, TARGET, RENDERER, torch.ones(SIZE, SIZE, 1))[:, 0] > 0.1
+    evidence = gather_evidence(SCENE, VIEWS, frozen_at(VIEWS), SupportConfig())
+    sums = weight_sums(AT_TARGET)
+    found, drawn = support(evidence, SCENE.means, sums, TARGET), sums > 0.1
     assert found[drawn & ~ARE_SHREDS].median() > 0.8
     # A few reach into the border of a photograph.
     assert found[drawn & ARE_SHREDS].quantile(0.9) < 0.1
@@ -79,7 +84,7 @@ def test_surfaces_are_supported_and_shreds_are_not():
 @pytest.mark.parametrize("exposure", [0.8, 1.25])
 def test_another_exposure_is_no_contradiction(exposure):
     views = [replace(VIEWS[0], image=(exposure * VIEWS[0].image).clamp(0, 1)), VIEWS[1], VIEWS[2]]
-    evidence = gather_evidence(SCENE, views, RENDERER, SupportConfig())
+    evidence = gather_evidence(SCENE, views, frozen_at(views), SupportConfig())
     assert evidence.agreement[evidence.areas[:, 0] > 0, 0].median() > 0.8
 
 
@@ -87,7 +92,7 @@ def test_a_photograph_of_something_else_contradicts():
     image = VIEWS[1].image.clone()
     image[:, : SIZE // 4] = 0.0
     views = [VIEWS[0], replace(VIEWS[1], image=image), VIEWS[2]]
-    evidence = gather_evidence(SCENE, views, RENDERER, SupportConfig())
+    evidence = gather_evidence(SCENE, views, frozen_at(views), SupportConfig())
     pixels, z = project(SCENE.means, PHOTOGRAPHS[1])
     shown = (evidence.areas[:, 1] > 0) & inside(pixels, z, PHOTOGRAPHS[1])
     left = pixels[:, 0] < SIZE // 4 - 4
@@ -97,7 +102,7 @@ def test_a_photograph_of_something_else_contradicts():
 
 
 def test_sums_of_weights_make_up_the_alpha():
-    sums = pixel_sums(SCENE, TARGET, RENDERER, torch.ones(SIZE, SIZE, 1))[:, 0]
+    sums = weight_sums(AT_TARGET)
     alpha = RENDERER.render(SCENE, TARGET).alpha.sum()
     assert torch.isclose(sums.sum(), alpha, rtol=1e-3)
 
@@ -181,10 +186,10 @@ def test_what_photographs_show_by_themselves_takes_the_place_of_what_is_doubted(
     in_the_way = gaussians_of(truth, 0.8 * truth.depth)[: SIZE * SIZE // 4]
     black = sh_from_rgb(torch.zeros(len(in_the_way), 3))
     scene = merge([SURFACES, replace(in_the_way, sh=black)])
-    drawn = RENDERER.render(scene, camera)
-    config = SupportConfig(max_difference=0.03)
-    found = support(gather_evidence(scene, VIEWS, RENDERER, config), scene, camera, RENDERER)
-    believed = believed_alpha(drawn, scene, found, camera, RENDERER)
+    frozen, config = RENDERER.freeze(scene, camera), SupportConfig(max_difference=0.03)
+    evidence, drawn = gather_evidence(scene, VIEWS, frozen_at(VIEWS, scene), config), frozen.context
+    found = support(evidence, scene.means, weight_sums(frozen), camera)
+    believed = believed_alpha(frozen, found)
     stereo = stereo_among(VIEWS, camera, drawn, KnowingReconstructor(), RENDERER, config)
     context = SceneContext(tuple(VIEWS), (), drawn, believed=believed)
     told = corrected(context, stereo)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig, RegistrationConfig
@@ -44,9 +44,9 @@ from gscompleter.stages.support import (
     believed_alpha,
     front,
     gather_evidence,
-    pixel_sums,
     shown,
     support,
+    weight_sums,
 )
 from gscompleter.types import (
     Camera,
@@ -201,15 +201,13 @@ class GSCompleter:
             near, far = working_range(views, scene, self.renderer)
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
-            context, gains, evidence = scene, None, None
+            context, gains = scene, None
             if context is None:
                 context, gains = init_context(self.reconstructor, views)
                 views = exposed_alike(views, gains)
-            elif witnesses is not None:
-                evidence = self.evidence(context, (*views, *others))
-            completion = Completion(
-                context, context, views, (), (), {}, others, gains=gains, evidence=evidence
-            )
+            completion = Completion(context, context, views, (), (), {}, others, gains=gains)
+            if scene is not None and witnesses is not None:
+                completion = replace(completion, evidence=self.evidence(completion))
             allowed = self.allowed_errors(completion)
         return replace(completion, allowed_errors=allowed, seconds=clock.seconds)
 
@@ -401,7 +399,7 @@ class GSCompleter:
     def as_believed(self, sight: Sight, frozen: FrozenView, view: View) -> Render:
         """The scene at a photograph, with alpha as far as photographs support it."""
         drawn = frozen.context
-        believed = self.believed(sight.completion, drawn, view.camera)
+        believed = self.believed(sight.completion, frozen, view.camera)
         return drawn if believed is None else replace(drawn, alpha=believed)
 
     def before_doubted(self, kept: Gaussians, sight: Sight) -> Gaussians:
@@ -409,7 +407,7 @@ class GSCompleter:
         if sight.believed is None or len(kept) == 0:
             return kept
         camera, scene = sight.window.wide, sight.completion.scene
-        nearest = front(scene, sight.frozen.context, camera, self.renderer)
+        nearest = front(scene, sight.frozen, camera)
         pixels, z = project(kept.means, camera)
         limit = sample(nearest[..., None], pixels, "nearest")[:, 0]
         drawn = sample(sight.frozen.context.alpha[..., None], pixels, "nearest")[:, 0] > 0.1
@@ -452,7 +450,7 @@ class GSCompleter:
             window,
             frozen,
             self.anchor(completion, window.target),
-            self.believed(completion, frozen.context, window.wide),
+            self.believed(completion, frozen, window.wide),
             self.stereo(completion, frozen.context, window),
         )
 
@@ -487,29 +485,34 @@ class GSCompleter:
             self.config.support,
         )
 
-    def believed(self, completion: Completion, drawn: Render, camera: Camera) -> Tensor | None:
-        """The alpha [h, w] of the scene as it stands, as far as photographs support what `camera`
-        sees; None where nothing is doubted."""
+    def believed(
+        self, completion: Completion, frozen: FrozenView, camera: Camera
+    ) -> Float[Tensor, "h w"] | None:
+        """The alpha of the scene as it stands, frozen at `camera`, as far as photographs support
+        what this sees; None where nothing is doubted."""
         if completion.evidence is None:
             return None
-        values = self.support(completion, completion.evidence, camera)
-        return believed_alpha(drawn, completion.scene, values, camera, self.renderer)
+        values = self.support(completion, completion.evidence, frozen, camera)
+        return believed_alpha(frozen, values)
 
     def support(
-        self, completion: Completion, evidence: Evidence, camera: Camera
+        self, completion: Completion, evidence: Evidence, frozen: FrozenView, camera: Camera
     ) -> Float[Tensor, "n"]:
-        """Support of the scene as it stands, as `camera` sees it; what was added has it all."""
-        config = self.config.support
-        values = support(evidence, completion.context, camera, self.renderer, config)
-        if completion.set_aside is not None:
-            values = values[~completion.set_aside]
-        return torch.cat([values, values.new_ones(len(completion.added))])
+        """Support of the scene as it stands, as `camera` sees it. What was added has it all, and so
+        has what it does not see."""
+        sums, means = weight_sums(frozen), completion.scene.means
+        seen = (sums[: completion.num_kept] > 0).nonzero()[:, 0]
+        known = evidence.of(rows_in_context(completion, seen))
+        values = support(known, means[seen], sums[seen], camera, self.config.support)
+        return torch.ones_like(sums).index_copy(0, seen, values)
 
-    def evidence(self, scene: Gaussians, views: Sequence[View]) -> Evidence | None:
-        """What the photographs show of a scene that was brought; None where nothing is doubted."""
+    def evidence(self, completion: Completion) -> Evidence | None:
+        """What the photographs show of a scene that was brought, before any target; None where
+        nothing is doubted."""
         if not self.config.support.doubts:
             return None
-        return gather_evidence(scene, views, self.renderer, self.config.support)
+        views, config = (*completion.views, *completion.witnesses), self.config.support
+        return gather_evidence(completion.scene, views, self.at(completion, views), config)
 
     def without_unsupported(self, sight: Sight) -> Sight:
         """`sight` once what covers its holes, and no photograph shows or needs, is set aside.
@@ -520,21 +523,27 @@ class GSCompleter:
         completion, config = sight.completion, self.config.support
         if completion.evidence is None or not completion.witnesses or config.keep_unsupported:
             return sight
-        camera, scene = sight.window.wide, completion.scene
-        in_holes = self.holes(sight)[..., None].float()
-        covering = pixel_sums(scene, camera, self.renderer, in_holes)[:, 0] > MIN_COVER
-        views = (*completion.views, *completion.witnesses)
-        unseen = shown(completion.evidence, completion.context, camera, self.renderer) < UNSEEN
-        if completion.set_aside is not None:
-            unseen = unseen[~completion.set_aside]
-        unseen = torch.cat([unseen, unseen.new_zeros(len(completion.added))])
-        doubtful = covering & unseen & (scene.generated == 0)
+        doubtful = self.unseen_in_holes(sight, completion.evidence)
         if not doubtful.any():
             return sight
-        taken = not_needed(scene, doubtful, views, self.renderer)
+        views = (*completion.views, *completion.witnesses)
+        taken = not_needed(completion.scene, doubtful, views, self.renderer)
         if not taken.any():
             return sight
         return self.sight(without(completion, taken), sight.window.target)
+
+    def unseen_in_holes(self, sight: Sight, evidence: Evidence) -> Bool[Tensor, "n"]:
+        """Which Gaussians of the scene as it stands cover holes and are shown by no photograph."""
+        completion, camera = sight.completion, sight.window.wide
+        scene, holes = completion.scene, self.holes(sight)
+        everywhere = torch.ones_like(sight.alpha)
+        layers = torch.stack([everywhere, holes.to(everywhere), 0 * everywhere], dim=-1)
+        sums, covering, _ = sight.frozen.sums(layers).unbind(-1)
+        of_context = (covering > MIN_COVER) & (scene.generated == 0)
+        rows = of_context[: completion.num_kept].nonzero()[:, 0]
+        known = evidence.of(rows_in_context(completion, rows))
+        unseen = shown(known, scene.means[rows], sums[rows], camera) < UNSEEN
+        return torch.zeros_like(of_context).index_fill(0, rows[unseen], True)
 
     def window(self, completion: Completion, target: Camera) -> Window:
         """The target and its wider camera, as wide as the generator can draw."""
@@ -570,13 +579,18 @@ def ranged(view: View, near: float, far: float) -> View:
 
 def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:
     """`completion` with more of its context set aside: `taken` of the Gaussians of its scene."""
-    num_kept = completion.num_kept
-    aside = torch.zeros(len(completion.context), dtype=torch.bool, device=taken.device)
-    if completion.set_aside is not None:
-        aside = completion.set_aside
-    rows = torch.nonzero(~aside)[:, 0][taken[:num_kept]]
+    aside = completion.set_aside
+    if aside is None:
+        aside = torch.zeros(len(completion.context), dtype=torch.bool, device=taken.device)
+    rows = rows_in_context(completion, taken[: completion.num_kept].nonzero()[:, 0])
     aside = aside.index_fill(0, rows, True)
     return replace(completion, scene=completion.scene[~taken], set_aside=aside)
+
+
+def rows_in_context(completion: Completion, rows: Int64[Tensor, "m"]) -> Int64[Tensor, "m"]:
+    """Which Gaussians of the context some are that the scene as it stands begins with."""
+    aside = completion.set_aside
+    return rows if aside is None else (~aside).nonzero()[:, 0][rows]
 
 
 def check_numbers(scene: Gaussians | None, num_targets: int) -> None:

@@ -149,8 +149,8 @@ class Explorer:
     def look(self, completion: Completion, camera: Camera) -> Look:
         """What a camera sees of a scene, in a small image."""
         camera = shrunk(completion.ranged(camera), self.config.side)
-        render = self.completer.renderer.render(completion.scene, camera)
-        believed = self.completer.believed(completion, render, camera)
+        frozen = self.completer.renderer.freeze(completion.scene, camera)
+        render, believed = frozen.context, self.completer.believed(completion, frozen, camera)
         alpha = render.alpha if believed is None else believed
         return Look(camera, render, hole_mask(alpha, self.completer.config.holes))
 

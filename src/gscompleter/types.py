@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Int64, Shaped, UInt8
 from torch import Tensor
 
 from gscompleter.coverage import COVERED
@@ -361,6 +361,10 @@ class Evidence:
     """How much of each Gaussian each photograph shows, in squared scene units."""
     agreement: Float[Tensor, "n k"]
     """How far the scene looks there as the photograph does, in [0, 1]; 0 where it shows nothing."""
+
+    def of(self, rows: Int64[Tensor, "m"]) -> Evidence:
+        """What they show of some of the Gaussians."""
+        return replace(self, areas=self.areas[rows], agreement=self.agreement[rows])
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,13 @@ class FrozenView(Protocol):
     def extended(self, new: Gaussians) -> FrozenView:
         """The view of context and `new`, in that order, both frozen."""
 
+    def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        """For each Gaussian of the context, the sum over the image of each layer times the
+        Gaussian's compositing weight."""
+
+    def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+        """The image of the context in other colours, from 0 up."""
+
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; differentiable in `new`."""
 

@@ -64,6 +64,10 @@ class CpuView:
     """The context alone."""
     depth_limits: Float32[ndarray, "tiles"]
     """z-depth behind which a tile shows nothing new."""
+    rows: Int32[ndarray, "splats"]
+    """Which Gaussian of the context each splat is."""
+    count: int
+    """How many Gaussians the context has."""
 
     @cached_property
     def context(self) -> Render:
@@ -73,8 +77,9 @@ class CpuView:
     def extended(self, new: Gaussians) -> CpuView:
         """The same as freezing context and `new` together, in that order."""
         added = self.viewpoint.bin(arrays_of(new), self.depth_limits).layer
+        count = self.count + len(new)
         if len(added.entries) == 0:
-            return self
+            return replace(self, count=count)
         frame = self.viewpoint.composite(self, added)
         used = np.zeros_like(frame.used)
         used[:, 0] = frame.used.sum(axis=1)
@@ -84,8 +89,32 @@ class CpuView:
         walked = (self.layer, added, frame.used, frame.full)
         lists = (tile_start, entries, depth_limits)
         self.viewpoint.share(rasterizer.merge_lists, len(used), *walked, *lists)
-        layer = joined(self.layer, added, tile_start, entries)
-        return CpuView(self.viewpoint, layer, frame._replace(used=used), depth_limits)
+        layer, kept = joined(self.layer, added, tile_start, entries)
+        rows = np.concatenate([self.rows[kept[0]], kept[1].astype(np.int32) + np.int32(self.count)])
+        frame = frame._replace(used=used)
+        return CpuView(self.viewpoint, layer, frame, depth_limits, rows, count)
+
+    def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        """By the backward pass alone: the frame that is kept tells what every pixel let through."""
+        nothing, itself = self.viewpoint.empty().layer, by_itself(self.layer)
+        frame = self.frame._replace(used=np.ascontiguousarray(self.frame.used[:, ::-1]))
+        slopes = (layers, torch.zeros_like(layers[..., 0]), torch.zeros_like(layers[..., 0]))
+        drawn = (nothing, itself, frame, slopes, rasterizer.OF_COLOUR)
+        values, written = self.viewpoint.composite_backward(*drawn)
+        values[~written] = 0
+        totals = np.zeros((self.count, 3), np.float32)
+        for channel in range(3):
+            totals[self.rows, channel] = np.bincount(
+                self.layer.entries, values[:, channel], minlength=len(self.rows)
+            )
+        return torch.from_numpy(totals)
+
+    def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+        """The lists that are kept, drawn once more."""
+        splats = self.layer.splats.copy()
+        splats[:, rasterizer.RED :] = np.maximum(float32(colours)[self.rows], 0)
+        frame = self.viewpoint.composite(self.viewpoint.empty(), self.layer._replace(splats=splats))
+        return torch.from_numpy(frame.image)
 
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; only `new` is projected, sorted and binned."""
@@ -190,7 +219,8 @@ class Viewpoint:
             np.zeros(self.tiles + 1, np.int64),
             np.empty(0, np.int32),
         )
-        return CpuView(self, layer, frame, np.full(self.tiles, np.inf, np.float32))
+        limits = np.full(self.tiles, np.inf, np.float32)
+        return CpuView(self, layer, frame, limits, np.empty(0, np.int32), 0)
 
     def bin(self, gaussians: GaussianArrays, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
         """Project the Gaussians, sort them and enter them into the lists of the tiles."""
@@ -409,9 +439,9 @@ def joined(
     new: Layer,
     tile_start: Int64[ndarray, "bounds"],
     entries: Int32[ndarray, "entries"],
-) -> Layer:
+) -> tuple[Layer, list[Int64[ndarray, "_"]]]:
     """The lists of both layers merged, and the splats that these name: the new ones are numbered
-    after those of the context."""
+    after those of the context. Also which splats of each layer those are."""
     named = np.zeros(len(context.splats) + len(new.splats), np.bool_)
     named[entries] = True
     numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
@@ -419,7 +449,13 @@ def joined(
     splats, opacities, boxes = (
         chosen(pair, rows) for pair in zip(context[:3], new[:3], strict=True)
     )
-    return Layer(splats, opacities, boxes, tile_start, numbers[entries])
+    return Layer(splats, opacities, boxes, tile_start, numbers[entries]), rows
+
+
+def by_itself(layer: Layer) -> Binned:
+    """A layer whose entries keep their gradients apart: each in its own slot."""
+    slots = np.arange(len(layer.entries), dtype=np.int32)
+    return Binned(layer, slots, np.zeros(1, np.int64))
 
 
 def chosen(arrays: Sequence[ndarray], rows: Sequence[Int64[ndarray, "_"]]) -> ndarray:

@@ -11,14 +11,15 @@ from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.geometry import at_depths
 from gscompleter.render import ColourRender, DepthRender, OpacityRender, Renderer
+from gscompleter.render.painting import painted, sums_by_slopes
 from gscompleter.render.spherical_harmonics import colours_from
-from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
+from gscompleter.types import Camera, Gaussians, Render, merge
 
 
 @runtime_checkable
@@ -59,7 +60,7 @@ class CudaRenderer:
         return Render(colour_and_depth[0, ..., :3], colour_and_depth[0, ..., 3], alpha[0, ..., 0])
 
     def freeze(self, context: Gaussians, camera: Camera) -> CudaView:
-        return CudaView(self, context, camera)
+        return frozen_by(self, context, camera)
 
     @torch.no_grad()
     def visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
@@ -138,6 +139,10 @@ class CudaView:
     drawing: Drawing
     scene: Gaussians
     camera: Camera
+    rows: Int64[Tensor, "m"]
+    """Which Gaussian of the context each of `scene` is."""
+    count: int
+    """How many Gaussians the context has."""
 
     @cached_property
     def context(self) -> Render:
@@ -146,16 +151,38 @@ class CudaView:
             return self.drawing.render(self.scene, self.camera)
 
     @cached_property
+    def reaching(self) -> Int64[Tensor, "seen"]:
+        """Which of `scene` reach the image."""
+        return self.drawing.visible(self.scene, self.camera).nonzero()[:, 0]
+
+    @cached_property
     def seen(self) -> Gaussians:
         """What of the context reaches the image, in the colours that this camera sees."""
-        kept = self.scene[self.drawing.visible(self.scene, self.camera)]
+        kept = self.scene[self.reaching]
         center = self.camera.center.to(kept.means.device)
         colours = colours_from(kept.sh, kept.means, center)
-        return replace(kept, sh=sh_from_rgb(colours), encoded=None)
+        return painted(kept, colours)
 
     def extended(self, new: Gaussians) -> CudaView:
         """The view of what is seen of the context, and of `new`."""
-        return replace(self, scene=merge([self.seen, new]))
+        numbers = self.count + torch.arange(len(new), device=self.rows.device)
+        rows = torch.cat([self.rows[self.reaching], numbers])
+        count = self.count + len(new)
+        return replace(self, scene=merge([self.seen, new]), rows=rows, count=count)
+
+    def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        """By the slopes of what is seen."""
+        sums = layers.new_zeros((self.count, 3))
+        return sums.index_copy(
+            0, self.rows[self.reaching], sums_by_slopes(self._painted, self.seen, layers)
+        )
+
+    def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+        """What is seen, drawn once more."""
+        return self._painted(colours[self.rows[self.reaching]])
+
+    def _painted(self, colours: Float[Tensor, "seen 3"]) -> Float[Tensor, "h w 3"]:
+        return self.drawing.render(painted(self.seen, colours), self.camera).image
 
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together."""
@@ -169,8 +196,14 @@ class CudaView:
 
     def plan_colours(self, new: Gaussians) -> ColourRender:
         """Context and `new` in other colours, all of it drawn anew."""
-        return lambda colours: self.composite(replace(new, sh=sh_from_rgb(colours), encoded=None))
+        return lambda colours: self.composite(painted(new, colours))
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Context and `new` at other depths, all of it drawn anew."""
         return lambda depths: self.composite(at_depths(new, self.camera, depths))
+
+
+def frozen_by(drawing: Drawing, context: Gaussians, camera: Camera) -> CudaView:
+    """The view of all of `context`."""
+    rows = torch.arange(len(context), device=context.means.device)
+    return CudaView(drawing, context, camera, rows, len(context))

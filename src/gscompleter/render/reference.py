@@ -15,8 +15,9 @@ from torch.utils.checkpoint import checkpoint
 
 from gscompleter.geometry import at_depths, rotations_from
 from gscompleter.render import ColourRender, DepthRender, OpacityRender, Renderer
+from gscompleter.render.painting import painted, sums_by_slopes
 from gscompleter.render.spherical_harmonics import colours_from
-from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
+from gscompleter.types import Camera, Gaussians, Render, merge
 
 BLUR = 0.3
 """Added to the 2D variances, in px²: a low-pass of about a pixel."""
@@ -72,6 +73,15 @@ class ReferenceView:
     def extended(self, new: Gaussians) -> ReferenceView:
         return replace(self, scene=merge([self.scene, new]))
 
+    def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        return sums_by_slopes(self._painted, self.scene, layers)
+
+    def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+        return self._painted(colours)
+
+    def _painted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+        return self.renderer.render(painted(self.scene, colours), self.camera).image
+
     def composite(self, new: Gaussians) -> Render:
         return self.renderer.render(merge([self.scene, new]), self.camera)
 
@@ -86,7 +96,7 @@ class ReferenceView:
         return lambda opacities: self.composite(replace(fixed, opacities=opacities))
 
     def plan_colours(self, new: Gaussians) -> ColourRender:
-        return lambda colours: self.composite(replace(new, sh=sh_from_rgb(colours), encoded=None))
+        return lambda colours: self.composite(painted(new, colours))
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         return lambda depths: self.composite(at_depths(new, self.camera, depths))

@@ -24,7 +24,7 @@ from gscompleter.progress import track
 from gscompleter.render import OpacityRender, Renderer
 from gscompleter.stages.harm import error_slope, error_with_loss
 from gscompleter.stages.setting_aside import error_of, without_needed
-from gscompleter.stages.support import pixel_sums
+from gscompleter.stages.support import weight_sums
 from gscompleter.types import Gaussians, View
 
 FADED = 0.02
@@ -139,8 +139,7 @@ def guarded(
         before = taken
         for view, error in zip(views, allowed, strict=True):
             if error_of(scene[~taken], view, renderer).item() > error:
-                layer = torch.ones((*view.image.shape[:2], 1), device=taken.device)
-                taken = taken & ~(pixel_sums(scene, view.camera, renderer, layer)[:, 0] > 0)
+                taken = taken & ~(weight_sums(renderer.freeze(scene, view.camera)) > 0)
     return taken
 
 

@@ -21,7 +21,7 @@ from gscompleter.reconstructors import Reconstructor
 from gscompleter.render import Renderer
 from gscompleter.stages.context import init_context
 from gscompleter.stages.selection import select_context
-from gscompleter.stages.support import believed_alpha, gather_evidence, support
+from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
 from gscompleter.types import Camera, Render, SceneContext, View
 
 NUM_VIEWS = 3
@@ -70,10 +70,11 @@ def stereo_among(
         scene, _ = init_context(reconstructor, [views[index] for index in chosen])
     except InputError:
         return None
-    evidence = gather_evidence(scene, views, renderer, config)
-    render = renderer.render(scene, camera)
-    values = support(evidence, scene, camera, renderer, config)
-    return Stereo(render, believed_alpha(render, scene, values, camera, renderer))
+    frozen_views = [renderer.freeze(scene, view.camera) for view in views]
+    evidence = gather_evidence(scene, views, frozen_views, config)
+    frozen = renderer.freeze(scene, camera)
+    values = support(evidence, scene.means, weight_sums(frozen), camera, config)
+    return Stereo(frozen.context, believed_alpha(frozen, values))
 
 
 def corrected(context: SceneContext, stereo: Stereo) -> SceneContext:

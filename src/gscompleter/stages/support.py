@@ -20,8 +20,8 @@ from torch.nn.functional import avg_pool2d, normalize
 from gscompleter.config import SupportConfig
 from gscompleter.generators.robust import robust_affine
 from gscompleter.geometry import z_depths
-from gscompleter.render import Renderer
-from gscompleter.types import SH_C0, Camera, Evidence, Gaussians, Render, View, observed
+from gscompleter.render import FrozenView
+from gscompleter.types import Camera, Evidence, Gaussians, Render, View
 
 BLUR = 0.01
 """Radius over which differences of colour, and support, are averaged, of the longer side of an
@@ -39,28 +39,28 @@ other does."""
 
 
 def gather_evidence(
-    scene: Gaussians, views: Sequence[View], renderer: Renderer, config: SupportConfig
+    scene: Gaussians, views: Sequence[View], frozen: Sequence[FrozenView], config: SupportConfig
 ) -> Evidence:
     """What photographs show of each Gaussian, and how far the scene looks like them there.
 
     Args:
         scene: The n Gaussians.
         views: The k photographs, whose cameras know the depth range.
-        renderer: Draws the scene.
+        frozen: The scene frozen at each of them.
         config: How different is too different.
     """
-    differences = [difference(renderer.render(scene, v.camera), v) for v in views]
+    differences = [difference(f.context, v) for f, v in zip(frozen, views, strict=True)]
     usual = torch.stack([d.median() for d in differences]).median().item()
     scale = config.max_difference * max(1.0, usual / EXACT)
-    columns = []
-    for view, different in zip(views, differences, strict=True):
+    areas = scene.means.new_empty((len(scene), len(views)))
+    agreement = torch.empty_like(areas)
+    for k, (view, different) in enumerate(zip(views, differences, strict=True)):
         agrees = torch.exp(-((different / scale) ** 2))
-        layers = torch.stack([torch.ones_like(agrees), agrees], dim=-1)
-        shown, agreeing = pixel_sums(scene, view.camera, renderer, layers).unbind(-1)
-        columns.append((shown * pixel_areas(scene, view.camera), agreeing / shown.clamp_min(1e-9)))
-    areas, agreement = zip(*columns, strict=True)
-    centers = torch.stack([view.camera.center for view in views])
-    return Evidence(centers, torch.stack(areas, dim=1), torch.stack(agreement, dim=1))
+        layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
+        sums, agreeing, _ = frozen[k].sums(layers).unbind(-1)
+        areas[:, k] = sums * pixel_areas(scene.means, view.camera)
+        agreement[:, k] = agreeing / sums.clamp_min(1e-9)
+    return Evidence(torch.stack([view.camera.center for view in views]), areas, agreement)
 
 
 def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
@@ -72,29 +72,29 @@ def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
 
 def support(
     evidence: Evidence,
-    scene: Gaussians,
+    means: Float[Tensor, "n 3"],
+    sums: Float[Tensor, "n"],
     camera: Camera,
-    renderer: Renderer,
     config: SupportConfig = SupportConfig(),
 ) -> Float[Tensor, "n"]:
     """How far the photographs support each Gaussian as `camera` sees it, in [0, 1].
 
     Args:
-        evidence: What the photographs show of `scene`.
-        scene: The n Gaussians.
+        evidence: What the photographs show of n Gaussians.
+        means: Where these are, in world coordinates.
+        sums: The sum of the compositing weights of each over the image of `camera`.
         camera: Who asks.
-        renderer: Draws the scene.
         config: From how far aside a photograph still tells something.
     """
-    rays = normalize(scene.means - camera.center, dim=-1)
-    agreeing, weights = torch.zeros_like(rays[:, 0]), torch.zeros_like(rays[:, 0])
+    rays = normalize(means - camera.center, dim=-1)
+    agreeing, weights = torch.zeros_like(sums), torch.zeros_like(sums)
     for k, center in enumerate(evidence.centers):
         rows = evidence.areas[:, k].nonzero()[:, 0]
-        turn = degrees_between(normalize(scene.means[rows] - center, dim=-1), rays[rows])
+        turn = degrees_between(normalize(means[rows] - center, dim=-1), rays[rows])
         weight = evidence.areas[rows, k] * (torch.exp(-((turn / config.max_turn) ** 2)) + LEAST)
         agreeing.index_add_(0, rows, weight * evidence.agreement[rows, k])
         weights.index_add_(0, rows, weight)
-    share = (shown(evidence, scene, camera, renderer) / ENOUGH).clamp_max(1.0)
+    share = (shown(evidence, means, sums, camera) / ENOUGH).clamp_max(1.0)
     return share * agreeing / weights.clamp_min(1e-20)
 
 
@@ -104,76 +104,51 @@ def degrees_between(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[T
 
 
 def shown(
-    evidence: Evidence, scene: Gaussians, camera: Camera, renderer: Renderer
+    evidence: Evidence, means: Float[Tensor, "n 3"], sums: Float[Tensor, "n"], camera: Camera
 ) -> Float[Tensor, "n"]:
     """How much of each Gaussian the photograph that shows most of it shows, as a share of what
-    `camera` sees; large where it sees nothing."""
-    layers = torch.ones((camera.height, camera.width, 1), device=scene.means.device)
-    needed = pixel_sums(scene, camera, renderer, layers)[:, 0] * pixel_areas(scene, camera)
+    `camera` sees; large where it sees nothing. The arguments are those of `support`."""
+    needed = sums * pixel_areas(means, camera)
     return evidence.areas.amax(dim=1) / needed.clamp_min(1e-20)
 
 
-def believed_alpha(
-    drawn: Render,
-    scene: Gaussians,
-    support: Float[Tensor, "n"],
-    camera: Camera,
-    renderer: Renderer,
-) -> Float[Tensor, "h w"]:
-    """Alpha of `scene` as `camera` sees it, each Gaussian counted by its support.
-
-    `drawn` is the same scene from the same camera.
-    """
-    return torch.minimum(blurred(composited(support, scene, camera, renderer)), drawn.alpha)
+def weight_sums(frozen: FrozenView) -> Float[Tensor, "n"]:
+    """The sum over the image of the compositing weights of each Gaussian of a frozen view."""
+    return frozen.sums(torch.ones_like(frozen.context.image))[:, 0]
 
 
-def front(
-    scene: Gaussians, drawn: Render, camera: Camera, renderer: Renderer
-) -> Float[Tensor, "h w"]:
+def believed_alpha(frozen: FrozenView, support: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+    """Alpha of a scene from a camera, each of its n Gaussians counted by its support."""
+    return torch.minimum(blurred(composited(support, frozen)), frozen.context.alpha)
+
+
+def front(scene: Gaussians, frozen: FrozenView, camera: Camera) -> Float[Tensor, "h w"]:
     """z-depth at which something new hides most of what `scene` shows, per pixel, in scene units.
 
     What is unsupported is seldom a surface. Something new stands `STANDOFF` standard deviations of
     depth before the mean: nearer, photographs from aside would see it stand before the scene.
+
+    Args:
+        scene: The Gaussians.
+        frozen: The same, frozen at `camera`.
+        camera: Who looks.
     """
-    z = z_depths(scene.means, camera).clamp_min(0.0)
+    drawn, z = frozen.context, z_depths(scene.means, camera).clamp_min(0.0)
     unit = drawn.depth.max().clamp_min(1e-12)
-    squares = composited((z / unit).clamp_max(2.0) ** 2, scene, camera, renderer)
+    squares = composited((z / unit).clamp_max(2.0) ** 2, frozen)
     mean = drawn.depth / unit
     spread = (squares / drawn.alpha.clamp_min(1e-6) - mean**2).clamp_min(0.0).sqrt()
     return unit * (mean - STANDOFF * spread).clamp_min(0.1 * mean)
 
 
-def composited(
-    values: Float[Tensor, "n"], scene: Gaussians, camera: Camera, renderer: Renderer
-) -> Float[Tensor, "h w"]:
-    """The sum over the Gaussians of compositing weight times value in [0, 1]."""
-    sh = ((values - 0.5) / SH_C0)[:, None, None].expand(-1, 1, 3)
-    return renderer.render(coloured(scene, sh), camera).image.mean(dim=-1)
+def composited(values: Float[Tensor, "n"], frozen: FrozenView) -> Float[Tensor, "h w"]:
+    """The sum over the Gaussians of compositing weight times value, from 0 up."""
+    return frozen.repainted(values[:, None].expand(-1, 3))[..., 0]
 
 
-def pixel_sums(
-    scene: Gaussians, camera: Camera, renderer: Renderer, layers: Float[Tensor, "h w c"]
-) -> Float[Tensor, "n c"]:
-    """The sum of each of up to three layers over the image, by the weights of each Gaussian.
-
-    A compositing weight is the slope of a pixel's colour in the colour of the Gaussian.
-    """
-    weights = torch.nn.functional.pad(layers, (0, 3 - layers.shape[-1]))
-    plan = renderer.freeze(scene[:0], camera).plan_colours(scene)
-    with torch.enable_grad():
-        colours = scene.means.new_full((len(scene), 3), 0.5).requires_grad_()
-        (slope,) = torch.autograd.grad((weights * plan(colours).image).sum(), colours)
-    return slope[:, : layers.shape[-1]]
-
-
-def coloured(scene: Gaussians, sh: Float[Tensor, "n 1 3"]) -> Gaussians:
-    """The same Gaussians in other colours."""
-    return observed(scene.means, scene.quats, scene.scales, scene.opacities, sh)
-
-
-def pixel_areas(scene: Gaussians, camera: Camera) -> Float[Tensor, "n"]:
+def pixel_areas(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n"]:
     """The area that a pixel covers at each Gaussian, in squared scene units."""
-    z = z_depths(scene.means, camera)
+    z = z_depths(means, camera)
     return z.clamp_min(0.0) ** 2 / (camera.K[0, 0] * camera.K[1, 1])
 
 

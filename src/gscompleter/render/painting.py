@@ -1,0 +1,36 @@
+"""The same Gaussians in other colours, which tells how much of each an image shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.types import Gaussians, sh_from_rgb
+
+
+def painted(gaussians: Gaussians, colours: Float[Tensor, "n 3"]) -> Gaussians:
+    """The Gaussians in colours that are the same from every side."""
+    return replace(gaussians, sh=sh_from_rgb(colours), encoded=None)
+
+
+def sums_by_slopes(
+    draw: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]],
+    gaussians: Gaussians,
+    layers: Float[Tensor, "h w 3"],
+) -> Float[Tensor, "n 3"]:
+    """`FrozenView.sums` by autograd: a compositing weight is the slope of a pixel's colour in the
+    colour of the Gaussian.
+
+    Args:
+        draw: The image of the Gaussians in other colours, differentiable in them.
+        gaussians: The n Gaussians.
+        layers: What is summed.
+    """
+    with torch.enable_grad():
+        colours = gaussians.means.new_full((len(gaussians), 3), 0.5).requires_grad_()
+        (slope,) = torch.autograd.grad((layers * draw(colours)).sum(), colours)
+    return slope
