@@ -15,6 +15,7 @@ OPENED = {
     "nerfstudio_fox": (67, None, 1080),
     "nerfstudio_fox/transforms.json": (67, None, 1080),
     "re10k/000000.torch": (93, None, 640),
+    "waymo_mmdet3d/waymo_infos_val.pkl": (1, 2059.0, 1920),
 }
 """How many frames, the focal length of the first one where no lens is removed, and its width."""
 
@@ -64,10 +65,9 @@ REFUSED = {
     "llff/gnomes_poses_bounds.npy": "has 103 rows, which belong to as many photographs",
     "llff/liberty_poses_bounds.npy": "has 135 rows, which belong to as many photographs",
     "NOTES.md": NOTHING,
-    "nuscenes_mmdet3d/info.pkl": NOTHING,
+    "nuscenes_mmdet3d/info.pkl": "size of the photograph of CAM_FRONT at .* is not known",
     "re10k/0d4de33c6888a754.head.txt": "size of frame 0 of .* is not known",
     "waymo_mmdet3d/0000000.png": NOTHING,
-    "waymo_mmdet3d/waymo_infos_val.pkl": NOTHING,
 }
 
 SPLATS = {

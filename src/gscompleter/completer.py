@@ -559,7 +559,9 @@ class GSCompleter:
         tolerance = 0.0 if completion.evidence is not None else self.config.harm.tolerance or 0.0
         watching = (*completion.views, *completion.witnesses)
         return tuple(
-            error_with_loss(squared_error(r.image, v.image).item(), max(tolerance, ROUNDING))
+            error_with_loss(
+                squared_error(v.compared(r.image), v.image).item(), max(tolerance, ROUNDING)
+            )
             for r, v in zip(contexts_of(self.at(completion, watching)), watching, strict=True)
         )
 

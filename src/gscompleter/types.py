@@ -120,6 +120,21 @@ class View(Movable):
     """Number of the frame in its scene; None for a view that is not one of its frames."""
     depth: Float[Tensor, "h w"] | None = None
     """Measured z-depth in scene units, 0 where unknown. For scoring: no stage reads it."""
+    ignored: Bool[Tensor, "h w"] | None = None
+    """True where the photograph is to be ignored, such as where something moves: nothing is made of
+    it there, and nothing compared with it. None where all of it counts."""
+
+    @property
+    def counted(self) -> Bool[Tensor, "h w"]:
+        """True where the photograph is not to be ignored."""
+        everywhere = torch.ones_like(self.image[..., 0], dtype=torch.bool)
+        return everywhere if self.ignored is None else ~self.ignored
+
+    def compared(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        """`image` as it is held against the photograph: the same as this where it is ignored."""
+        if self.ignored is None:
+            return image
+        return torch.where(self.ignored[..., None], self.image, image)
 
     def evened(self, gain: Float[Tensor, "3"]) -> View:
         """The same in an exposure that this one is brighter than by `gain`, channel by channel."""

@@ -81,7 +81,7 @@ def optimize(
         order = order or torch.randperm(len(views), generator=random).tolist()
         view = views[order.pop()]
         gaussians = state.gaussians()
-        image = renderer.render(gaussians, view.camera).image
+        image = view.compared(renderer.render(gaussians, view.camera).image)
         loss = (1 - config.dssim_weight) * (image - view.image).abs().mean()
         loss = loss + config.dssim_weight * (1 - ssim_map(image, view.image).mean())
         state.optimizer.zero_grad()

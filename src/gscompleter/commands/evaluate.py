@@ -84,6 +84,7 @@ def source_of(options: EvaluateOptions) -> dict[str, Any]:
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
         "resolution": list(size) if isinstance(size, tuple) else size,
+        **({"ignore_masked": True} if options.ignore_masked else {}),
     }
 
 
@@ -160,6 +161,8 @@ def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped], notes: list[s
         if options.resolution is not None:
             size = working_size(options.resolution)
             cases = [replace(case, resolution=size) for case in cases]
+        if options.ignore_masked:
+            cases = [replace(case, ignore_masked=True) for case in cases]
         return [task_of(case) for case in cases]
     return list(islice(tasks_in_clips(options, skipped, notes), options.limit))
 
@@ -181,10 +184,16 @@ def tasks_in_clips(
     for path in options.paths:
         for clip in usable(open_clips(path), skipped):
             notes += clip.notes
+            if options.ignore_masked and not clip.has_masks:
+                raise InputError(
+                    f"Nothing says what is to be ignored in {clip.name}: it has neither masks nor "
+                    "boxes of what moves; leave --ignore-masked out."
+                )
             for protocol in protocols:
                 if isinstance(protocol, ViewByView) and (reason := protocol.reason_to_skip(clip)):
                     skipped.append(Skipped(clip.name, reason))
-                yield from tasks_of(protocol, clip, working_size(resolution_of(options)))
+                size = working_size(resolution_of(options))
+                yield from tasks_of(protocol, clip, size, options.ignore_masked)
 
 
 def cases_file(path: Path) -> Path:

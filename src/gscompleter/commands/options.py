@@ -76,15 +76,16 @@ class SceneOptions(ComputeOptions):
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Posed photographs: a folder with a COLMAP model or a nerfstudio transforms.json, a
     cameras.json beside its photographs, a poses_bounds.npy of LLFF, a sequence of KITTI, a scene
-    of DGP, a chunk of pixelSplat, or a camera file of RealEstate10K beside its frames. The cameras
-    of photographs that have none are found by COLMAP and kept in OUT/colmap."""
+    of DGP, a segment of Waymo, a sequence of PandaSet, a chunk of pixelSplat, or a camera file of
+    RealEstate10K beside its frames. The cameras of photographs that have none are found by COLMAP
+    and kept in OUT/colmap."""
     context: tuple[Frame, ...] | None = None
     """Numbers of the frames to work with, in the order of the sorted file paths."""
     out: Path
     """The folder to write."""
     format: str | None = None
-    """What SCENE is: colmap, nerfstudio, cameras-json, llff, kitti, dgp, chunks or
-    real-estate-10k. Found by what lies there if not given."""
+    """What SCENE is: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
+    mmdet3d, pandaset, chunks or real-estate-10k. Found by what lies there if not given."""
     scene: Path | None
     """A file of Gaussians."""
     resolution: Size = LONG_SIDE
@@ -211,7 +212,8 @@ class EvaluateOptions(ModelOptions):
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """A cases.json; or, with --protocol, scenes: folders with a transforms.json or of such
-    folders, chunks of pixelSplat, or camera files of RealEstate10K."""
+    folders, chunks of pixelSplat, camera files of RealEstate10K, or drives (Waymo, nuScenes, KITTI,
+    DDAD, PandaSet), of which the front camera is taken."""
     out: Path
     """Folder for the results, a new one or that of an earlier run to go on with."""
     protocol: tuple[str, ...] = ()
@@ -232,6 +234,9 @@ class EvaluateOptions(ModelOptions):
     resolution: Size | None = None
     """What to work at, as `complete` has it. If not given, the resolution of the cases, or for
     scenes that of `complete`."""
+    ignore_masked: bool = False
+    """Ignore what masks cover in the photographs, and boxes around what moves: nothing is made of
+    it, and it does not count in the scores."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to do, in all shards together."""
 

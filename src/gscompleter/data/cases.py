@@ -16,7 +16,7 @@ from typing import Any
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.framing import Resolution
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.photographs import Photographs, without_masked
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.json_file import read_json
 from gscompleter.types import View
@@ -38,6 +38,8 @@ class Case:
     """Height and width, or what else `PosedPhotographs.views` takes."""
     near: float | None = None
     far: float | None = None
+    ignore_masked: bool = False
+    """Whether what is masked in the photographs is ignored."""
 
     @property
     def name(self) -> str:
@@ -46,7 +48,8 @@ class Case:
     def load(self, frames: tuple[int, ...]) -> list[View]:
         """Photographs of `frames`."""
         scene = open_photographs(self.scene, near=self.near, far=self.far)
-        return scene.views(frames, self.resolution)
+        views = scene.views(frames, self.resolution)
+        return without_masked(views, scene, self.resolution) if self.ignore_masked else views
 
 
 def holds_cases(path: Path) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -26,7 +26,8 @@ class Skipped:
 def open_clips(path: Path | str) -> Iterator[Photographs]:
     """The scenes in a file or folder of any of `FORMATS`, a folder of such, or a `cases.json`.
 
-    What it is, is found out at once; the scenes are read one at a time.
+    Of a vehicle with several cameras a scene is what the front camera saw. What it is, is found
+    out at once; the scenes are read one at a time.
 
     Raises:
         InputError: where it is none of these, and while iterating, where a scene is damaged.
@@ -37,7 +38,15 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
     inside = [] if recognised(path) or not os.path.isdir(path) else sorted(path.iterdir())
     folders = [child for child in inside if child.is_dir() and recognised(child)]
     scenes = [(FORMATS[format_of(place)], place) for place in folders or [path]]
-    return (clip for format, place in scenes for clip in format.open(place))
+    return (looking_ahead(clip) for format, place in scenes for clip in format.open(place))
+
+
+def looking_ahead(clip: Photographs) -> Photographs:
+    """The photographs of the front camera, where a vehicle has several; else all."""
+    if clip.front is None:
+        return clip
+    ahead = tuple(frame for frame in clip.frames if frame.sensor == clip.front)
+    return replace(clip, frames=ahead)
 
 
 def usable(clips: Iterable[P], skipped: list[Skipped]) -> Iterator[P]:

@@ -1,13 +1,16 @@
 """DGP's scenes, as DDAD publishes them: a JSON file of all sensors, and one of calibrations.
 
 Every image has the pose of its camera, camera-to-world in OpenCV axes. A sample names the
-calibration that its images share, which lists intrinsics by the names of the cameras.
+calibration that its images share, which lists intrinsics by the names of the cameras. The point
+cloud of the same sample gives sparse depth.
 """
 
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +41,8 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     """The photographs of a scene of DGP, called by the name of its folder.
 
     Frames of all cameras are numbered together in the order of their sorted names, which are
-    paths below the folder: all of the first camera, then all of the second.
+    paths below the folder: all of the first camera, then all of the second. The first by name, in
+    DDAD CAMERA_01, is the front camera.
 
     Raises:
         InputError: where there is no scene file, it or the calibration is damaged, or no image is
@@ -50,13 +54,17 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     content = read_json(file, ADVICE)
     cameras = _calibrations(file, content)
     images = [datum for datum in _list(content, "data") if "image" in _object(datum, "datum")]
-    frames = sorted((_frame(d, cameras, file) for d in images), key=lambda frame: frame.name)
+    sweeps = _sweeps(content)
+    frames = sorted((_frame(d, cameras, sweeps, file) for d in images), key=lambda f: f.name)
     if not frames:
         raise InputError(f"{quoted(file)} lists no images; name a scene with cameras.")
-    yield photographs_of(file.resolve().parent.name, str(file), frames)
+    front = min(frame.sensor or "" for frame in frames)
+    yield photographs_of(file.resolve().parent.name, str(file), frames, front=front)
 
 
-def _frame(datum: Any, cameras: Mapping[str, Intrinsics], file: Path) -> Frame:
+def _frame(
+    datum: Any, cameras: Mapping[str, Intrinsics], sweeps: Mapping[str, Any], file: Path
+) -> Frame:
     image, camera = _object(datum["datum"], "image"), _object(datum, "id").get("name")
     name = text_of(image, "filename", str(file))
     title = f"image {quoted(name)} of {quoted(file)}"
@@ -67,7 +75,41 @@ def _frame(datum: Any, cameras: Mapping[str, Intrinsics], file: Path) -> Frame:
         )
     given = cameras[camera]
     intrinsics = Intrinsics(size_of(image, title), given.focal, given.center)
-    return Frame(name, title, _pose(_object(image, "pose"), title), intrinsics, file.parent / name)
+    sweep = _object(_object(sweeps.get(str(datum.get("key"))), "datum"), "point_cloud")
+    points = text_of(sweep, "filename", str(file))
+    pose = _pose(_object(sweep, "pose"), str(file)) if points is not None else np.eye(4)
+    there = points is not None and os.path.isfile(file.parent / points)
+    return Frame(
+        name,
+        title,
+        _pose(_object(image, "pose"), title),
+        intrinsics,
+        file.parent / name,
+        sensor=camera,
+        measured=partial(_points, file.parent / str(points), pose) if there else None,
+    )
+
+
+def _sweeps(content: Any) -> dict[str, Any]:
+    """The point cloud of the sample that each datum belongs to, by the datum's key."""
+    data = {str(d.get("key")): d for d in _list(content, "data") if isinstance(d, dict)}
+    found: dict[str, Any] = {}
+    for sample in _list(content, "samples"):
+        keys = [str(key) for key in _list(sample, "datum_keys")]
+        clouds = [k for k in keys if "point_cloud" in _object(data.get(k), "datum")]
+        found |= {key: data[clouds[0]] for key in keys if clouds}
+    return found
+
+
+def _points(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
+    """The points of a sweep in the world frame: the first three columns of its array `data`."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            points = arrays["data"][:, :3].astype(np.float64)
+    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
+        raise InputError(f"{quoted(path)} is no point cloud of DGP; {ADVICE}.") from error
+    finite = points[np.isfinite(points).all(axis=1)]
+    return finite @ world_from_laser[:3, :3].T + world_from_laser[:3, 3]
 
 
 def _pose(pose: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:

@@ -17,12 +17,16 @@ from gscompleter.data.chunks import holds_chunks, open_chunks
 from gscompleter.data.colmap.scene import holds_colmap, open_colmap
 from gscompleter.data.dgp import holds_dgp, open_dgp
 from gscompleter.data.kitti import holds_kitti, open_kitti
+from gscompleter.data.kitti_raw import holds_kitti_raw, open_kitti_raw
 from gscompleter.data.limits import check_planes
 from gscompleter.data.llff import holds_llff, open_llff
+from gscompleter.data.mmdet3d import holds_infos, open_infos
 from gscompleter.data.other_exports import refuse_other_exports
+from gscompleter.data.pandaset import holds_pandaset, open_pandaset
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import holds_camera_files, open_camera_files
 from gscompleter.data.transforms import holds_transforms, open_transforms
+from gscompleter.data.waymo import holds_waymo, open_waymo
 from gscompleter.errors import InputError, quoted
 
 
@@ -63,6 +67,20 @@ FORMATS = {
     ),
     "llff": Format("a folder with LLFF's poses_bounds.npy", holds_llff, open_llff),
     "kitti": Format("a sequence of KITTI odometry", holds_kitti, open_kitti, "m"),
+    "kitti-raw": Format(
+        "a drive of raw KITTI (with oxts and image_02)", holds_kitti_raw, open_kitti_raw, "m"
+    ),
+    "pandaset": Format("a sequence of PandaSet", holds_pandaset, open_pandaset, "m"),
+    "mmdet3d": Format(
+        "infos of mmdetection3d for nuScenes or Waymo (.pkl)", holds_infos, open_infos, "m"
+    ),
+    "waymo": Format(
+        "segments of the Waymo Open Dataset 2 (a folder with camera_image/SEGMENT.parquet, or that "
+        "file)",
+        holds_waymo,
+        open_waymo,
+        "m",
+    ),
     "real-estate-10k": Format(
         "RealEstate10K camera files (.txt, with the frames of each in the folder of its name)",
         holds_camera_files,

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from gscompleter.data.intrinsics import FRACTIONS, Intrinsics, pinhole_defect
 from gscompleter.data.lens import Pinhole, undistorted
 from gscompleter.data.limits import MAX_SIDE
+from gscompleter.data.moving_objects import Box
 from gscompleter.data.poses import pose_defect
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.image import decode_pixels, image_size, read_pixels
@@ -44,6 +45,12 @@ class Frame:
     """The file of its depth map, and what the values in it are multiplied by."""
     mask: Path | None = None
     """An image that is black where the photograph is to be ignored."""
+    sensor: str | None = None
+    """Which camera of a vehicle took it; None where there is one camera."""
+    measured: Callable[[], Float[np.ndarray, "n 3"]] | None = None
+    """Reads what lasers measured at about that time, in the frame of the poses."""
+    boxes: Callable[[], tuple[Box, ...]] | None = None
+    """Reads boxes around what stands or moves there at about that time, in that frame."""
 
     def stored(self) -> Path | bytes | None:
         """The image file or its bytes; None where there is none."""
@@ -51,16 +58,25 @@ class Frame:
             return find_image(self.image)
         return None if self.image is None else self.image()
 
+    def has_photograph(self) -> bool:
+        """Whether the photograph is there; what is stored within another file is not looked for."""
+        if isinstance(self.image, Path):
+            return find_image(self.image) is not None
+        return self.image is not None
+
     def stored_size(self) -> tuple[int, int] | None:
         """Width and height of the photograph; None where there is none."""
         stored = self.stored()
         return None if stored is None else image_size(stored, capital(self.title))
 
     def size(self) -> tuple[int, int]:
-        """Width and height of the photograph, or where there is none, what the file says."""
-        size = self.stored_size()
-        if size is None and self.intrinsics.size != FRACTIONS:
-            size = self.intrinsics.size
+        """Width and height of the photograph, or where there is none, what the file says.
+
+        A photograph whose bytes have to be found first is not opened where the file says it.
+        """
+        told = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
+        within = self.image is not None and not isinstance(self.image, Path)
+        size = told if within and told is not None else self.stored_size() or told
         if size is None:
             raise InputError(
                 f"The size of {self.title} is not known, because it has no image and no `w` and "

@@ -2,7 +2,8 @@
 
 A pose is the upper 3×4 of camera-to-world of camera 0, in OpenCV axes, a line a frame. A
 calibration is the 3×4 projection of each camera from the frame of camera 0: its intrinsics, and
-how far the camera stands aside.
+how far the camera stands aside. Where it has `Tr`, the pose of the laser, sweeps in the folder
+`velodyne` give sparse depth.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +22,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import pose_defect
+from gscompleter.data.velodyne import read_sweep
 from gscompleter.errors import InputError, quoted
 
 POSES, CALIBRATION = "poses.txt", "calib.txt"
@@ -57,10 +61,15 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     calibration = _calibration_beside(folder, poses)
     images, camera = _camera_folder(folder)
     intrinsics, first_from_camera = _camera(calibration, camera)
-    frames = [
-        _frame(number, first @ first_from_camera, intrinsics, images, poses)
-        for number, first in enumerate(_matrices(poses))
-    ]
+    first_from_laser = _laser(calibration)
+    frames = []
+    for number, first in enumerate(_matrices(poses)):
+        frame = _frame(number, first @ first_from_camera, intrinsics, images, poses)
+        sweep = folder / "velodyne" / f"{number:06d}.bin"
+        if first_from_laser is not None and os.path.isfile(sweep):
+            measured = partial(read_sweep, sweep, first @ first_from_laser)
+            frame = replace(frame, measured=measured)
+        frames.append(frame)
     yield photographs_of(folder.resolve().name, str(poses), frames)
 
 
@@ -80,10 +89,21 @@ def _camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarra
             f"{quoted(calibration)} has {len(projections)} projections, and the photographs are "
             f"those of camera {camera}; a line P{camera} is needed."
         )
-    K, aside = projections[camera][:3, :3], projections[camera][:3, 3]
+    return rectified(projections[camera], camera, str(calibration))
+
+
+def rectified(
+    projection: Float[np.ndarray, "4 4"], camera: int, title: str
+) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:
+    """The intrinsics of a rectified camera, and the transform from its frame to that of camera 0.
+
+    Raises:
+        InputError: where its projection, from the frame of camera 0, is that of no such camera.
+    """
+    K, aside = projection[:3, :3], projection[:3, 3]
     if not _is_upright(K):
         raise InputError(
-            f"The projection of camera {camera} in {quoted(calibration)} is none of a rectified "
+            f"The projection of camera {camera} in {quoted(title)} is none of a rectified "
             "camera; name the calib.txt of KITTI odometry."
         )
     transform = np.eye(4)
@@ -95,6 +115,13 @@ def _camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarra
 def _is_upright(K: Float[np.ndarray, "3 3"]) -> bool:
     """Whether a matrix is that of intrinsics: upper triangular, with positive focal lengths."""
     return bool((np.tril(K, -1) == 0).all() and (np.diag(K) > 0).all() and K[2, 2] == 1)
+
+
+def _laser(calibration: Path) -> Float[np.ndarray, "4 4"] | None:
+    """The transform from the frame of the laser to that of camera 0, where the file has it."""
+    with calibration.open(encoding="utf-8-sig", errors="replace") as file:
+        lines = [line for line in file if line.startswith("Tr")]
+    return _matrix(lines[0].partition(":")[2]) if lines else None
 
 
 def _matrices(path: Path) -> list[Float[np.ndarray, "4 4"]]:

@@ -8,7 +8,7 @@ intrinsics are brought to a resolution together.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -22,8 +22,10 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.framing import Resolution, framing, resize
 from gscompleter.data.intrinsics import opening_angle
 from gscompleter.data.lens import remap, undistortion_map
+from gscompleter.data.moving_objects import covered
 from gscompleter.data.origin import local_origin
 from gscompleter.data.poses import pose_defect
+from gscompleter.data.sparse_depth import sparse_depth
 from gscompleter.errors import InputError
 from gscompleter.io.image import as_image, read_depth, read_pixels
 from gscompleter.types import Camera, View
@@ -31,7 +33,12 @@ from gscompleter.types import Camera, View
 MAX_FOV = 100.0
 """Widest opening angle of a camera that benchmarks keep, in degrees."""
 MAX_TRANSLATION = 1e3
-"""Farthest a camera may be from the origin along an axis for benchmarks, in scene units."""
+"""Farthest a camera may be from the origin along an axis for benchmarks, in scene units. Of a road
+it is the first camera that is the origin."""
+
+MAX_FROM_ZERO = 100.0
+"""Farthest that a vehicle may be from the zero of its map along an axis, in metres, before a local
+origin takes its place."""
 
 
 @runtime_checkable
@@ -75,7 +82,10 @@ class PosedPhotographs(Protocol):
         """
 
     def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
-        """True where the photograph of a frame is to be ignored; None where nothing is."""
+        """True where the photograph of a frame is to be ignored; None where nothing is.
+
+        That is where its mask is black, and where a box of something that moves lies.
+        """
 
     def points(self) -> Float[Tensor, "n 3"] | None:
         """Points on the surfaces of the scene, told from `origin`; None where none are known.
@@ -110,6 +120,8 @@ class Photographs:
     """Name of the format they were opened as, where one was."""
     sparse: Callable[[], Float[np.ndarray, "n 3"]] | None = None
     """Reads points on the scene's surfaces, in the files' own frame, where there are some."""
+    front: str | None = None
+    """The camera that looks ahead, of a vehicle with several; None elsewhere."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,7 +131,7 @@ class Photographs:
         return len(self.frames)
 
     def has_photograph(self, frame: int) -> bool:
-        return self.frame(frame).stored() is not None
+        return self.frame(frame).has_photograph()
 
     def camera(self, frame: int, resolution: Resolution = None) -> Camera:
         """Its photograph need not exist where the file says how large it is."""
@@ -132,19 +144,30 @@ class Photographs:
 
     def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
         found = self.frame(frame)
-        if found.mask is None:
-            return None
-        shown = read_pixels(found.mask).max(axis=-1)
-        return torch.from_numpy(fitted(found, shown, found.size(), resolution)) == 0
+        masks = []
+        if found.mask is not None:
+            shown = read_pixels(found.mask).max(axis=-1)
+            masks.append(fitted(found, shown, found.size(), resolution) == 0)
+        if found.boxes is not None:
+            camera = self._camera(found, found.size(), resolution)
+            masks.append(covered(found.boxes(), camera, self.origin))
+        return torch.from_numpy(np.logical_or.reduce(masks)) if masks else None
 
     def points(self) -> Float[Tensor, "n 3"] | None:
         if self.sparse is None:
             return None
         return torch.from_numpy(self.sparse() - self.origin).float()
 
+    @property
+    def has_masks(self) -> bool:
+        """Whether something is told of what is to be ignored."""
+        return any(frame.mask is not None or frame.boxes is not None for frame in self.frames)
+
     def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
         for number, frame in enumerate(self.frames):
-            reason = _oddity(frame) or (None if size is None else _size_to_skip(frame, size))
+            reason = _oddity(frame, self.origin) or (
+                None if size is None else _size_to_skip(frame, size)
+            )
             if reason is not None:
                 return f"frame {number}: {reason}"
         return None
@@ -173,13 +196,49 @@ class Photographs:
         depth = None
         if frame.depth is not None:
             depth = torch.from_numpy(fitted(frame, read_depth(*frame.depth), size, resolution))
+        elif frame.measured is not None:
+            points = torch.from_numpy(frame.measured() - self.origin).float()
+            depth = sparse_depth(points, camera)
         return View(as_image(fitted(frame, pixels, size, resolution)), camera, number, depth)
 
 
-def photographs_of(name: str, title: str, frames: Sequence[Frame]) -> Photographs:
+def without_masked(
+    views: Sequence[View], photographs: PosedPhotographs, resolution: Resolution = None
+) -> list[View]:
+    """Views of photographs at a resolution, that are to be ignored where they are masked.
+
+    Raises:
+        InputError: where nothing is left of one.
+    """
+    found = []
+    for view in views:
+        assert view.frame is not None
+        mask = photographs.mask(view.frame, resolution)
+        if mask is not None and mask.all():
+            raise InputError(
+                f"All of frame {view.frame} of {photographs.name} is masked; choose another frame."
+            )
+        found.append(replace(view, ignored=mask))
+    return found
+
+
+def photographs_of(
+    name: str, title: str, frames: Sequence[Frame], front: str | None = None
+) -> Photographs:
     """Photographs told from zero, or where that is too far away, from a local origin."""
     valid = [frame.c2w for frame in frames if pose_defect(frame.c2w) is None]
-    return Photographs(name, title, tuple(frames), local_origin(valid))
+    return Photographs(name, title, tuple(frames), local_origin(valid), front=front)
+
+
+def along_a_road(
+    name: str, title: str, frames: Sequence[Frame], front: str | None = None
+) -> Photographs:
+    """Photographs of a vehicle on a map. Maps are kilometres wide: far from their zero, coordinates
+    are told from the first camera."""
+    valid = (frame.c2w[:3, 3] for frame in frames if pose_defect(frame.c2w) is None)
+    first = next(valid, np.zeros(3))
+    origin = first.copy() if np.abs(first).max() > MAX_FROM_ZERO else np.zeros(3)
+    return Photographs(name, title, tuple(frames), origin, front=front)
 
 
 def fitted(
@@ -207,7 +266,7 @@ def fitted(
     return framing(*size, resolution).image(pixels, filtering)
 
 
-def _oddity(frame: Frame) -> str | None:
+def _oddity(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
     """What makes benchmarks leave a frame's clip out; None where they keep it."""
     size = frame.intrinsics.size or frame.size()
     defect = frame.defect(*size)
@@ -216,7 +275,7 @@ def _oddity(frame: Frame) -> str | None:
     fov = opening_angle(frame.pinholes(*size)[1])
     if fov > MAX_FOV:
         return f"its opening angle of {fov:.1f}° is above {MAX_FOV:g}°"
-    farthest = float(np.abs(frame.c2w[:3, 3]).max())
+    farthest = float(np.abs(frame.c2w[:3, 3] - origin).max())
     if farthest > MAX_TRANSLATION:
         return f"its translation of {farthest:g} is above {MAX_TRANSLATION:g}"
     return None

@@ -61,7 +61,8 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
         pixels, z = project(points, view.camera)
         visible = _visibility(pixels, z, view, render)
         colours.append(sample(view.image, pixels))
-        weights.append((visible * _closeness(points, target, view)) ** SHARPNESS)
+        counted = _counted(view, pixels)
+        weights.append((visible * counted * _closeness(points, target, view)) ** SHARPNESS)
 
     baselines = [baseline_between(nearest.camera, view.camera) for view in context.views]
     reference = baselines.index(min(baselines))
@@ -95,6 +96,7 @@ def with_unexplained(warped: Warped, target: Camera, context: SceneContext) -> W
         pixels, z = project(points, view.camera)
         empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
         unexplained = empty & inside(pixels, z, view.camera) & ~warped.known
+        unexplained = unexplained & _counted(view, pixels)
         weight = unexplained * _closeness(points, target, view) ** SHARPNESS
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
         total = total + weight
@@ -132,6 +134,11 @@ def _visibility(
     error = (z - depth).abs() / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
     visible = inside(pixels, z, view.camera) & (alpha >= COVERED)
     return torch.exp(-(error**2)) * visible
+
+
+def _counted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
+    """Where a photograph is not to be ignored at `pixels`, nor beside them."""
+    return sample((~view.counted)[..., None].float(), pixels)[..., 0] == 0
 
 
 def _closeness(points: Float[Tensor, "h w 3"], target: Camera, view: View) -> Float[Tensor, "h w"]:

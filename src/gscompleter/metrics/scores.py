@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.metrics.geometry import abs_rel, alignment
-from gscompleter.metrics.image import masked_psnr, psnr, ssim
+from gscompleter.metrics.image import MAX_PSNR, masked_psnr, ssim
 from gscompleter.metrics.lpips import lpips_if_available
 from gscompleter.render import Renderer
 from gscompleter.stages.integration import hole_mask
@@ -115,18 +115,19 @@ def score(
     target = truth.target
     was = renderer.render(before, target.camera)
     now = renderer.render(after, target.camera)
-    holes, covered = hole_mask(was.alpha), now.depth_map().valid
+    counted = target.counted
+    holes, covered = hole_mask(was.alpha), now.depth_map().valid & counted
     context = _drawn(before, after, truth.views, renderer)
     beside = _drawn(before, after, truth.neighbours, renderer)
     scores = Scores(
         hole_fraction=holes.float().mean().item(),
-        target_before=quality(was.image, target.image),
-        target_after=quality(now.image, target.image),
-        hole_psnr=masked_psnr(now.image, target.image, holes),
-        observed_psnr=_masked_change(was, now, target, ~holes),
-        neighbours_psnr=mean_change(_changes(beside, psnr)),
-        context_psnr=_changes(context, psnr),
-        context_ssim=_changes(context, ssim),
+        target_before=quality(was.image, target),
+        target_after=quality(now.image, target),
+        hole_psnr=masked_psnr(now.image, target.image, holes & counted),
+        observed_psnr=_masked_change(was, now, target, ~holes & counted),
+        neighbours_psnr=mean_change(_changes(beside, counted_psnr)),
+        context_psnr=_changes(context, counted_psnr),
+        context_ssim=_changes(context, counted_ssim),
         depth_observed=abs_rel(now.depth, target.depth, ~holes & covered),
         depth_hole=abs_rel(now.depth, target.depth, holes & covered),
     )
@@ -142,14 +143,30 @@ def score(
     return scores, Drawings(was, now, holes)
 
 
-def quality(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Quality:
-    """PSNR, SSIM and, where the weights are at hand, LPIPS."""
+def quality(image: Float[Tensor, "h w 3"], photograph: View) -> Quality:
+    """PSNR, SSIM and, where the weights are at hand, LPIPS.
+
+    What is to be ignored of the photograph does not count for PSNR, and counts as equal for the
+    others, which look at neighbourhoods.
+    """
+    truth, compared = photograph.image, photograph.compared(image)
     return Quality(
-        psnr(image, truth),
-        ssim(image, truth),
-        lpips_if_available(image, truth, "vgg"),
-        lpips_if_available(image, truth, "alex"),
+        counted_psnr(image, photograph),
+        counted_ssim(image, photograph),
+        lpips_if_available(compared, truth, "vgg"),
+        lpips_if_available(compared, truth, "alex"),
     )
+
+
+def counted_psnr(image: Float[Tensor, "h w 3"], photograph: View) -> float:
+    """PSNR in dB over the pixels of the photograph that count; of none it is that of equality."""
+    counted = masked_psnr(image, photograph.image, photograph.counted)
+    return MAX_PSNR if counted is None else counted
+
+
+def counted_ssim(image: Float[Tensor, "h w 3"], photograph: View) -> float:
+    """SSIM, with what is to be ignored of the photograph taken for equal."""
+    return ssim(photograph.compared(image), photograph.image)
 
 
 def rim_error(
@@ -184,19 +201,19 @@ def _masked_change(
 
 def _drawn(
     before: Gaussians, after: Gaussians, views: Sequence[View], renderer: Renderer
-) -> list[tuple[Image, Image, Image]]:
+) -> list[tuple[Image, Image, View]]:
     """The image of each view before and after, and its photograph."""
     return [
         (
             renderer.render(before, view.camera).image,
             renderer.render(after, view.camera).image,
-            view.image,
+            view,
         )
         for view in views
     ]
 
 
 def _changes(
-    drawn: Sequence[tuple[Image, Image, Image]], metric: Callable[[Image, Image], float]
+    drawn: Sequence[tuple[Image, Image, View]], metric: Callable[[Image, View], float]
 ) -> tuple[Change, ...]:
-    return tuple(Change(metric(was, image), metric(now, image)) for was, now, image in drawn)
+    return tuple(Change(metric(was, view), metric(now, view)) for was, now, view in drawn)

@@ -20,8 +20,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.metrics.image import psnr
-from gscompleter.metrics.scores import MIN_PIXELS, Drawings, Scores, Truth, score
+from gscompleter.metrics.scores import MIN_PIXELS, Drawings, Scores, Truth, counted_psnr, score
 from gscompleter.render import Renderer
 from gscompleter.runs.memory import peak_memory
 from gscompleter.runs.methods import METHODS, Models, Prediction, numbered
@@ -254,7 +253,7 @@ def ended(progress: Progress, targets: Sequence[View], renderer: Renderer) -> Pr
     steps = []
     for step, target in zip(progress.steps, targets, strict=False):  # the last may have failed
         image = renderer.render(progress.scene, target.camera).image
-        steps.append(replace(step, psnr_end=psnr(image, target.image)))
+        steps.append(replace(step, psnr_end=counted_psnr(image, target)))
     return replace(progress, steps=tuple(steps))
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from gscompleter.data.cases import Case
 from gscompleter.data.framing import Resolution
-from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.photographs import PosedPhotographs, without_masked
 from gscompleter.errors import InputError
 from gscompleter.runs.protocols import EvaluationProtocol, Split
 from gscompleter.types import View
@@ -46,7 +46,10 @@ def task_of(case: Case) -> Task:
 
 
 def tasks_of(
-    protocol: EvaluationProtocol, clip: PosedPhotographs, resolution: Resolution = None
+    protocol: EvaluationProtocol,
+    clip: PosedPhotographs,
+    resolution: Resolution = None,
+    ignore_masked: bool = False,
 ) -> list[Task]:
     """The tasks of a clip: one for each target, or one for all where they depend on each other.
 
@@ -54,13 +57,15 @@ def tasks_of(
         protocol: What chooses the frames.
         clip: Where they are.
         resolution: As in `PosedPhotographs.views`.
+        ignore_masked: Whether what is masked in the photographs is ignored.
 
     Raises:
         InputError: where a frame of the protocol is not in the clip.
     """
 
     def load(frames: tuple[int, ...]) -> list[View]:
-        return clip.views(frames, resolution)
+        views = clip.views(frames, resolution)
+        return without_masked(views, clip, resolution) if ignore_masked else views
 
     tasks = []
     for split in protocol.splits(clip):

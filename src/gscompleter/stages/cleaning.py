@@ -95,7 +95,7 @@ def change_without(
     plan = renderer.freeze(scene[:0], view.camera).plan(scene)
     full = scene.opacities
     left = torch.where(faded, full.clamp_max(FADED), full)
-    error, slope = error_slope(plan, view.image, left)
+    error, slope = error_slope(plan, view, left)
     square = mean_squares(plan, left, probes, generator)
     # The parabola about `left`, at no opacity less at full opacity.
     return (square * (left**2 - (full - left) ** 2) - slope * full) / max(error, LEAST)
@@ -148,4 +148,4 @@ def halved(view: View) -> View:
     image = avg_pool2d(view.image.permute(2, 0, 1), 2).permute(1, 2, 0)
     K = view.camera.K * view.camera.K.new_tensor([[0.5], [0.5], [1.0]])
     camera = replace(view.camera, K=K, height=image.shape[0], width=image.shape[1])
-    return replace(view, image=image, camera=camera, depth=None)
+    return replace(view, image=image, camera=camera, depth=None, ignored=None)

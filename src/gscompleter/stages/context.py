@@ -14,7 +14,8 @@ from gscompleter.geometry import z_depths
 from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.reconstructors import Reconstructor, reconstructed
 from gscompleter.render import Renderer
-from gscompleter.types import Camera, Gaussians, View
+from gscompleter.stages.integration import falling_on
+from gscompleter.types import Camera, Gaussians, Reconstruction, View
 
 
 def init_context(
@@ -25,7 +26,23 @@ def init_context(
     With them comes by how much each view is brighter, by channel, where Ψ evened out exposures.
     """
     made = reconstructed(reconstructor, views)
-    return made.gaussians, made.gains
+    return without_ignored(made, views), made.gains
+
+
+def without_ignored(made: Reconstruction, views: Sequence[View]) -> Gaussians:
+    """What Ψ made of pixels that count. Where it does not say which pixel a Gaussian is of, those
+    go that fall on an ignored one."""
+    gaussians = made.gaussians
+    gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    for number, view in enumerate(views):
+        if view.ignored is None:
+            continue
+        if made.view_index is None or made.pixel_index is None:
+            gone |= falling_on(view.ignored, gaussians, view.camera)
+        else:
+            own = made.view_index == number
+            gone[own] = view.ignored.flatten()[made.pixel_index[own]]
+    return gaussians[~gone] if gone.any() else gaussians
 
 
 def exposed_alike(views: Sequence[View], gains: Float[Tensor, "v 3"] | None) -> tuple[View, ...]:

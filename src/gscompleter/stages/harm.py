@@ -77,7 +77,7 @@ class Check:
 
     def excess(self, image: Float[Tensor, "h w 3"]) -> float:
         """How far the mean squared error of `image` lies over what is allowed."""
-        return squared_error(image, self.view.image).item() - self.allowed
+        return squared_error(self.view.compared(image), self.view.image).item() - self.allowed
 
     def to_lower(
         self,
@@ -89,14 +89,15 @@ class Check:
         """Which of `added`, of the opacities that gave `image`, are to give way."""
         if HALVINGS <= trial < HALVINGS + REMOVALS:
             return self.at_worst(image, added)
-        _, slope = error_slope(self.plan, self.view.image, opacities)
+        _, slope = error_slope(self.plan, self.view, opacities)
         if trial < HALVINGS:
             return fewest(slope * opacities / 2, self.excess(image))
         return slope != 0
 
     def at_worst(self, image: Float[Tensor, "h w 3"], added: Gaussians) -> Bool[Tensor, "n"]:
         """Those of `added` at the fewest pixels of `image` that make up for its excess."""
-        errors, before = (squared_errors(i, self.view.image) for i in (image, self.before))
+        compared = map(self.view.compared, (image, self.before))
+        errors, before = (squared_errors(image, self.view.image) for image in compared)
         relief = (errors - before) / errors.numel()
         pixels = fewest(relief.flatten(), self.excess(image)).view(relief.shape)
         return falling_on(dilate(pixels, REACH), added, self.view.camera)
@@ -126,14 +127,14 @@ def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
 
 
 def error_slope(
-    plan: OpacityRender, photograph: Float[Tensor, "h w 3"], opacities: Float[Tensor, "n"]
+    plan: OpacityRender, view: View, opacities: Float[Tensor, "n"]
 ) -> tuple[float, Float[Tensor, "n"]]:
     """Error against the photograph, and how it grows with each opacity."""
     with torch.enable_grad():
         variable = opacities.detach().clone().requires_grad_()
-        image = plan(variable).image
-        (slope,) = torch.autograd.grad((image - photograph).square().mean(), variable)
-    return squared_error(image.detach(), photograph).item(), slope
+        image = view.compared(plan(variable).image)
+        (slope,) = torch.autograd.grad((image - view.image).square().mean(), variable)
+    return squared_error(image.detach(), view.image).item(), slope
 
 
 def squared_error(image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]) -> Tensor:

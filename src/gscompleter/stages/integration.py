@@ -62,9 +62,9 @@ def refine_opacities(
     """
     if config.iterations == 0 or len(added) == 0:
         return added, ()
-    plans = [(frozen_target.plan(added), reference.image, config.target_weight)]
+    plans = [(frozen_target.plan(added), reference, config.target_weight)]
     seen = zip(frozen_views, views, strict=True)
-    plans += [(frozen.plan(added), view.image, 1.0) for frozen, view in seen]
+    plans += [(frozen.plan(added), view, 1.0) for frozen, view in seen]
 
     logit = config.parametrization == "logit"
     start = added.opacities.logit(eps=1e-4) if logit else added.opacities
@@ -77,7 +77,10 @@ def refine_opacities(
     losses = []
     for _ in track(range(config.iterations), "Refining"):
         current = opacities()
-        terms = [w * (plan(current).image - image).abs().mean() for plan, image, w in plans]
+        terms = [
+            weight * (view.compared(plan(current).image) - view.image).abs().mean()
+            for plan, view, weight in plans
+        ]
         loss = torch.stack(terms).sum()
         optimizer.step(loss)
         losses.append(loss.item())

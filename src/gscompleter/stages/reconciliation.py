@@ -119,7 +119,8 @@ class Fit:
 
     def excess(self, photograph: Asked) -> Float[Tensor, ""]:
         """By how much the error of a photograph is above its goal, relative to what is allowed."""
-        error = (self.drawn(photograph.frozen).image - photograph.view.image).square().mean()
+        image = photograph.view.compared(self.drawn(photograph.frozen).image)
+        error = (image - photograph.view.image).square().mean()
         return (error / max(photograph.allowed, 1e-12) - GOAL).clamp_min(0.0)
 
     def step(self, loss: Float[Tensor, ""]) -> None:

@@ -59,7 +59,7 @@ def without_needed(
         before = missing
         for view, error in zip(views, allowed, strict=True):
             plan = renderer.freeze(rest, view.camera).plan(candidates)
-            missing = missing & ~needed(plan, candidates.opacities, missing, view.image, error)
+            missing = missing & ~needed(plan, candidates.opacities, missing, view, error)
     return doubtful.masked_scatter(doubtful, missing)
 
 
@@ -71,7 +71,7 @@ def wanted(
     missed = torch.zeros(len(candidates), dtype=torch.bool, device=doubtful.device)
     for view in views:
         plan = renderer.freeze(rest, view.camera).plan(candidates)
-        error, slope = error_slope(plan, view.image, candidates.opacities)
+        error, slope = error_slope(plan, view, candidates.opacities)
         missed |= -slope * candidates.opacities > LITTLE * error
     result = doubtful.clone()
     result[doubtful] = missed
@@ -82,7 +82,7 @@ def needed(
     plan: OpacityRender,
     opacities: Float[Tensor, "n"],
     missing: Bool[Tensor, "n"],
-    photograph: Float[Tensor, "h w 3"],
+    view: View,
     allowed: float,
 ) -> Bool[Tensor, "n"]:
     """Which of the Gaussians that are `missing` a photograph needs back, so that its mean squared
@@ -90,14 +90,16 @@ def needed(
     back = torch.zeros_like(missing)
     for _ in range(MAX_TRIALS):
         out = missing & ~back
-        error = squared_error(plan(torch.where(out, 0.0, opacities)).image, photograph).item()
+        image = view.compared(plan(torch.where(out, 0.0, opacities)).image)
+        error = squared_error(image, view.image).item()
         if error <= allowed or not out.any():
             return back
-        _, slope = error_slope(plan, photograph, torch.where(out, FADED, 1.0) * opacities)
+        _, slope = error_slope(plan, view, torch.where(out, FADED, 1.0) * opacities)
         back = back | fewest(torch.where(out, -slope * opacities, 0.0), error - allowed)
     return back | (missing & (slope != 0))
 
 
 def error_of(scene: Gaussians, view: View, renderer: Renderer) -> Float[Tensor, ""]:
     """Mean squared error of the scene against a photograph."""
-    return squared_error(renderer.render(scene, view.camera).image, view.image)
+    image = renderer.render(scene, view.camera).image
+    return squared_error(view.compared(image), view.image)

@@ -92,9 +92,9 @@ def sources_of(context: SceneContext, warped: Warped) -> Sources:
         (gain * view.image.cpu()).clamp(0, 1)
         for view, gain in zip(context.views, warped.gains, strict=True)
     ]
-    everywhere = [torch.ones_like(image[..., 0], dtype=torch.bool) for image in photographs]
+    counted = [view.counted.cpu() for view in context.views]
     return Sources.stacked(
         [*photographs, warped.image],
-        [*everywhere, warped.known],
+        [*counted, warped.known],
         [*(render.depth.cpu() for render in context.at_views), warped.depth],
     )

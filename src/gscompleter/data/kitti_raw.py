@@ -1,0 +1,165 @@
+"""Drives of raw KITTI (synced and rectified), whose poses are those of GPS and inertial sensors.
+
+`DATE/DATE_drive_NNNN_sync` holds `image_02/data`, `oxts/data` and perhaps `velodyne_points/data`;
+`DATE` the calibrations. Latitude and longitude become metres by a Mercator projection at the scale
+of the first latitude, as in the development kit.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.frame import Frame
+from gscompleter.data.kitti import LARGEST, MAX_LINE, rectified
+from gscompleter.data.photographs import Photographs, along_a_road
+from gscompleter.data.range_image import poses_of
+from gscompleter.data.velodyne import read_sweep
+from gscompleter.errors import InputError, quoted
+
+EARTH_RADIUS = 6_378_137.0
+"""In metres."""
+CAMERAS = ("02", "03", "00", "01")
+"""Colour on the left, then on the right, then grey: the first that has photographs is taken."""
+MAX_LATITUDE = 89.0
+"""In degrees: Mercator's map has no poles."""
+
+
+def holds_kitti_raw(path: Path) -> bool:
+    """Whether `path` is the folder of a drive."""
+    return os.path.isdir(path / "oxts" / "data") and _camera_of(path) is not None
+
+
+def open_kitti_raw(path: Path) -> Iterator[Photographs]:
+    """The photographs of a drive, called by its folder, in the order of their numbers.
+
+    Raises:
+        InputError: where a calibration or the sensors of a photograph are missing or damaged.
+    """
+    camera = _camera_of(path)
+    if camera is None:
+        raise InputError(
+            f"There are no photographs in {quoted(path)}; a folder image_02 is needed."
+        )
+    rig = _rig(path.resolve().parent, camera)
+    images = sorted((path / f"image_{camera}" / "data").iterdir())
+    readings = [_reading(path / "oxts" / "data" / f"{image.stem}.txt") for image in images]
+    scale = float(np.cos(np.radians(readings[0][0])))
+    frames = [
+        _frame(path, image, rig, _pose(reading, scale))
+        for image, reading in zip(images, readings, strict=True)
+    ]
+    yield along_a_road(path.resolve().name, str(path), frames)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rig:
+    """How sensors stand on the vehicle."""
+
+    camera: str
+    projection: Float[np.ndarray, "4 4"]
+    """Of the rectified camera, from the frame of rectified camera 0."""
+    title: str
+    imu_from_laser: Float[np.ndarray, "4 4"]
+    laser_from_rectified: Float[np.ndarray, "4 4"]
+
+
+def _rig(date: Path, camera: str) -> _Rig:
+    title = str(date / "calib_cam_to_cam.txt")
+    cameras = _calibration(date / "calib_cam_to_cam.txt")
+    cam_from_laser = _rigid(date / "calib_velo_to_cam.txt")
+    laser_from_imu = _rigid(date / "calib_imu_to_velo.txt")
+    rectify = np.eye(4)
+    rectify[:3, :3] = _entry(cameras, "R_rect_00", 9, title).reshape(3, 3)
+    projection = np.eye(4)
+    projection[:3] = _entry(cameras, f"P_rect_{camera}", 12, title).reshape(3, 4)
+    laser_from_rectified = np.linalg.pinv(rectify @ cam_from_laser)
+    return _Rig(camera, projection, title, np.linalg.pinv(laser_from_imu), laser_from_rectified)
+
+
+def _frame(path: Path, image: Path, rig: _Rig, imu: Float[np.ndarray, "4 4"]) -> Frame:
+    intrinsics, first_from_camera = rectified(rig.projection, int(rig.camera), rig.title)
+    laser = imu @ rig.imu_from_laser
+    sweep = path / "velodyne_points" / "data" / f"{image.stem}.bin"
+    return Frame(
+        image.stem,
+        f"photograph {image.stem} of {quoted(path)}",
+        laser @ rig.laser_from_rectified @ first_from_camera,
+        intrinsics,
+        image,
+        measured=partial(read_sweep, sweep, laser) if os.path.isfile(sweep) else None,
+    )
+
+
+def _pose(reading: Float[np.ndarray, "6"], scale: float) -> Float[np.ndarray, "4 4"]:
+    """The pose of the inertial sensor, east, north and up of the origin of the map."""
+    latitude, longitude, altitude, roll, pitch, yaw = reading.tolist()
+    east = scale * EARTH_RADIUS * np.radians(longitude)
+    north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
+    return poses_of(np.array([roll, pitch, yaw, east, north, altitude]))
+
+
+def _reading(path: Path) -> Float[np.ndarray, "6"]:
+    """Latitude, longitude (degrees), altitude, roll, pitch and yaw (radians) at one time."""
+    words = _lines(path)[0].split() if _lines(path) else []
+    numbers = _numbers(" ".join(words[:6]))
+    if numbers is None or len(numbers) != 6 or abs(numbers[0]) > MAX_LATITUDE:
+        raise InputError(f"{quoted(path)} holds no latitude, longitude and angles; copy it again.")
+    return numbers
+
+
+def _rigid(path: Path) -> Float[np.ndarray, "4 4"]:
+    """The transform that a file tells as R and T."""
+    entries = _calibration(path)
+    transform = np.eye(4)
+    transform[:3, :3] = _entry(entries, "R", 9, str(path)).reshape(3, 3)
+    transform[:3, 3] = _entry(entries, "T", 3, str(path))
+    return transform
+
+
+def _entry(
+    entries: Mapping[str, Float[np.ndarray, "_"]], key: str, count: int, title: str
+) -> Float[np.ndarray, "n"]:
+    found = entries.get(key)
+    if found is None or len(found) != count:
+        raise InputError(
+            f"{quoted(title)} has no line {key} of {count} numbers; copy it from the same date."
+        )
+    return found
+
+
+def _calibration(path: Path) -> dict[str, Float[np.ndarray, "_"]]:
+    """The numbers of each line by its label; lines of other things are left out."""
+    parts = (line.partition(":") for line in _lines(path))
+    found = {label.strip(): _numbers(rest) for label, colon, rest in parts if colon}
+    return {label: numbers for label, numbers in found.items() if numbers is not None}
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            return [line[:MAX_LINE] for line in file if line.strip()]
+    except OSError as error:
+        raise InputError(
+            f"{quoted(path)} cannot be read: {error.strerror}; copy it from the same drive."
+        ) from error
+
+
+def _numbers(text: str) -> Float[np.ndarray, "n"] | None:
+    try:
+        numbers = np.array([float(word) for word in text.split()])
+    except ValueError:
+        return None
+    return numbers if (np.abs(numbers) <= LARGEST).all() else None
+
+
+def _camera_of(path: Path) -> str | None:
+    """The first camera that has photographs in a drive."""
+    folders = {camera: path / f"image_{camera}" / "data" for camera in CAMERAS}
+    return next((c for c, folder in folders.items() if any(folder.glob("*.*"))), None)

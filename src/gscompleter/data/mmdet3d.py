@@ -1,0 +1,224 @@
+"""Infos of mmdetection3d (version 1.1), for nuScenes and for Waymo in KITTI's layout.
+
+A pickle lists samples: the pose of the vehicle, and the image, intrinsics and pose of each camera.
+Samples of one drive that follow each other make a scene.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.frame import Frame
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.json_numbers import array_of, number_of, optional_number, text_of
+from gscompleter.data.limits import MAX_IN_PIXELS, MAX_SIDE
+from gscompleter.data.moving_objects import Box, upright
+from gscompleter.data.photographs import Photographs, along_a_road
+from gscompleter.data.restricted_pickle import load_plain
+from gscompleter.errors import InputError, quoted
+
+ADVICE = "write the infos again with mmdetection3d 1.1"
+FRONT = "CAM_FRONT"
+MAX_GAP = 1.5
+"""Seconds from one sample to the next of a scene; those of nuScenes are half a second apart."""
+MAX_TIME = 1e12
+"""Of a time in seconds."""
+MICROSECONDS = 1e12
+"""Times from here on are told in microseconds."""
+FIXED = frozenset(("traffic_cone", "barrier"))
+"""Things that do not move by themselves."""
+MAX_SNIFFED = 4096
+"""Bytes at either end of a pickle that tell whether it is one of infos."""
+
+
+def holds_infos(path: Path) -> bool:
+    """Whether `path` is a pickle of infos."""
+    if path.suffix != ".pkl" or not os.path.isfile(path):
+        return False
+    with path.open("rb") as file:
+        head = file.read(MAX_SNIFFED)
+        file.seek(max(os.path.getsize(path) - MAX_SNIFFED, 0))
+        return b"data_list" in head + file.read() or b"metainfo" in head
+
+
+def open_infos(path: Path) -> Iterator[Photographs]:
+    """The scenes of a pickle of infos, called by their drive and the time they begin at.
+
+    Frames are numbered camera by camera, the front camera first, and by their time. Images are
+    looked for beside the pickle and below it, where the data set has them.
+
+    Raises:
+        InputError: where the file holds no infos, anything but plain values, or no images.
+    """
+    content = load_plain(path)
+    samples = content.get("data_list") if isinstance(content, dict) else None
+    if not isinstance(samples, list) or not samples:
+        raise InputError(f"{quoted(path)} holds no infos with a `data_list`; {ADVICE}.")
+    kinds = _kinds(content.get("metainfo"))
+    told = sorted((_Sample(path, kinds, *_told(s, path)) for s in samples), key=_Sample.order)
+    return (_scene(path, scene) for scene in _scenes(told))
+
+
+class _Sample:
+    """What the vehicle recorded at one time."""
+
+    def __init__(
+        self,
+        file: Path,
+        kinds: Mapping[int, str],
+        content: dict[str, Any],
+        images: dict[str, dict[str, Any]],
+        title: str,
+    ) -> None:
+        self.file, self.kinds, self.content, self.images = file, kinds, content, images
+        self.title = title
+        time = number_of(content, "timestamp", title, 0.0, MAX_TIME * 1e6)
+        self.time = time * 1e-6 if time >= MICROSECONDS else time
+        first = images.get(FRONT) or next(iter(images.values()))
+        file_name = os.path.basename(text_of(first, "img_path", title) or "")
+        self.drive = content.get("context_name") or file_name.split("__")[0]
+
+    def order(self) -> tuple[str, float]:
+        return str(self.drive), self.time
+
+    @property
+    def vehicle(self) -> Float[np.ndarray, "4 4"]:
+        """Its pose in the world."""
+        return array_of(self.content, "ego2global", (4, 4), self.title)
+
+    @property
+    def vehicle_from_laser(self) -> Float[np.ndarray, "4 4"]:
+        """The pose of the laser; that of Waymo's infos is the vehicle itself."""
+        lidar = self.content.get("lidar_points")
+        if not isinstance(lidar, dict) or "lidar2ego" not in lidar:
+            return np.eye(4)
+        return array_of(lidar, "lidar2ego", (4, 4), self.title)
+
+
+def _told(sample: Any, path: Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str]:
+    """A sample, its images by camera, and what errors call it."""
+    title = f"a sample of {quoted(path)}"
+    images = sample.get("images") if isinstance(sample, dict) else None
+    if not isinstance(images, dict):
+        raise InputError(f"An entry of {quoted(path)} has no `images`; {ADVICE}.")
+    there = {name: image for name, image in images.items() if _is_posed(image)}
+    if not there:
+        raise InputError(f"The images of {title} have no file or no pose; {ADVICE}.")
+    return sample, there, title
+
+
+def _is_posed(image: Any) -> bool:
+    return isinstance(image, dict) and {"img_path", "cam2img", "lidar2cam"} <= image.keys()
+
+
+def _scenes(samples: list[_Sample]) -> Iterator[list[_Sample]]:
+    """Samples of one drive that follow each other."""
+    scene = samples[:1]
+    for before, after in pairwise(samples):
+        if after.drive != before.drive or after.time - before.time > MAX_GAP:
+            yield scene
+            scene = []
+        scene.append(after)
+    yield scene
+
+
+def _scene(path: Path, samples: list[_Sample]) -> Photographs:
+    cameras = {name: None for sample in samples for name in sample.images}
+    names = sorted(cameras, key=lambda name: (name != FRONT, name))
+    frames = [_frame(s, name) for name in names for s in samples if name in s.images]
+    called = f"{samples[0].drive}_{samples[0].time:.3f}"
+    return along_a_road(called, str(path), frames, front=names[0])
+
+
+def _frame(sample: _Sample, camera: str) -> Frame:
+    image = sample.images[camera]
+    title = f"the photograph of {camera} at {sample.time:.3f} in {quoted(sample.file)}"
+    file = text_of(image, "img_path", title)
+    assert file is not None
+    laser_from_camera = _inverse(array_of(image, "lidar2cam", (4, 4), title))
+    return Frame(
+        f"{camera}/{os.path.basename(file)}",
+        title,
+        # By way of the laser: between its time and the camera's the vehicle has moved, and
+        # lidar2cam knows of it.
+        sample.vehicle @ sample.vehicle_from_laser @ laser_from_camera,
+        _intrinsics(image, title),
+        _place(sample.file.parent, file, camera),
+        sensor=camera,
+        boxes=partial(_boxes, sample) if _tells_speeds(sample) else None,
+    )
+
+
+def _inverse(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The inverse of a transform; NaN where it has none, for its defect to be found in it."""
+    try:
+        return np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return np.full((4, 4), np.nan)
+
+
+def _intrinsics(image: Mapping[str, Any], title: str) -> Intrinsics:
+    shape = (3, 4) if len(np.shape(image["cam2img"])) == 2 and _columns(image) == 4 else (3, 3)
+    K = array_of(image, "cam2img", shape, title)
+    if not np.isfinite(K).all() or np.abs(K).max() > MAX_IN_PIXELS:
+        raise InputError(f"The `cam2img` of {title} is impossible; {ADVICE}.")
+    sides = [
+        optional_number(image, key, title, 1.0, float(MAX_SIDE)) for key in ("width", "height")
+    ]
+    size = None if sides[0] is None or sides[1] is None else (int(sides[0]), int(sides[1]))
+    return Intrinsics(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
+
+
+def _columns(image: Mapping[str, Any]) -> int:
+    return np.shape(image["cam2img"])[1]
+
+
+def _place(folder: Path, file: str, camera: str) -> Path:
+    """Where an image lies: beside the pickle, or where the data set keeps those of its camera."""
+    order = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_SIDE_LEFT", "CAM_SIDE_RIGHT")
+    numbered = f"image_{order.index(camera)}" if camera in order else camera
+    places = [folder / file, folder / "samples" / camera / file, folder / camera / file]
+    places += [folder / part / numbered / file for part in ("training", "validation", "testing")]
+    return next((place for place in places if os.path.isfile(place)), places[0])
+
+
+def _kinds(metainfo: Any) -> dict[int, str]:
+    """The names of things by their labels."""
+    kinds = metainfo.get("categories") if isinstance(metainfo, dict) else None
+    return {label: name for name, label in kinds.items()} if isinstance(kinds, dict) else {}
+
+
+def _tells_speeds(sample: _Sample) -> bool:
+    """Whether things around the vehicle have speeds, as those of nuScenes do."""
+    things = sample.content.get("instances")
+    return isinstance(things, list) and any(
+        isinstance(thing, dict) and "velocity" in thing for thing in things
+    )
+
+
+def _boxes(sample: _Sample) -> tuple[Box, ...]:
+    """What may move around the vehicle. Its boxes are told from the laser, by their centres."""
+    title = f"a box in {quoted(sample.file)}"
+    world = sample.vehicle @ sample.vehicle_from_laser
+    things = [thing for thing in sample.content["instances"] if isinstance(thing, dict)]
+    moving = [t for t in things if sample.kinds.get(t.get("bbox_label_3d", -1)) not in FIXED]
+    return tuple(_box(thing, world, title) for thing in moving)
+
+
+def _box(thing: Mapping[str, Any], world: Float[np.ndarray, "4 4"], title: str) -> Box:
+    center, sides, heading = np.split(array_of(thing, "bbox_3d", (7,), title), [3, 6])
+    velocity = (
+        array_of(thing, "velocity", (2,), title) if "velocity" in thing else np.full(2, np.nan)
+    )
+    speed = float(np.linalg.norm(velocity))
+    length, width, height = sides.tolist()
+    pose = world @ upright(center, float(heading[0]))
+    return Box(pose, (length, width, height), speed if np.isfinite(speed) else None)

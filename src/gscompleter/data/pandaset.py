@@ -1,0 +1,93 @@
+"""Sequences of PandaSet: a folder for each camera with its images, intrinsics and poses.
+
+Poses are camera-to-world in OpenCV axes, told as a place and a quaternion. Point clouds and boxes
+are pickles of pandas, which can run programs, and are left out.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.frame import Frame
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.json_numbers import number_of
+from gscompleter.data.limits import MAX_COORDINATE, MAX_IN_PIXELS
+from gscompleter.data.photographs import Photographs, along_a_road
+from gscompleter.data.poses import rotation_of
+from gscompleter.errors import InputError, quoted
+from gscompleter.io.json_file import read_json
+
+FRONT = "front_camera"
+INTRINSICS, POSES = "intrinsics.json", "poses.json"
+ADVICE = "copy the sequence again"
+NO_DEPTH = (
+    "The point clouds and boxes of PandaSet are pickles of pandas, which can run programs; they "
+    "are not read."
+)
+
+
+def holds_pandaset(path: Path) -> bool:
+    """Whether `path` is the folder of a sequence."""
+    return os.path.isfile(path / "camera" / FRONT / POSES)
+
+
+def open_pandaset(path: Path) -> Iterator[Photographs]:
+    """The photographs of a sequence, called by its folder.
+
+    Frames are numbered camera by camera, the front camera first, and by their time.
+
+    Raises:
+        InputError: where poses or intrinsics are missing or damaged.
+    """
+    folders = sorted((path / "camera").iterdir(), key=lambda f: (f.name != FRONT, f.name))
+    cameras = [folder for folder in folders if os.path.isfile(folder / POSES)]
+    frames = [frame for folder in cameras for frame in _frames(folder)]
+    if not frames:
+        raise InputError(f"There are no poses in {quoted(path)}; {ADVICE}.")
+    found = along_a_road(path.resolve().name, str(path), frames, front=FRONT)
+    yield replace(found, notes=(NO_DEPTH,))
+
+
+def _frames(folder: Path) -> list[Frame]:
+    """The photographs of one camera."""
+    poses = read_json(folder / POSES, ADVICE)
+    if not isinstance(poses, list):
+        raise InputError(f"{quoted(folder / POSES)} is no list of poses; {ADVICE}.")
+    intrinsics = _intrinsics(folder / INTRINSICS)
+    return [_frame(folder, number, pose, intrinsics) for number, pose in enumerate(poses)]
+
+
+def _frame(folder: Path, number: int, pose: Any, intrinsics: Intrinsics) -> Frame:
+    title = f"pose {number} of {quoted(folder / POSES)}"
+    image = folder / f"{number:02d}"
+    name = f"{folder.name}/{image.name}"
+    return Frame(name, title, _pose(pose, title), intrinsics, image, sensor=folder.name)
+
+
+def _pose(pose: Any, title: str) -> Float[np.ndarray, "4 4"]:
+    def numbers(part: str, keys: str) -> list[float]:
+        entry = pose.get(part) if isinstance(pose, dict) else None
+        entry = entry if isinstance(entry, dict) else {}
+        return [number_of(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
+
+    c2w = np.eye(4)
+    c2w[:3, :3] = rotation_of(numbers("heading", "wxyz"))
+    c2w[:3, 3] = numbers("position", "xyz")
+    return c2w
+
+
+def _intrinsics(path: Path) -> Intrinsics:
+    content = read_json(path, ADVICE)
+    entry, title = content if isinstance(content, dict) else {}, quoted(path)
+    fx, fy = (
+        number_of(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
+    )
+    cx, cy = (number_of(entry, key, title, -MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("cx", "cy"))
+    return Intrinsics(None, (fx, fy), (cx, cy))

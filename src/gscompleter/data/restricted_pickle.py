@@ -1,0 +1,94 @@
+"""Pickles of plain values: nothing that a file names is ever imported or called.
+
+A pickle is a program. Infos of data sets need little of it: numbers, texts, lists and dictionaries,
+and single numbers of NumPy, which are built here from their bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gscompleter.errors import InputError, quoted, refuse_pointer
+
+MAX_BYTES = 1 << 30
+"""Of a file."""
+NUMBERS = frozenset(["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"])
+"""Kinds of numbers that are built."""
+
+
+def load_plain(path: Path) -> Any:
+    """The plain value in a pickle.
+
+    Raises:
+        InputError: where the file cannot be read, is none, or holds anything but plain values.
+    """
+    refuse_pointer(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(
+                f"{quoted(path)} has more than {MAX_BYTES >> 20} MB; split it into smaller files."
+            )
+        return _Plain(io.BytesIO(path.read_bytes())).load()
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(
+            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+        ) from error
+    except Exception as error:  # a damaged pickle fails in any way that its opcodes can
+        raise InputError(
+            f"{quoted(path)} is no pickle of plain values ({type(error).__name__}: "
+            f"{quoted(str(error))}); write it again with lists and numbers only."
+        ) from error
+
+
+# The unpickler in C reserves as much memory as a file of a few bytes asks for; that in Python grows
+# with what is there.
+class _Plain(pickle._Unpickler):
+    """An unpickler that knows three names."""
+
+    def find_class(self, module: str, name: str) -> Callable[..., Any]:
+        found = KNOWN.get((module.replace("numpy._core", "numpy.core"), name))
+        if found is None:
+            raise pickle.UnpicklingError(f"it asks for {module}.{name}")
+        return found
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise pickle.UnpicklingError("it asks for what lies outside of it")
+
+
+class _Kind:
+    """What NumPy calls a dtype, as far as a single number needs it."""
+
+    def __init__(self, code: str, align: bool = False, copy: bool = False) -> None:
+        if code not in NUMBERS:
+            raise pickle.UnpicklingError(f"it holds NumPy values of the kind {quoted(code)}")
+        self.code, self.order = code, "="
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.order = state[1] if state[1] in ("<", ">", "=") else "="
+
+
+def _number(kind: _Kind, data: bytes) -> bool | int | float:
+    (value,) = np.frombuffer(data, np.dtype(kind.order + kind.code)).tolist()
+    return value
+
+
+def _bytes_of(text: str, encoding: str) -> bytes:
+    if encoding != "latin1":
+        raise pickle.UnpicklingError(f"it asks for the encoding {quoted(encoding)}")
+    return text.encode("latin1")
+
+
+KNOWN: dict[tuple[str, str], Callable[..., Any]] = {
+    ("numpy.core.multiarray", "scalar"): _number,
+    ("numpy", "dtype"): _Kind,
+    ("_codecs", "encode"): _bytes_of,
+}
+"""What is built where a pickle has one of these names."""

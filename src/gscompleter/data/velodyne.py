@@ -1,0 +1,32 @@
+"""Sweeps of KITTI's laser: x, y, z and reflectance as float32, in the frame of the laser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.errors import InputError, quoted
+
+BYTES = 16
+"""Of a point."""
+
+
+def read_sweep(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
+    """The points of a sweep in the world frame, in metres.
+
+    Raises:
+        InputError: where the file cannot be read, or is none of whole points.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+        ) from error
+    if len(data) % BYTES:
+        raise InputError(f"{quoted(path)} is truncated: it ends within a point; copy it again.")
+    points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
+    finite = points[np.isfinite(points).all(axis=1)]
+    return finite @ world_from_laser[:3, :3].T + world_from_laser[:3, 3]

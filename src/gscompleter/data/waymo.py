@@ -1,0 +1,294 @@
+"""Segments of the Waymo Open Dataset, version 2: a parquet file for each component and segment.
+
+`camera_image/SEGMENT.parquet` holds the photographs, a row for each camera and time, with the pose
+of the vehicle as it was taken; `camera_calibration` the cameras on the vehicle. Where the segment
+has them, `lidar`, `lidar_calibration`, `lidar_pose` and `vehicle_pose` give sparse depth, and
+`lidar_box` what moves. Axes of vehicle and cameras are x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.frame import Frame
+from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.lens import Distortion
+from gscompleter.data.limits import MAX_SIDE
+from gscompleter.data.moving_objects import Box, upright
+from gscompleter.data.parquet import ADVICE, read_columns
+from gscompleter.data.photographs import Photographs, along_a_road
+from gscompleter.data.range_image import inclinations_of, moved, points_of, poses_of
+from gscompleter.errors import InputError, quoted
+
+IMAGES = "camera_image"
+CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
+"""By the numbers that the tables give them."""
+SIGN = 3
+"""The type of boxes around things that never move."""
+CAMERA_FROM_OPENCV = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""From x right, y down, z forward to x forward, y left, z up."""
+
+Beams = tuple[Float[np.ndarray, "h"] | None, float, float]
+"""The inclinations of a laser's beams in radians, in rising order, and where they begin and end."""
+
+LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "k3", "p1", "p2")
+TIME, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
+
+
+def holds_waymo(path: Path) -> bool:
+    """Whether `path` is a folder of segments, or the photographs of one segment."""
+    if os.path.isdir(path):
+        return any((path / IMAGES).glob("*.parquet"))
+    return path.suffix == ".parquet" and path.parent.name == IMAGES and os.path.isfile(path)
+
+
+def open_waymo(path: Path) -> Iterator[Photographs]:
+    """The segments in a folder, or the one whose photographs are named, called by their names.
+
+    Frames are numbered camera by camera, the front camera first, and by their time.
+
+    Raises:
+        InputError: where a table is missing or damaged, or pyarrow is not installed.
+    """
+    if os.path.isdir(path):
+        names = [file.stem for file in sorted((path / IMAGES).glob("*.parquet"))]
+        segments = [Segment(path, name) for name in names]
+    else:
+        segments = [Segment(path.parent.parent, path.stem)]
+    return map(_photographs, segments)
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Twenty seconds of one drive."""
+
+    root: Path
+    """The folder with a folder for each component."""
+    name: str
+
+    def file(self, component: str) -> Path:
+        """Where a component of it lies."""
+        return self.root / component / f"{self.name}.parquet"
+
+    def has(self, *components: str) -> bool:
+        """Whether all of these components are there."""
+        return all(os.path.isfile(self.file(component)) for component in components)
+
+    def rows(
+        self, component: str, columns: dict[str, str], **where: int
+    ) -> Iterator[dict[str, Any]]:
+        """Rows of a component, their values by the keys of `columns`; `where` tells the time."""
+        keys = {{"time": TIME, "camera": CAMERA}[key]: value for key, value in where.items()}
+        found = read_columns(self.file(component), list(columns.values()), keys)
+        values = [found[column] for column in columns.values()]
+        return (dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True))
+
+
+def _photographs(segment: Segment) -> Photographs:
+    file = segment.file(IMAGES)
+    columns = {"time": TIME, "camera": CAMERA, "pose": "[CameraImageComponent].pose.transform"}
+    cameras = _cameras(segment)
+    rows = sorted(
+        (row for row in segment.rows(IMAGES, columns) if row["camera"] in CAMERAS),
+        key=lambda row: (row["camera"], row["time"]),
+    )
+    if not rows:
+        raise InputError(f"{quoted(file)} holds no photographs; {ADVICE}.")
+    frames = [_frame(segment, cameras, **row) for row in rows]
+    return along_a_road(segment.name, str(file), frames, front=CAMERAS[1])
+
+
+def _frame(
+    segment: Segment,
+    cameras: dict[int, tuple[Intrinsics, Float[np.ndarray, "4 4"]]],
+    time: int,
+    camera: int,
+    pose: Any,
+) -> Frame:
+    title = f"the photograph of {CAMERAS[camera]} at {time} in {quoted(segment.file(IMAGES))}"
+    if camera not in cameras:
+        raise InputError(f"The camera of {title} has no calibration; {ADVICE}.")
+    intrinsics, vehicle_from_camera = cameras[camera]
+    measured = segment.has("lidar", "lidar_calibration", "vehicle_pose")
+    boxed = segment.has("lidar_box", "vehicle_pose")
+    return Frame(
+        f"{CAMERAS[camera]}/{time}",
+        title,
+        _matrix(pose, title) @ vehicle_from_camera @ CAMERA_FROM_OPENCV,
+        intrinsics,
+        partial(_image, segment, time, camera),
+        sensor=CAMERAS[camera],
+        measured=partial(_points, segment, time) if measured else None,
+        boxes=partial(_boxes, segment, time) if boxed else None,
+    )
+
+
+def _cameras(segment: Segment) -> dict[int, tuple[Intrinsics, Float[np.ndarray, "4 4"]]]:
+    """The intrinsics of each camera, and its pose on the vehicle in the axes of Waymo."""
+    prefix = "[CameraCalibrationComponent]"
+    columns = {"camera": CAMERA, **{key: f"{prefix}.intrinsic.{key}" for key in LENS}}
+    columns |= {"width": f"{prefix}.width", "height": f"{prefix}.height"}
+    columns |= {"pose": f"{prefix}.extrinsic.transform"}
+    title = str(segment.file("camera_calibration"))
+    return {
+        row["camera"]: (_intrinsics(row, title), _matrix(row["pose"], title))
+        for row in segment.rows("camera_calibration", columns)
+    }
+
+
+def _intrinsics(row: dict[str, Any], title: str) -> Intrinsics:
+    values = {key: value for key, value in row.items() if key != "pose"}
+    if any(value is None or not np.isfinite(value) for value in values.values()):
+        raise InputError(f"A camera in {quoted(title)} lacks intrinsics; {ADVICE}.")
+    size = (row["width"], row["height"])
+    if not all(1 <= side <= MAX_SIDE for side in size):
+        raise InputError(f"A camera in {quoted(title)} has images of {size} pixels; {ADVICE}.")
+    return Intrinsics(
+        size,
+        (row["f_u"], row["f_v"]),
+        (row["c_u"], row["c_v"]),
+        distortion=Distortion(
+            radial=(row["k1"], row["k2"], row["k3"]), tangential=(row["p1"], row["p2"])
+        ),
+    )
+
+
+def _image(segment: Segment, time: int, camera: int) -> bytes:
+    """The JPEG file of a photograph."""
+    columns = {"image": "[CameraImageComponent].image"}
+    found = [row["image"] for row in segment.rows(IMAGES, columns, time=time, camera=camera)]
+    if len(found) != 1 or not isinstance(found[0], bytes):
+        raise InputError(
+            f"{quoted(segment.file(IMAGES))} has no image of {CAMERAS[camera]} at {time}; {ADVICE}."
+        )
+    return found[0]
+
+
+@lru_cache(maxsize=2)
+def _points(segment: Segment, time: int) -> Float[np.ndarray, "n 3"]:
+    """What the lasers of the vehicle measured first, in the world frame and in metres.
+
+    The laser on the roof turns while the vehicle drives, and `lidar_pose` has where the vehicle
+    was at each of its measurements.
+    """
+    vehicle = _vehicle(segment, time)
+    prefix = "[LiDARComponent].range_image_return1"
+    columns = {"laser": LASER, "values": f"{prefix}.values", "shape": f"{prefix}.shape"}
+    lasers, turning = _lasers(segment), _poses_while_turning(segment, time)
+    points = [np.zeros((0, 3))]
+    for row in segment.rows("lidar", columns, time=time):
+        laser, image = row["laser"], _image_of(row, segment.file("lidar"))
+        if image is None:
+            continue
+        ranges, poses = image[..., 0], turning.get(laser, vehicle)
+        if laser not in lasers or not _fit_together(ranges, lasers[laser][0], poses):
+            raise InputError(
+                f"Laser {laser} of {quoted(segment.file('lidar'))} does not fit its calibration or "
+                f"its poses; {ADVICE}."
+            )
+        points.append(_hits(ranges, *lasers[laser], poses))
+    return np.concatenate(points)
+
+
+def _fit_together(ranges: np.ndarray, beams: Beams, poses: np.ndarray) -> bool:
+    """Whether each row of a range image has a beam, and each pixel a pose where any has."""
+    values, low, high = beams
+    known = low is not None and high is not None if values is None else len(values) == len(ranges)
+    return known and (poses.ndim == 2 or poses.shape[:2] == ranges.shape)
+
+
+def _hits(
+    ranges: Float[np.ndarray, "h w"],
+    beams: Beams,
+    extrinsic: Float[np.ndarray, "4 4"],
+    vehicle: Float[np.ndarray, "h w 4 4"] | Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "n 3"]:
+    """What a laser hit, in the world frame; `vehicle` is one pose, or that at each pixel."""
+    local = points_of(ranges, inclinations_of(*beams, len(ranges)), extrinsic)
+    hit = np.isfinite(ranges) & (ranges > 0)
+    return moved(local[hit], vehicle if vehicle.ndim == 2 else vehicle[hit])
+
+
+def _vehicle(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
+    """The pose of the vehicle at that time."""
+    title = str(segment.file("vehicle_pose"))
+    columns = {"pose": "[VehiclePoseComponent].world_from_vehicle.transform"}
+    found = [
+        _matrix(row["pose"], title) for row in segment.rows("vehicle_pose", columns, time=time)
+    ]
+    if len(found) != 1:
+        raise InputError(f"{quoted(title)} has {len(found)} poses at {time}; {ADVICE}.")
+    return found[0]
+
+
+def _lasers(segment: Segment) -> dict[int, tuple[Beams, Float[np.ndarray, "4 4"]]]:
+    """The inclinations of each laser, as `inclinations_of` takes them, and its pose."""
+    prefix = "[LiDARCalibrationComponent]"
+    columns = {"laser": LASER, "pose": f"{prefix}.extrinsic.transform"}
+    columns |= {key: f"{prefix}.beam_inclination.{key}" for key in ("values", "min", "max")}
+    title = str(segment.file("lidar_calibration"))
+    return {
+        row["laser"]: ((row["values"], row["min"], row["max"]), _matrix(row["pose"], title))
+        for row in segment.rows("lidar_calibration", columns)
+    }
+
+
+def _poses_while_turning(segment: Segment, time: int) -> dict[int, Float[np.ndarray, "h w 4 4"]]:
+    """Poses of the vehicle at each pixel of the range images that have them."""
+    if not segment.has("lidar_pose"):
+        return {}
+    prefix = "[LiDARPoseComponent].range_image_return1"
+    columns = {"laser": LASER, "values": f"{prefix}.values", "shape": f"{prefix}.shape"}
+    images = {
+        row["laser"]: _image_of(row, segment.file("lidar_pose"))
+        for row in segment.rows("lidar_pose", columns, time=time)
+    }
+    return {laser: poses_of(image) for laser, image in images.items() if image is not None}
+
+
+def _image_of(row: dict[str, Any], file: Path) -> Float[np.ndarray, "h w c"] | None:
+    """The values of a range image in their shape; None where there are none."""
+    values, shape = row["values"], row["shape"]
+    if values is None or shape is None:
+        return None
+    if len(shape) != 3 or any(side < 1 for side in shape) or len(values) != np.prod(shape):
+        raise InputError(f"A range image in {quoted(file)} is damaged; {ADVICE}.")
+    return np.asarray(values, dtype=np.float64).reshape(shape)
+
+
+def _boxes(segment: Segment, time: int) -> tuple[Box, ...]:
+    """What stands or moves around the vehicle, signs left out."""
+    vehicle = _vehicle(segment, time)
+    prefix = "[LiDARBoxComponent]"
+    columns = {"type": f"{prefix}.type", "heading": f"{prefix}.box.heading"}
+    columns |= {f"center_{axis}": f"{prefix}.box.center.{axis}" for axis in "xyz"}
+    columns |= {f"size_{axis}": f"{prefix}.box.size.{axis}" for axis in "xyz"}
+    columns |= {f"speed_{axis}": f"{prefix}.speed.{axis}" for axis in "xyz"}
+    rows = segment.rows("lidar_box", columns, time=time)
+    return tuple(_box(row, vehicle) for row in rows if row["type"] != SIGN)
+
+
+def _box(row: dict[str, Any], vehicle: Float[np.ndarray, "4 4"]) -> Box:
+    def vector(of: str) -> Float[np.ndarray, "3"]:
+        return np.array([row[f"{of}_{axis}"] for axis in "xyz"], dtype=np.float64)
+
+    speed, (length, width, height) = float(np.linalg.norm(vector("speed"))), vector("size").tolist()
+    pose = vehicle @ upright(vector("center"), np.float64(row["heading"]))
+    return Box(pose, (length, width, height), speed if np.isfinite(speed) else None)
+
+
+def _matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:
+    """A transform from its 16 numbers, row by row."""
+    if values is None or len(values) != 16 or not np.isfinite(values).all():
+        raise InputError(f"A transform in {quoted(title)} is damaged; {ADVICE}.")
+    return np.asarray(values, dtype=np.float64).reshape(4, 4)

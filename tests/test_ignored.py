@@ -1,0 +1,187 @@
+"""Photographs that are ignored in part: nothing is made of it, and nothing held against it."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter import InputError
+from gscompleter.config import RefineConfig
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.moving_objects import Box, covered, upright
+from gscompleter.data.photographs import without_masked
+from gscompleter.data.sparse_depth import sparse_depth
+from gscompleter.generators.warp import warp_photographs
+from gscompleter.geometry import unproject
+from gscompleter.io.image import write_image
+from gscompleter.metrics.scores import Truth, score
+from gscompleter.render import load_renderer
+from gscompleter.stages.context import init_context
+from gscompleter.stages.harm import do_no_harm, squared_error
+from gscompleter.stages.integration import refine_opacities
+from gscompleter.types import SceneContext, View, sh_from_rgb
+from scenes import Room, camera_at, gaussians_of, half_a_room_of, photographed, reconstruction_of
+from scenes import view_of as photograph_of
+
+SIZE = 48
+ROOM = Room()
+CAMERA = camera_at(size=SIZE)
+RENDERER = load_renderer("cpu")
+
+
+def square(low: int = 12, high: int = 30) -> torch.Tensor:
+    """A square of pixels to ignore."""
+    mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    mask[low:high, low:high] = True
+    return mask
+
+
+def with_something_red(view: View) -> View:
+    """The photograph, with something red that is to be ignored."""
+    mask = square()
+    red = torch.tensor([1.0, 0.0, 0.0])
+    return replace(view, image=torch.where(mask[..., None], red, view.image), ignored=mask)
+
+
+@pytest.mark.parametrize("aligned", [True, False])
+def test_nothing_is_made_of_what_is_ignored(aligned):
+    views = [photograph_of(ROOM, camera_at(x, size=SIZE)) for x in (0.0, 0.3)]
+    views[0] = with_something_red(views[0])
+    made = reconstruction_of(views, [view.depth for view in views])
+    unaligned = replace(made, view_index=None, pixel_index=None)
+    scene, _ = init_context(lambda _: made if aligned else unaligned, views)
+    red = sh_from_rgb(torch.tensor([[1.0, 0.0, 0.0]]))
+    assert ((made.gaussians.sh - red).abs().amax((1, 2)) < 1e-5).sum() == square().sum()
+    assert ((scene.sh - red).abs().amax((1, 2)) > 1e-5).all()
+    gone = len(made.gaussians) - len(scene)
+    if aligned:
+        assert gone == square().sum()
+    else:
+        assert square().sum() < gone < 2.2 * square().sum()
+
+
+def test_what_is_ignored_forbids_nothing():
+    """What is added to the right half differs from a photograph that is black there."""
+    view, context, added = half_a_room_of(ROOM, CAMERA)
+    mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    mask[:, SIZE // 2 :] = True
+    wrong = replace(view, image=torch.where(mask[..., None], 0.0, view.image))
+    frozen = RENDERER.freeze(context, CAMERA)
+    for photograph, kept in ((wrong, False), (replace(wrong, ignored=mask), True)):
+        before = photograph.compared(frozen.context.image)
+        allowed = 2 * squared_error(before, photograph.image).item() + 1e-3
+        mended = do_no_harm(added, [frozen], [photograph], [allowed])
+        assert torch.equal(mended.opacities, added.opacities) == kept
+
+
+def test_refinement_asks_nothing_there():
+    view, context, added = half_a_room_of(ROOM, CAMERA)
+    frozen = RENDERER.freeze(context, CAMERA)
+    mask = torch.ones(SIZE, SIZE, dtype=torch.bool)
+    odd = replace(view, image=1 - view.image)
+    reference = photograph_of(ROOM, CAMERA)
+
+    def refined(photographs: list[View]) -> torch.Tensor:
+        frozens = [frozen] * len(photographs)
+        config = RefineConfig(iterations=3)
+        return refine_opacities(added, frozen, reference, frozens, photographs, config)[0].opacities
+
+    assert torch.equal(refined([replace(odd, ignored=mask)]), refined([]))
+    assert not torch.equal(refined([odd]), refined([]))
+
+
+def test_what_is_ignored_is_not_carried_over():
+    target = camera_at(0.1, size=SIZE)
+    views = (with_something_red(photograph_of(ROOM, CAMERA)),)
+    scene = gaussians_of(photograph_of(ROOM, CAMERA))
+    at_views = (RENDERER.render(scene, CAMERA),)
+    context = SceneContext(views, at_views, RENDERER.render(scene, target))
+    careless = replace(context, views=(replace(views[0], ignored=None),))
+
+    def reds(known: SceneContext) -> int:
+        red, green, blue = warp_photographs(views[0], target, known).image.unbind(-1)
+        return int((red - (green + blue) / 2 > 0.9).sum())
+
+    assert reds(careless) > 0.8 * square().sum()
+    assert reds(context) == 0
+
+
+def test_scores_count_nothing_there():
+    view = photograph_of(ROOM, CAMERA)
+    scene = gaussians_of(view)
+    red = with_something_red(view)
+
+    def scored(photograph: View):
+        truth = Truth((photograph, photograph), photograph, (photograph,))
+        return score(scene, scene, scene[:0], truth, RENDERER)[0]
+
+    plain, ignoring, counting = (scored(v) for v in (view, red, replace(red, ignored=None)))
+    assert counting.target_after.psnr < plain.target_after.psnr - 5
+    assert ignoring.target_after.psnr == pytest.approx(plain.target_after.psnr, abs=1.0)
+    assert ignoring.context_psnr[0].after == ignoring.target_after.psnr
+    assert ignoring.neighbours_psnr.after == pytest.approx(ignoring.target_after.psnr)
+    assert ignoring.target_after.ssim > plain.target_after.ssim - 1e-6
+    assert counting.target_after.ssim < plain.target_after.ssim - 0.1
+    moved = replace(red, depth=torch.where(square(), 5 * view.depth, view.depth))
+    assert scored(moved).depth_observed == pytest.approx(ignoring.depth_observed)
+    assert scored(replace(moved, ignored=None)).depth_observed > ignoring.depth_observed + 0.1
+
+
+def test_masks_of_files_are_ignored_where_asked(tmp_path):
+    folder = photographed(tmp_path, [camera_at(x, size=SIZE) for x in (0.0, 0.3)])
+    photographs = open_photographs(folder)
+    for name, mask in (("one.png", square()), ("all.png", torch.ones(SIZE, SIZE) > 0)):
+        write_image(tmp_path / name, ~mask)
+    frames = [
+        replace(frame, mask=tmp_path / name)
+        for frame, name in zip(photographs.frames, ("one.png", "all.png"), strict=True)
+    ]
+    masked = replace(photographs, frames=tuple(frames))
+    assert (photographs.has_masks, masked.has_masks) == (False, True)
+    (view,) = without_masked(masked.views([0]), masked)
+    assert torch.equal(view.ignored, square())
+    (plain,) = without_masked(photographs.views([0]), photographs)
+    assert plain.ignored is None
+    with pytest.raises(InputError, match="All of frame 1 of .* is masked"):
+        without_masked(masked.views([1]), masked)
+
+
+def box_at(center: tuple[float, ...], side: float, speed: float | None, turn: float = 0.0) -> Box:
+    pose = upright(torch.tensor(center, dtype=torch.float64).numpy(), turn)
+    return Box(pose, (side, side, side), speed)
+
+
+def test_a_box_covers_its_outline():
+    """A cube with its front face 2 ahead: 1.1 wide once it is widened, 0.55 to either side."""
+    mask = covered([box_at((0.0, 0.0, 2.55), 1.0, 3.0)], CAMERA, CAMERA.center.double().numpy())
+    half = 0.55 / 2.0 * 0.9 * SIZE
+    rows, columns = torch.nonzero(torch.from_numpy(mask), as_tuple=True)
+    for found in (rows, columns):
+        assert found.min().item() == pytest.approx(SIZE / 2 - half, abs=1.5)
+        assert found.max().item() == pytest.approx(SIZE / 2 + half, abs=1.5)
+    assert mask.sum() == pytest.approx((2 * half) ** 2, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("center", "speed", "share"),
+    [
+        ((0.0, 0.0, 3.0), 0.2, 0.0),
+        ((0.0, 0.0, 3.0), None, 0.03),
+        ((0.0, 0.0, -3.0), 3.0, 0.0),
+        ((0.0, 0.0, 0.2), 3.0, 0.99),
+        ((1e7, 0.0, 3.0), 3.0, 0.0),
+    ],
+)
+def test_boxes_that_stand_lie_behind_or_around(center, speed, share):
+    mask = covered([box_at(center, 1.0, speed, 0.7)], CAMERA, CAMERA.center.double().numpy())
+    assert mask.mean() >= share
+    assert share > 0 or not mask.any()
+
+
+def test_the_nearest_point_of_a_pixel_tells_its_depth():
+    wall = torch.full((SIZE, SIZE), 4.0)
+    points = torch.cat([unproject(0.5 * (i + 2) * wall, CAMERA).reshape(-1, 3) for i in range(2)])
+    behind = -points
+    depth = sparse_depth(torch.cat([points, behind])[::2], CAMERA)
+    assert (depth[:, ::2] - 4.0).abs().max() < 1e-5
+    assert (depth[:, 1::2] == 0).all()
