@@ -9,7 +9,7 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH_INDEX := $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url $(TORCH_CPU_INDEX))
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow lint format types evaluate bench gpu clean
+.PHONY: demo test test-slow lint format types docs dist release-check evaluate bench gpu clean
 
 demo: $(VENV)/installed
 	$(BIN)/gscompleter demo --out demo --overwrite
@@ -31,6 +31,19 @@ format: $(VENV)/installed-dev
 
 types: $(VENV)/installed-dev
 	$(BIN)/mypy
+
+# The documentation site, in site/; a warning is an error.
+docs: $(VENV)/installed-test
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# Wheel and sdist, in dist/. The same sources give the same bytes.
+dist: $(VENV)/installed-test
+	$(BIN)/python -m hatchling build -d dist
+
+# The wheel and every extra in an empty environment of each Python; gigabytes and an hour.
+PYTHONS ?= python3.10 python3.11 python3.12 python3.13
+release-check: $(VENV)/installed-test
+	$(BIN)/python tests/release_check.py $(PYTHONS) --extras
 
 # Compares methods on every case of a cases.json: make evaluate CASES=path/to/cases.json METHODS=all
 CASES ?= ../shared/data/cases.json
@@ -91,4 +104,4 @@ $(VENV)/installed-dev: pyproject.toml | $(VENV)/torch
 	touch $@ $(VENV)/installed $(VENV)/installed-test
 
 clean:
-	rm -rf $(VENV) $(GPU_VENV) demo results build dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(GPU_VENV) demo results build dist site .pytest_cache .mypy_cache .ruff_cache

@@ -1,4 +1,4 @@
-"""What the build of a wheel adds: the viewer's JavaScript, so that `view` has to fetch nothing."""
+"""What the build adds: the viewer's JavaScript, so that `view` has to fetch nothing."""
 
 from __future__ import annotations
 
@@ -14,12 +14,22 @@ PLACE = "gscompleter/viewer/libraries.json"
 
 
 class ViewerLibraries(BuildHookInterface[Any]):
-    """Packs the pinned npm packages into the wheel; the same lock gives the same bytes."""
+    """Packs the pinned npm packages into wheel and sdist; the same lock gives the same bytes."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Fetch them, and say so where that cannot be: `view` does the same when it first runs."""
+        """Fetch them, and say so where that cannot be: `view` does the same when it first runs.
+
+        Of an sdist, which has them, a wheel is built without a connection.
+        """
         if version == "editable":
             return
+        place = PLACE if self.target_name == "wheel" else f"src/{PLACE}"
+        packed = Path(self.root) / "src" / PLACE
+        if packed.is_file() or (packed := self.fetched()) is not None:
+            build_data["force_include"][str(packed)] = place
+
+    def fetched(self) -> Path | None:
+        """A file of the libraries; None, with a warning, where they cannot be had."""
         sys.path.insert(0, str(Path(self.root) / "src"))
         from gscompleter.errors import InputError
         from gscompleter.viewer.packages import write_libraries
@@ -29,6 +39,8 @@ class ViewerLibraries(BuildHookInterface[Any]):
         try:
             write_libraries(packed)
         except InputError as error:
-            self.app.display_warning(f"This wheel comes without the viewer's libraries: {error}")
-            return
-        build_data["force_include"][str(packed)] = PLACE
+            self.app.display_warning(
+                f"This {self.target_name} comes without the viewer's libraries: {error}"
+            )
+            return None
+        return packed

@@ -15,8 +15,8 @@ from gscompleter.io.image import write_image
 
 def main() -> None:
     scene, first, second, target = sys.argv[1], *map(int, sys.argv[2:5])
-    views = gsc.load_views(scene, frames=[first, second], resolution=(256, 256))
-    camera = gsc.load_camera(scene, frame=target, resolution=(256, 256))
+    views = gsc.load_views(scene, frames=[first, second], resolution=256)
+    camera = gsc.load_camera(scene, frame=target, resolution=256)
 
     completion = gsc.GSCompleter()(views, camera)
     (result,) = completion.targets

@@ -24,8 +24,8 @@ def mean_colour(nearest: gsc.View, target: gsc.Camera, context: SceneContext) ->
 
 def main() -> None:
     scene, first, second, target = sys.argv[1], *map(int, sys.argv[2:5])
-    views = gsc.load_views(scene, frames=[first, second], resolution=(256, 256))
-    camera = gsc.load_camera(scene, frame=target, resolution=(256, 256))
+    views = gsc.load_views(scene, frames=[first, second], resolution=256)
+    camera = gsc.load_camera(scene, frame=target, resolution=256)
 
     completer = gsc.GSCompleter(
         reconstructor=PlaneSweep(disc_sigma=0.7),

@@ -39,8 +39,8 @@ class Telea:
 
 def main() -> None:
     scene, first, second, target = sys.argv[1], *map(int, sys.argv[2:5])
-    views = gsc.load_views(scene, frames=[first, second], resolution=(256, 256))
-    camera = gsc.load_camera(scene, frame=target, resolution=(256, 256))
+    views = gsc.load_views(scene, frames=[first, second], resolution=256)
+    camera = gsc.load_camera(scene, frame=target, resolution=256)
     completion = gsc.GSCompleter(generator=Telea())(views, camera)
     print(f"{len(completion.added):,} Gaussians joined {len(completion.context):,}.")
     for note in completion.targets[0].notes:

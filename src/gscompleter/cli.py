@@ -18,6 +18,7 @@ from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
 from gscompleter import __version__
 from gscompleter.commands.convert import ConvertOptions
+from gscompleter.commands.doctor import DoctorOptions
 from gscompleter.commands.generator_options import generator_flags
 from gscompleter.commands.options import (
     FOUND,
@@ -60,6 +61,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "report": (ReportOptions, "gscompleter.commands.report", "run_report"),
     "strip": (StripOptions, "gscompleter.commands.strip", "run_strip"),
     "view": (ViewOptions, "gscompleter.commands.view", "run_view"),
+    "doctor": (DoctorOptions, "gscompleter.commands.doctor", "run_doctor"),
     "warmup": (WarmupOptions, "gscompleter.commands.warmup", "run_warmup"),
 }
 

@@ -296,8 +296,8 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
     """Four of the eight paths: along the row, and from the three neighbours of the row before."""
     h, w = large_y.shape[0] + 1, large_x.shape[1] + 1
     widest = 2
-    for low, high in zip(bands.low.flat, bands.high.flat):
-        widest = max(widest, high - low + 2)
+    for width in (bands.high - bands.low).flat:
+        widest = max(widest, width + 2)
     rows = np.zeros((2, 3, w, widest), np.float32)
     lows = np.zeros((2, 3, w), np.float32)
     along = np.zeros((2, widest), np.float32)

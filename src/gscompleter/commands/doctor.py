@@ -1,0 +1,209 @@
+"""The command `doctor`: what is on this machine, and what cannot be done for want of what."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+
+from packaging.requirements import Requirement
+
+from gscompleter.config.settings import Settings
+from gscompleter.errors import InputError
+
+DISTRIBUTION = "gscompleter"
+"""What pip calls the package."""
+
+PURPOSES = {
+    "cuda": "rendering on an NVIDIA GPU",
+    "evaluation": "the plots of evaluate, tables and bench",
+    "models": "downloading published weights from the Hugging Face hub",
+    "diffusion": "--generator pe-field and diffusers-inpaint",
+    "poses": "photographs whose cameras are not known",
+    "fid": "tables --fid",
+    "live": "completing in the browser with gscompleter live",
+    "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
+    "film": "complete --film",
+    "waymo": "the Waymo Open Dataset 2, whose tables are parquet",
+}
+"""What each extra is for. Those for developers (`test`, `dev`, `docs`) are not looked for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorOptions(Settings):
+    """Say what is there (device, renderers, packages, extras, weights, caches), and what cannot be
+    done for want of what.
+
+    Nothing is downloaded or changed. What is missing is missing for something: the embedded models
+    need the packages alone.
+    """
+
+    json: bool = False
+    """Print it as JSON."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """One thing that was looked for."""
+
+    kind: str
+    """What it is one of: the heading that it stands under."""
+    name: str
+    there: bool
+    told: str
+    """Versions and places of what is there; of what is missing, what it is for and what to do."""
+
+
+def run_doctor(options: DoctorOptions) -> None:
+    """Look at everything and print it."""
+    found = list(examined())
+    if options.json:
+        print(json.dumps([asdict(one) for one in found], indent=2))
+    else:
+        tell(found)
+
+
+def tell(found: list[Found]) -> None:
+    """Print what was found, by kinds, a line each."""
+    width = max(len(one.name) for one in found)
+    kinds = dict.fromkeys(one.kind for one in found)
+    for kind in kinds:
+        print(f"{kind}:")
+        for one in found:
+            if one.kind == kind:
+                print(f"  {one.name:{width}}  {'' if one.there else 'missing: '}{one.told}")
+
+
+def examined() -> Iterator[Found]:
+    """All that is looked for, in the order in which it is told."""
+    yield from machine_facts()
+    yield from packages()
+    yield from extras()
+    yield from renderers()
+    yield from weights()
+    yield from viewer()
+    yield from caches()
+
+
+def machine_facts() -> Iterator[Found]:
+    """Versions, processor, memory and the device that is computed on."""
+    # Here and below, so that `--help` does not wait for torch.
+    from gscompleter.benchmark.machine import machine
+    from gscompleter.render import choose_device
+
+    facts = machine(choose_device())
+    unit = {"memory_gb": ("memory", " GB")}
+    for name, value in facts.items():
+        shown, suffix = unit.get(name, (name, ""))
+        yield Found("machine", shown, True, f"{value}{suffix}")
+
+
+def packages() -> Iterator[Found]:
+    """The packages that everything needs."""
+    for requirement in required():
+        there = installed(requirement)
+        told = there or f"{requirement}, without which nothing runs; pip install '{requirement}'"
+        yield Found("packages", requirement.name, there is not None, told)
+
+
+def extras() -> Iterator[Found]:
+    """What `pip install 'gscompleter[EXTRA]'` adds."""
+    for extra, purpose in PURPOSES.items():
+        versions = {requirement.name: installed(requirement) for requirement in required(extra)}
+        missing = [name for name, there in versions.items() if there is None]
+        listed = ", ".join(missing or [f"{name} {there}" for name, there in versions.items()])
+        remedy = f"; pip install '{DISTRIBUTION}[{extra}]'" if missing else ""
+        yield Found("extras", extra, not missing, f"{listed}, for {purpose}{remedy}")
+
+
+def required(extra: str = "") -> list[Requirement]:
+    """What the package needs, or what an extra adds to that.
+
+    Raises:
+        InputError: where pip knows nothing of the package.
+    """
+    try:
+        all_of_them = [Requirement(line) for line in requires(DISTRIBUTION) or []]
+    except PackageNotFoundError:
+        raise InputError(
+            f"What {DISTRIBUTION} needs is told by its installation, and there is none; run "
+            "`pip install .` in the folder of its sources."
+        ) from None
+    return [r for r in all_of_them if is_for(extra, r)]
+
+
+def is_for(extra: str, requirement: Requirement) -> bool:
+    """Whether an extra adds this requirement; without a name, whether all need it."""
+    if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+        return not extra
+    return bool(extra) and requirement.marker.evaluate({"extra": extra})
+
+
+def installed(requirement: Requirement) -> str | None:
+    """The version that is here, where it is one that will do."""
+    try:
+        there = version(requirement.name)
+    except PackageNotFoundError:
+        return None
+    return there if requirement.specifier.contains(there, prereleases=True) else None
+
+
+def renderers() -> Iterator[Found]:
+    """Which renderers can draw here, and whether the kernels are compiled."""
+    from gscompleter.kernels.compiled import is_compiled
+    from gscompleter.rehearsal import PARTS
+    from gscompleter.render import load_renderer
+
+    for name in ("cpu", "cuda", "reference"):
+        try:
+            load_renderer(name)
+        except InputError as error:
+            yield Found("renderers", name, False, str(error))
+        else:
+            yield Found("renderers", name, True, "draws here")
+    missing = [part for part in PARTS if not is_compiled(part)]
+    lacking = "compiled by the first completion, or in advance by `gscompleter warmup`"
+    yield Found("renderers", "kernels", not missing, lacking if missing else "compiled")
+
+
+def weights() -> Iterator[Found]:
+    """Weights that others publish: those of Ψ, and of LPIPS."""
+    from gscompleter.metrics.lpips import NETWORKS
+    from gscompleter.metrics.lpips import place_of as place_of_lpips
+    from gscompleter.weights.fetching import cached
+    from gscompleter.weights.published import PUBLISHED
+
+    here = [name for name, published in PUBLISHED.items() if cached(published)]
+    listed = ", ".join(here) or f"all {len(PUBLISHED)} that `gscompleter models` lists"
+    yield Found("weights", "reconstructors", bool(here), f"{listed}, for --reconstructor")
+    for name, network in NETWORKS.items():
+        places = [place_of_lpips(file, None) for file in (network.backbone, network.linear)]
+        there = all(place.is_file() for place in places)
+        told = "for LPIPS in the tables of evaluate" + ("" if there else "; load_lpips fetches it")
+        yield Found("weights", f"lpips-{name}", there, told)
+
+
+def viewer() -> Iterator[Found]:
+    """The JavaScript that pages need: in the wheel, in our cache, or to be fetched."""
+    from gscompleter.viewer.packages import BUILT, LOCK, place_of, read_lock
+
+    if BUILT.is_file():
+        yield Found("viewer", "libraries", True, f"with the package, {BUILT}")
+        return
+    missing = [p for p in read_lock(LOCK) if not place_of(p).is_file()]
+    names = ", ".join(package.name for package in missing)
+    lacking = f"{names}, fetched with npm's registry when `gscompleter view` is first run"
+    yield Found("viewer", "libraries", not missing, lacking if missing else "in the cache")
+
+
+def caches() -> Iterator[Found]:
+    """Where files are kept for later runs."""
+    import torch
+
+    from gscompleter.cache import cache_folder
+    from gscompleter.kernels.compiled import cache_folder as kernels_folder
+
+    yield Found("caches", "downloads", True, f"{cache_folder()} (GSCOMPLETER_HOME)")
+    yield Found("caches", "kernels", True, f"{kernels_folder()} (NUMBA_CACHE_DIR)")
+    yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")

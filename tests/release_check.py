@@ -1,0 +1,140 @@
+"""The wheel in empty environments, one for each Python that is named: `make release-check`.
+
+    python tests/release_check.py python3.10 python3.13 [--extras]
+
+Each gets the wheel and what pip finds for it, a few GB with the torch that pip chooses; then the
+commands run in another folder, with nothing on the PATH but the environment: no compiler, no Node.
+With `--extras` each extra is installed on top, one after the other, and imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from gscompleter import __version__
+from gscompleter.commands.doctor import PURPOSES
+
+ROOT = Path(__file__).resolve().parents[1]
+
+IMPORT_ALL = "import gscompleter; [getattr(gscompleter, name) for name in gscompleter.__all__]"
+"""Every public name."""
+IMPORT_EXTRA = """
+import sys
+from importlib import import_module
+from importlib.metadata import packages_distributions
+from gscompleter.commands.doctor import required
+wanted = {requirement.name.replace("_", "-").lower() for requirement in required(sys.argv[1])}
+for module, places in packages_distributions().items():
+    ours = any(place.replace("_", "-").lower() in wanted for place in places)
+    if ours and module.isidentifier() and module != "__pycache__":
+        import_module(module)
+        print("imported", module)
+"""
+"""The modules that the packages of an extra bring."""
+
+
+def built(kind: str, folder: Path, root: Path = ROOT) -> Path:
+    """The `wheel` or `sdist` that is built of the sources in `root`."""
+    command = [sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", str(folder)]
+    subprocess.run(command, cwd=root, check=True, capture_output=True)
+    (archive,) = folder.iterdir()
+    return archive
+
+
+def environment(python: str, folder: Path) -> Path:
+    """An empty environment in `folder`: the folder of its programs."""
+    subprocess.run([python, "-m", "venv", "--without-pip", str(folder)], check=True)
+    return folder / "bin"
+
+
+def install(programs: Path, *words: str) -> None:
+    """Let the pip that runs this install something into an environment."""
+    pip = [sys.executable, "-m", "pip", "--python", str(programs / "python"), "install", "--quiet"]
+    subprocess.run([*pip, *words], check=True)
+
+
+def ran(programs: Path, folder: Path, *words: object) -> str:
+    """What a program of an environment prints when it runs in `folder`, which is its home, too."""
+    alone = {"PATH": str(programs), "HOME": str(folder), "LANG": "C.UTF-8"}
+    bounds = {name: value for name, value in os.environ.items() if name.endswith("_NUM_THREADS")}
+    command = [str(programs / str(words[0])), *map(str, words[1:])]
+    done = subprocess.run(command, cwd=folder, env=alone | bounds, capture_output=True, text=True)
+    assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stderr}"
+    return done.stdout
+
+
+def check_answers(programs: Path, folder: Path) -> None:
+    """The version, and what `doctor` finds."""
+    assert ran(programs, folder, "gscompleter", "--version").strip() == __version__
+    found = json.loads(ran(programs, folder, "gscompleter", "doctor", "--json"))
+    there = {(one["kind"], one["name"]): one["there"] for one in found}
+    assert all(there[name] for name in there if name[0] == "packages"), found
+    assert there["renderers", "cpu"], found
+    assert there["viewer", "libraries"], found
+
+
+def check_completion(programs: Path, folder: Path, scene: Path, *words: object) -> None:
+    """A completion, and a page that shows it."""
+    out = folder / "out"
+    ran(programs, folder, "gscompleter", "complete", scene, *words, "--out", out, "--quiet")
+    assert json.loads((out / "summary.json").read_text())["gaussians"]["added"] > 0
+    ran(programs, folder, "gscompleter", "view", out, "--save", "page.html")
+    page = (folder / "page.html").read_text()
+    assert "three.js authors" in page, "the licences are not in the page"
+
+
+def check_extras(programs: Path, wheel: Path, folder: Path) -> Iterator[str]:
+    """Install and import each extra; yields a line on each."""
+    for extra in PURPOSES:
+        try:
+            install(programs, f"gscompleter[{extra}] @ {wheel.as_uri()}")
+            imported = ran(programs, folder, "python", "-c", IMPORT_EXTRA, extra).split()[1::2]
+            yield f"{extra}: imported {' '.join(imported)}"
+        except (subprocess.CalledProcessError, AssertionError) as error:
+            yield f"{extra}: FAILED, {error}"
+
+
+def check(python: str, wheel: Path, with_extras: bool) -> bool:
+    """Everything with one Python, told line by line. Returns whether all went well."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "elsewhere"
+        folder.mkdir()
+        programs = environment(python, Path(name) / "environment")
+        install(programs, str(wheel))
+        check_answers(programs, folder)
+        ran(programs, folder, "python", "-c", IMPORT_ALL)
+        ran(programs, folder, "gscompleter", "demo", "--out", "demo", "--quiet")
+        scene, targets = folder / "demo/scene", folder / "demo/scene/targets.json"
+        frames = ("--context", 0, 1, "--target", targets, "--resolution", 96)
+        check_completion(programs, folder, scene, *frames)
+        print(f"{python}: demo, complete and view ran from the wheel", flush=True)
+        lines = check_extras(programs, wheel, folder) if with_extras else iter(())
+        return all(told(f"{python}: {line}") for line in lines)
+
+
+def told(line: str) -> bool:
+    """Print a line; returns whether it tells of no failure."""
+    print(line, flush=True)
+    return "FAILED" not in line
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("pythons", nargs="+")
+    parser.add_argument("--extras", action="store_true")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        wheel = built("wheel", Path(folder))
+        went_well = [check(python, wheel, asked.extras) for python in asked.pythons]
+    sys.exit(not all(went_well))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,273 @@
+"""Every command and every piece of Python in README and docs: run, or at least parsed.
+
+A block of ``` is shell unless it says otherwise. Of its commands those of `gscompleter` are run on
+a small room, `SCENE`, or the reason why not stands in `NOT_RUN`; all of them are parsed. `text` is
+output, or a file.
+"""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+
+from command import run
+from gscompleter.cli import COMMANDS, parsed
+from gscompleter.commands.doctor import PURPOSES
+from gscompleter.config.settings import checked
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.viewer.packages import Libraries
+from scenes import camera_at, photographed
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+FRAMES = 11
+"""Of the room that stands for SCENE: as many as the commands name."""
+SIDE = 32
+"""Pixels of its photographs."""
+
+NOT_RUN = {
+    "live": "serves until it is closed; test_live.py presses its buttons",
+    "poses": "needs photographs that COLMAP can match; test_poses.py has them",
+    "demo": "takes half a minute; `make release-check` runs it",
+    "bench": "takes minutes; test_bench.py runs it on less",
+    "warmup": "test_rehearsal.py compiles in advance",
+    "evaluate": "needs sequences or takes hours; test_runs.py evaluates a room",
+    "tables": "needs what evaluate wrote; test_runs.py has it",
+    "index": "needs sequences; test_protocols.py writes one",
+}
+"""Commands that no test here runs, and why."""
+NEEDS_WEIGHTS = ("--reconstructor", "--generator")
+"""Options that name published weights, which no machine of ours has."""
+FAST = ("doctor", "models", "report", "strip", "view", "convert")
+"""Commands that take a second or two."""
+WRITES_OUT = ("complete", "clean")
+"""Commands after which OUT is theirs."""
+PYTHON_NOT_RUN = {"docs/models.md": "needs published weights"}
+"""Pages whose Python is only compiled, and why."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """What stands between two lines of ```."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+    @property
+    def commands(self) -> list[list[str]]:
+        """The words of each command."""
+        lines = self.text.replace("\\\n", " ").splitlines()
+        return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def blocks() -> Iterator[Block]:
+    """The blocks of all pages."""
+    for page in PAGES:
+        text = page.read_text()
+        for found in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S):
+            line = text[: found.start()].count("\n") + 1
+            yield Block(page, line, found[1] or "sh", found[2])
+
+
+def of(language: str) -> list[Block]:
+    return [block for block in blocks() if block.language == language]
+
+
+def test_every_block_says_what_it_is():
+    unknown = [b.name for b in blocks() if b.language not in ("sh", "python", "text", "bibtex")]
+    assert unknown == [], "mark them as sh (or nothing), python, or text"
+
+
+def understand_ours(words: list[str]) -> None:
+    if words != ["--version"]:
+        assert words[0] in COMMANDS, f"there is no command {words[0]}"
+        checked(parsed(words))
+
+
+def understand_make(words: list[str]) -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.M))
+    assert {word for word in words if "=" not in word} <= targets
+
+
+def understand_pip(words: list[str]) -> None:
+    for extras in re.findall(r"gscompleter\[([\w,]+)\]", " ".join(words)):
+        assert set(extras.split(",")) <= set(PURPOSES)
+
+
+def understand_python(words: list[str]) -> None:
+    if words[0] == "-c":
+        compile(words[1], "-c", "exec")
+    else:
+        assert (ROOT / words[0]).is_file()
+
+
+def understand_docker(words: list[str]) -> None:
+    if words[0] == "build":
+        assert (ROOT / words[words.index("-f") + 1]).is_file()
+
+
+UNDERSTOOD: dict[str, Callable[[list[str]], None]] = {
+    "gscompleter": understand_ours,
+    "make": understand_make,
+    "pip": understand_pip,
+    "python": understand_python,
+    "docker": understand_docker,
+    "apptainer": lambda words: None,
+}
+"""How the words after a program are checked."""
+
+
+@pytest.mark.parametrize("block", of("sh"), ids=lambda block: block.name)
+def test_commands_are_understood(block):
+    for program, *words in block.commands:
+        if program not in UNDERSTOOD:
+            pytest.fail(
+                f"{block.name}: say in UNDERSTOOD of tests/test_snippets.py how commands of "
+                f"{program!r} are checked, or mark the block as text if it is none."
+            )
+        UNDERSTOOD[program](words)
+
+
+@cache
+def options_of(command: str) -> set[str]:
+    """The names of the options of a command."""
+    with pytest.MonkeyPatch.context() as patch:
+        said: list[str] = []
+        patch.setattr("sys.stdout.write", lambda text: said.append(text) or len(text))
+        with pytest.raises(SystemExit):
+            parsed([command, "--help"])
+    return set(re.findall(r"--[a-z][\w.-]*", "".join(said)))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_within_sentences_name_what_there_is(page):
+    prose = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
+    for code in re.findall(r"`gscompleter ([a-z][^`]*)`", prose):
+        command, *words = code.split()
+        assert command in COMMANDS
+        named = {word for word in words if word.startswith("--") and word != "--help"}
+        assert named <= options_of(command), code
+    for code in re.findall(r"`((?:make|python|pip) [^`]+)`", prose):
+        program, *words = shlex.split(code)
+        UNDERSTOOD[program](words)
+
+
+@pytest.mark.parametrize("command", ["complete", "view"])
+def test_the_reference_has_a_term_for_each_option(command):
+    site = runpy.run_path(str(ROOT / "mkdocs_hooks.py"))
+    page = site["as_definitions"](site["help_of"](command))
+    terms = set(re.findall(r"^`(?:-h, )?(--[\w.-]+)[^`]*`\n:   +\S", page, re.M))
+    in_sentences = {"--config", "--target"}
+    assert terms <= options_of(command) <= terms | in_sentences
+
+
+def is_run(words: list[str]) -> bool:
+    """Whether these words after `gscompleter` can be run here."""
+    return words[0] in COMMANDS and words[0] not in NOT_RUN and not set(words) & set(NEEDS_WEIGHTS)
+
+
+def ours(block: Block) -> list[list[str]]:
+    """The commands of a block that are run."""
+    return [
+        words for program, *words in block.commands if program == "gscompleter" and is_run(words)
+    ]
+
+
+def runnable() -> list[object]:
+    """The blocks with commands that are run; those that complete something are slow."""
+    found = [block for block in of("sh") if ours(block)]
+    quick = [all(words[0] in FAST for words in ours(block)) for block in found]
+    return [
+        pytest.param(block, id=block.name, marks=[] if fast else [pytest.mark.slow])
+        for block, fast in zip(found, quick, strict=True)
+    ]
+
+
+def test_every_command_is_run_or_there_is_a_reason():
+    tried = {words[0] for block in of("sh") for words in ours(block)}
+    untold = set(COMMANDS) - tried - set(NOT_RUN)
+    assert untold == set(), (
+        "show these commands in a block of README or docs that can be run on the room of "
+        "tests/test_snippets.py, or say in NOT_RUN why they cannot"
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """A room with as many small photographs as the commands name."""
+    cameras = [camera_at(-0.3 + 0.1 * n, yaw=n, size=SIDE) for n in range(FRAMES)]
+    return photographed(tmp_path_factory.mktemp("snippets") / "SCENE", cameras)
+
+
+@pytest.fixture
+def sandbox(scene, completed_room, tmp_path, monkeypatch) -> Path:
+    """A folder with all that the commands name."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gscompleter.viewer.packages.load_libraries", lambda: Libraries({}, {}))
+    for name in ("SCENE", "scene"):
+        shutil.copytree(scene, name)
+    shutil.copytree(completed_room, "OUT")
+    for name, file in (("before.ply", "context.ply"), ("after.ply", "completed.ply")):
+        shutil.copy(completed_room / file, name)
+    shutil.copy(completed_room / "context.ply", "splat.ply")
+    shutil.copy(completed_room / "targets.json", "cameras.json")
+    return tmp_path
+
+
+@pytest.mark.parametrize("block", runnable())
+def test_commands_run(block, sandbox, monkeypatch, capsys):
+    """What would be served is saved, and what lies in OUT already is replaced."""
+    for number, words in enumerate(ours(block)):
+        serves = words[0] == "view" and "--save" not in words
+        more = ["--save", f"page{number}.html"] if serves else []
+        if words[0] in WRITES_OUT and "--overwrite" not in words:
+            more += ["--overwrite"]
+        assert run(monkeypatch, *words, *more) == 0, capsys.readouterr().err
+
+
+def grey(nearest, target, context) -> torch.Tensor:
+    """The least of generators."""
+    return torch.full((target.height, target.width, 3), 0.5)
+
+
+@pytest.mark.parametrize("page", sorted({b.page for b in of("python")}), ids=lambda p: p.name)
+def test_python_runs(page, sandbox):
+    """The blocks of a page, one after the other."""
+    names = {"my_model": PlaneSweep(), "my_generator": grey}
+    for block in of("python"):
+        if block.page == page:
+            code = compile(block.text, block.name, "exec")
+            if str(page.relative_to(ROOT)) not in PYTHON_NOT_RUN:
+                exec(code, names)
+
+
+@pytest.mark.parametrize(
+    ("script", "prints"),
+    [
+        ("01_complete_a_scene", "Gaussians joined"),
+        ("05_stage_by_stage", "left"),
+        pytest.param("02_bring_your_own_models", "joined", marks=pytest.mark.slow),
+        pytest.param("03_bring_your_own_generator", "joined", marks=pytest.mark.slow),
+    ],
+)
+def test_tutorials_run(script, prints, sandbox, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [script, "SCENE", "0", "4", "8"])
+    runpy.run_path(str(ROOT / "examples" / f"{script}.py"), run_name="__main__")
+    assert prints in capsys.readouterr().out
+    assert (sandbox / "completed.ply").is_file()
