@@ -9,7 +9,8 @@ import torch
 
 from command import run
 from gscompleter import load_cameras
-from gscompleter.cli import auto_counted, parsed
+from gscompleter.cli import parsed
+from gscompleter.commands.words import auto_counted
 from gscompleter.data.formats import open_photographs
 from gscompleter.geometry import baseline_between
 from scenes import camera_at, photographed

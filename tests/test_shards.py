@@ -10,12 +10,20 @@ from pathlib import Path
 import pytest
 
 from gscompleter import InputError
+from gscompleter.batch.places import FolderPlace
 from gscompleter.commands import evaluate as command
 from gscompleter.config.generators import PEFieldSettings
 from gscompleter.data.cases import read_cases
 from gscompleter.reports.tables import tables
 from gscompleter.runs import store
-from gscompleter.runs.runner import RowCounts, RunConfig, deciding, evaluate
+from gscompleter.runs.runner import (
+    Evaluating,
+    RowCounts,
+    RunConfig,
+    deciding,
+    evaluate,
+    job_of,
+)
 from gscompleter.runs.store import VERSION, claim, read_json, row_paths, write_json
 from gscompleter.runs.tasks import Task, task_of
 from scenes import Room, camera_at, photographed
@@ -147,10 +155,10 @@ def finished(scenes, tmp_path_factory) -> Path:
     return out
 
 
-def started(scenes: Path, out: Path, shard: str) -> subprocess.Popen:
+def started(scenes: Path, out: Path, shard: str, *more: str) -> subprocess.Popen:
     code = "from gscompleter.cli import main; main()"
     words = [sys.executable, "-c", code, "evaluate", scenes / "cases.json", "--out", out]
-    words += ["--methods", *METHOD_NAMES, "--device", "cpu", "--shard", shard]
+    words += ["--methods", *METHOD_NAMES, "--device", "cpu", "--shard", shard, *more]
     return subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL)
 
 
@@ -167,6 +175,25 @@ def three_at_once(scenes: Path, out: Path, finished: Path) -> None:
 
 def test_three_shards_at_once_end_with_the_tables_of_one_run(scenes, finished, tmp_path):
     three_at_once(scenes, tmp_path / "out", finished)
+
+
+def test_a_case_that_somebody_does_is_left_to_them(tasks, tmp_path):
+    out, job = tmp_path / "out", job_of(tasks[0])
+    evaluating = Evaluating(out, METHOD_NAMES, RunConfig())
+    with FolderPlace(out).claimed(f"claims/{job.name}"):
+        assert evaluating(job).state == "elsewhere"
+    assert evaluating.ended(job) is None
+    assert row_paths(out) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [(), ("--engine", "local", "--workers", "2")])
+def test_without_shards_the_work_is_shared_too(scenes, finished, tmp_path, more):
+    out = tmp_path / "out"
+    runs = [started(scenes, out, "0/1", *more) for _ in range(2)]
+    assert [one.wait() for one in runs] == [0, 0]
+    same_tables(out, finished)
+    assert os.listdir(out / "claims") == []
 
 
 @pytest.mark.slow

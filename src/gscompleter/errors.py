@@ -27,6 +27,10 @@ class InputError(ValueError):
         self.argument = argument
 
 
+class OutputError(InputError):
+    """A result cannot be written: nothing else could be written there either."""
+
+
 def quoted(value: object, length: int | None = None) -> str:
     """What was given as a sentence can hold it: on one line, its middle left out if it is long.
 

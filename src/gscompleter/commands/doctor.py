@@ -25,6 +25,8 @@ PURPOSES = {
     "live": "completing in the browser with gscompleter live",
     "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
     "film": "complete --film",
+    "ray": "batch --engine ray",
+    "slurm": "batch --engine submitit",
     "waymo": "the Waymo Open Dataset 2, whose tables are parquet",
 }
 """What each extra is for. Those for developers (`test`, `dev`, `docs`) are not looked for."""

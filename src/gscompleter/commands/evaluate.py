@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -13,6 +12,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from gscompleter.batch.shards import parse_shard
+from gscompleter.commands.engines import engine_for
 from gscompleter.commands.options import (
     LONG_SIDE,
     EvaluateOptions,
@@ -47,7 +48,7 @@ def run_evaluation(options: EvaluateOptions) -> None:
         raise InputError("No data was named; give a cases.json, or scenes with --protocol.")
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     methods = methods_named(options.methods)
-    shard = parse_shard(options.shard)
+    shard = parse_shard(options.shard, os.environ)
     if options.resolution is not None:
         check_resolution(working_size(options.resolution))
     skipped: list[Skipped] = []
@@ -67,9 +68,10 @@ def run_evaluation(options: EvaluateOptions) -> None:
         seed=options.seed,
         source=source_of(options),
     )
+    engine = engine_for(options, str(options.out.resolve()))
     with shown_on(shown):
         compile_kernels((config.device, config.reconstructor, config.generator))
-        counts = evaluate(tasks, methods, options.out, config, shard, options.again)
+        counts = evaluate(tasks, methods, options.out, config, shard, options.again, engine)
         told = f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}."
         console.print(told)
         # An empty shard, where there are more shards than cases, has nothing to show.
@@ -209,18 +211,6 @@ def cases_file(path: Path) -> Path:
             "in --protocol n-10."
         )
     return file
-
-
-def parse_shard(text: str | None) -> tuple[int, int]:
-    """`i/n` as numbers."""
-    if text is None:
-        return 0, 1
-    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
-    if match is None:
-        raise InputError(
-            f"--shard is '{quoted(text)}'; give it as i/n, as in 0/4 for the first of four."
-        )
-    return int(match[1]), int(match[2])
 
 
 def tell_skipped(skipped: Sequence[Skipped], console: Console) -> None:

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
+from gscompleter.batch.engines import EngineName
 from gscompleter.commands.generator_options import GeneratorOptions
 from gscompleter.config import CompleterConfig
 from gscompleter.config.cleaning import CleaningConfig
@@ -203,7 +204,27 @@ class DemoOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(ModelOptions):
+class EngineOptions(Options):
+    """What every command can be told that lets others do its work."""
+
+    engine: EngineName | None
+    """Who does the work."""
+    workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
+    """How many workers there are. If not given, as many as there are cores and memory for on this
+    machine, as the cluster of Ray has room for, or one job of SLURM."""
+    threads: Annotated[int, Interval(ge=1, le=1024)] | None = None
+    """How many threads compute in each; if not given, the cores are shared out on this machine,
+    and it is one elsewhere."""
+    address: str | None = None
+    """Of a cluster of Ray that is there; one is started on this machine if not given."""
+    gpus: Annotated[float, Interval(ge=0, le=1024)] = 0.0
+    """GPUs that a worker of Ray or SLURM holds; of Ray also a part of one."""
+    slurm: tuple[str, ...] = ()
+    """What SLURM is told with --engine submitit, as in --slurm partition=gpu time=120."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(ModelOptions, EngineOptions):
     """Run methods on cases of which the truth is known, and score them.
 
     Run again with the same options, it goes on where it was stopped. The tables are printed and
@@ -230,7 +251,10 @@ class EvaluateOptions(ModelOptions):
     """What of an earlier run is done once more: cases that failed, or all scores, from the
     predictions that were saved."""
     shard: str | None = None
-    """i/n does every n-th case from the i-th on, i from 0 to n - 1: n processes share the work."""
+    """i/n does every n-th case from the i-th on, i from 0 to n - 1; auto takes both from an array
+    of SLURM. Processes without it share the work, too."""
+    engine: EngineName | None = None
+    """Who does the work; this process alone if not given."""
     resolution: Size | None = None
     """What to work at, as `complete` has it. If not given, the resolution of the cases, or for
     scenes that of `complete`."""

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, OutputError, quoted
 from gscompleter.io.unfinished import (
     MARK,
     abandoned,
@@ -76,7 +76,7 @@ def replacing(path: Path | str, first_stays: bool = False) -> Iterator[BinaryIO]
             if not (first_stays and _linked(temporary, target)):
                 os.replace(temporary, target)
     except OSError as error:
-        raise InputError(_cannot_write(path, error)) from error
+        raise OutputError(_cannot_write(path, error)) from error
     finally:
         if temporary is not None:
             with contextlib.suppress(OSError):
@@ -132,11 +132,11 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
             draft.publish()
         except InputError as error:
             # The user asked for `path` and need not hear of the temporary name.
-            raise InputError(str(error).replace(str(draft.folder), str(path))) from error
+            raise type(error)(str(error).replace(str(draft.folder), str(path))) from error
         except OSError as error:
             if error.errno not in _DISK_ERRORS:
                 raise
-            raise InputError(_cannot_write(path, error)) from error
+            raise OutputError(_cannot_write(path, error)) from error
 
 
 class _Draft:
@@ -147,7 +147,7 @@ class _Draft:
         try:
             self.exists = self.target.is_dir()
         except OSError as error:
-            raise InputError(_cannot_write(path, error)) from error
+            raise OutputError(_cannot_write(path, error)) from error
         self.parents: list[Path] = []
         if self.exists:
             _finish_abandoned(self.target)
@@ -160,7 +160,7 @@ class _Draft:
             self.folder, self.lock = create_folder(home)
         except OSError as error:
             self._remove_parents()
-            raise InputError(_cannot_write(path, error)) from error
+            raise OutputError(_cannot_write(path, error)) from error
 
     def _make_parents(self, folder: Path) -> None:
         missing = [p for p in (folder, *folder.parents) if not p.exists()]
@@ -183,7 +183,7 @@ class _Draft:
                 self._move_inside()
                 _finish(self.folder)
         except OSError as error:
-            raise InputError(_cannot_write(self.target, error)) from error
+            raise OutputError(_cannot_write(self.target, error)) from error
 
     def _changed_places(self) -> bool:
         """Swap draft and target in one step, where nothing but results would go."""
@@ -283,7 +283,7 @@ def _check_free(path: Path, target: Path, overwrite: bool) -> None:
     try:
         entries = os.listdir(target) if target.is_dir() else []
     except OSError as error:
-        raise InputError(_cannot_write(path, error)) from error
+        raise OutputError(_cannot_write(path, error)) from error
     if not overwrite and any(not name.startswith(MARK) for name in entries):
         raise InputError(
             f"The output folder {quoted(path)} is not empty; name another one, or overwrite the "

@@ -30,7 +30,7 @@ def create_file(folder: Path) -> tuple[Path, BinaryIO]:
     while True:
         path = folder / _new_name()
         file = path.open("xb")
-        if _locked(file.fileno(), wait=True) is not False and os.fstat(file.fileno()).st_nlink:
+        if locked(file.fileno(), wait=True) is not False and os.fstat(file.fileno()).st_nlink:
             return path, file
         file.close()  # it was cleaned up before it was locked
 
@@ -42,7 +42,7 @@ def create_folder(folder: Path) -> tuple[Path, int]:
         path.mkdir()
         with contextlib.suppress(FileNotFoundError):
             lock = os.open(path, os.O_RDONLY)
-            _locked(lock, wait=True)
+            locked(lock, wait=True)
             if path.exists():
                 return path, lock
             os.close(lock)
@@ -61,7 +61,7 @@ def abandoned(folder: Path) -> Iterator[list[Path]]:
             with contextlib.suppress(OSError):
                 lock = os.open(path, os.O_RDONLY)
                 locks.callback(os.close, lock)
-                if _locked(lock, wait=False):
+                if locked(lock, wait=False):
                     found.append(path)
         yield found
 
@@ -95,7 +95,7 @@ def _new_name() -> str:
     return f"{_prefix()}{secrets.token_hex(6)}"
 
 
-def _locked(descriptor: int, wait: bool) -> bool | None:
+def locked(descriptor: int, wait: bool) -> bool | None:
     """Lock it; False where another holds it, None where the file system knows no locks."""
     if fcntl is None:
         return None

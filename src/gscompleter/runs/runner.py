@@ -6,16 +6,22 @@ Rows of scores are made from what is saved, so that to score again needs no meth
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from gscompleter.batch.engines import Engine
+from gscompleter.batch.jobs import CLAIMS, Job, Outcome
+from gscompleter.batch.places import FolderPlace
+from gscompleter.batch.rounds import Rounds, in_this_process
+from gscompleter.batch.shards import checked_shard
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, load_generator
 from gscompleter.memory import check_memory
-from gscompleter.progress import shown_on, stage, track
+from gscompleter.progress import Activity, going_on, shown_on, stage
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.runs.methods import Models, check_methods
@@ -35,6 +41,9 @@ from gscompleter.runs.store import (
 from gscompleter.runs.tasks import Task
 from gscompleter.stages.context import exposed_alike
 from gscompleter.types import View
+
+RETRIES = 2
+"""How often a task is tried again whose worker was killed."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +109,7 @@ def evaluate(
     config: RunConfig = RunConfig(),
     shard: tuple[int, int] = (0, 1),
     again: Again = "nothing",
+    engine: Engine = in_this_process,
 ) -> RowCounts:
     """Run every method on every task of the shard, and write a row of scores for each.
 
@@ -113,25 +123,84 @@ def evaluate(
         config: What decides the numbers; the same as in earlier calls.
         shard: (i, n) takes the tasks i, i + n, i + 2n, …; n calls with i from 0 do them all.
         again: What of an earlier call is done once more.
+        engine: Who does it. Calls at the same time share the tasks, whatever engine they have.
 
     Raises:
         InputError: a wrong name or shard, a folder that holds something else, a full disk.
     """
     check_evaluation(tasks, methods, config, shard)
     claim(out, deciding(config))
-    jobs = [(task, name) for task in tasks[shard[0] :: shard[1]] for name in methods]
-    missing = [job for job in jobs if is_missing(row_path(out, job[0].name, job[1]), again)]
-    failed, current, prepared = 0, None, None
-    for task, method in track(missing, "evaluating"):
-        # What goes on inside would fill a log.
-        with stage(f"{task.name}, {method}"), shown_on(None):
-            folder = task_folder(out, task.name)
-            if prepared is None or task is not current:
-                current, prepared = task, attempt(partial(prepare, task, folder, config))
-            row = row_of(task, method, prepared, folder)
-        write_json(row_path(out, task.name, method), row)
-        failed += row["error"] is not None
-    return RowCounts(len(missing) - failed, failed, len(jobs) - len(missing))
+    share = tasks[shard[0] :: shard[1]]
+    done = Evaluating(out, tuple(methods), config, again)
+    todo = {row: task for task in share for row in done.missing(task)}
+    jobs = [job_of(task) for task in {task.name: task for task in todo.values()}.values()]
+    rounds = Rounds(FolderPlace(out), done, jobs, RETRIES)
+    activity = Activity("evaluating", len(todo))
+    with going_on(activity) if todo else nullcontext():
+        for outcome in rounds.outcomes(engine, done):
+            for _ in done.rows_of(outcome.job.options["task"]) & set(todo):
+                activity.stepped()
+    failed = sum(read_json(row).get("error") is not None for row in todo)
+    return RowCounts(len(todo) - failed, failed, len(share) * len(methods) - len(todo))
+
+
+def job_of(task: Task) -> Job:
+    """A task as a job, which all methods of the task are."""
+    return Job(slug(task.name), {"task": task})
+
+
+@dataclass(frozen=True)
+class Evaluating:
+    """Does the jobs of an evaluation, and knows what became of them."""
+
+    out: Path
+    methods: tuple[str, ...]
+    config: RunConfig
+    again: Again = "nothing"
+
+    def rows_of(self, task: Task) -> set[Path]:
+        """Where the rows of a task lie."""
+        return {row_path(self.out, task.name, method) for method in self.methods}
+
+    def missing(self, task: Task) -> dict[Path, str]:
+        """The rows of a task that are to be made, and of which method they are."""
+        rows = {row_path(self.out, task.name, method): method for method in self.methods}
+        return {row: method for row, method in rows.items() if is_missing(row, self.again)}
+
+    def ended(self, job: Job) -> Outcome | None:
+        """What became of a task that others did."""
+        there = all(row.exists() for row in self.rows_of(job.options["task"]))
+        return Outcome(job, "done") if there else None
+
+    def give_up(self, job: Job, reason: str) -> Outcome:
+        """Write rows that say why there is nothing."""
+        task = job.options["task"]
+        for row, method in self.missing(task).items():
+            write_json(row, row_of(task, method, reason, task_folder(self.out, task.name)))
+        return Outcome(job, "failed", reason)
+
+    def __call__(self, job: Job) -> Outcome:
+        """Run every method on the task that has no row yet, unless somebody else does it.
+
+        Raises:
+            OutputError: where a result cannot be written.
+        """
+        with FolderPlace(self.out).claimed(f"{CLAIMS}/{job.name}") as lost:
+            if lost is None:
+                return Outcome(job, "elsewhere")
+            self.run(job.options["task"])
+            return Outcome(job, "done")
+
+    def run(self, task: Task) -> None:
+        """Make the rows of a task that are missing."""
+        prepared, folder = None, task_folder(self.out, task.name)
+        for row, method in self.missing(task).items():
+            # What goes on inside would fill a log.
+            with stage(f"{task.name}, {method}"), shown_on(None):
+                if prepared is None:
+                    prepared = attempt(partial(prepare, task, folder, self.config))
+                made = row_of(task, method, prepared, folder)
+            write_json(row, made)
 
 
 def is_missing(path: Path, again: Again) -> bool:
@@ -240,19 +309,10 @@ def check_evaluation(
 ) -> None:
     """Raise an InputError, before anything is written, where a run is impossible."""
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
-    check_shard(shard)
+    checked_shard(shard)
     check_tasks(tasks)
     config.load_reconstructor()
     config.load_generator()
-
-
-def check_shard(shard: tuple[int, int]) -> None:
-    """Raise an InputError for a shard that does not exist."""
-    number, count = shard
-    if not 0 <= number < count:
-        raise InputError(
-            f"There is no shard {number}/{count}; of n shards the first is 0/n, the last (n-1)/n."
-        )
 
 
 def check_tasks(tasks: Sequence[Task]) -> None:

@@ -19,13 +19,12 @@ from typing import TypeVar
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, OutputError
 from gscompleter.metrics.scores import MIN_PIXELS, Drawings, Scores, Truth, counted_psnr, score
 from gscompleter.render import Renderer
 from gscompleter.runs.memory import peak_memory
 from gscompleter.runs.methods import METHODS, Models, Prediction, numbered
 from gscompleter.runs.store import (
-    OutputError,
     load_prediction,
     save_image,
     save_prediction,

@@ -28,7 +28,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, OutputError, quoted
 from gscompleter.io import json_file
 from gscompleter.io.files import replacing
 from gscompleter.io.image import write_image
@@ -48,10 +48,6 @@ VERSION = 3
 _FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 
 Arrays = dict[str, np.ndarray]
-
-
-class OutputError(InputError):
-    """A result cannot be written: the run ends."""
 
 
 def slug(name: str) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from gscompleter.data.cases import Case
 from gscompleter.data.framing import Resolution
@@ -63,10 +64,7 @@ def tasks_of(
         InputError: where a frame of the protocol is not in the clip.
     """
 
-    def load(frames: tuple[int, ...]) -> list[View]:
-        views = clip.views(frames, resolution)
-        return without_masked(views, clip, resolution) if ignore_masked else views
-
+    load = partial(photographs_of, clip, resolution, ignore_masked)
     tasks = []
     for split in protocol.splits(clip):
         check_frames(protocol, split, clip)
@@ -77,6 +75,14 @@ def tasks_of(
             beside = neighbours(target, split.context, len(clip))
             tasks.append(Task(clip.name, split.context, (target,), load, beside))
     return tasks
+
+
+def photographs_of(
+    clip: PosedPhotographs, resolution: Resolution, ignore_masked: bool, frames: tuple[int, ...]
+) -> list[View]:
+    """Photographs of frames of a clip, as `tasks_of` is asked for them."""
+    views = clip.views(frames, resolution)
+    return without_masked(views, clip, resolution) if ignore_masked else views
 
 
 def check_frames(protocol: EvaluationProtocol, split: Split, clip: PosedPhotographs) -> None:

@@ -1,0 +1,102 @@
+"""What a batch of very many jobs would take: measured jobs, replayed through the scheduler.
+
+    python benchmarks/simulate_batch.py OUT --jobs 10000 --workers 16 --lost-per-hour 0.05
+
+OUT is what `gscompleter batch` wrote. Jobs are drawn from its rows. A worker takes the next job
+when it is free, as in `gscompleter.batch`; it needs a while to start, and may be killed in the
+middle of a job, which is then done again, at most `retries` times more. With --jobs 0 the jobs of
+OUT are replayed as they are, to hold the simulation against the time that OUT took.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import json
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Who does the jobs."""
+
+    workers: int
+    start_seconds: float
+    """Until a worker does its first job: processes, imports, compiled kernels."""
+    lost_per_hour: float
+    """How often a worker is killed in an hour."""
+    retries: int = 2
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What became of the jobs."""
+
+    hours: float
+    busy: float
+    """Share of the time of all workers in which they did what counts."""
+    repeated: int
+    """Attempts that were lost."""
+    given_up: int
+
+
+def replay(seconds: Sequence[float], fleet: Fleet, seed: int = 0) -> Replay:
+    """Let the workers of `fleet` do jobs of so many seconds."""
+    chance = random.Random(seed)
+    free = [fleet.start_seconds] * fleet.workers
+    waiting = [(job, 0) for job in range(len(seconds))][::-1]
+    useful, repeated, given_up = 0.0, 0, 0
+    while waiting:
+        job, lost = waiting.pop()
+        now = heapq.heappop(free)
+        alive = chance.expovariate(fleet.lost_per_hour / 3600) if fleet.lost_per_hour else 1e99
+        if alive >= seconds[job]:
+            useful += seconds[job]
+            heapq.heappush(free, now + seconds[job])
+            continue
+        repeated += 1
+        heapq.heappush(free, now + alive + fleet.start_seconds)
+        if lost < fleet.retries:
+            waiting.insert(0, (job, lost + 1))
+        else:
+            given_up += 1
+    end = max(free)
+    return Replay(end / 3600, useful / (end * fleet.workers), repeated, given_up)
+
+
+def rows_of(out: Path) -> list[dict]:
+    """The rows of jobs that are done."""
+    rows = [json.loads(path.read_text()) for path in sorted((out / "rows").glob("*.json"))]
+    return [row for row in rows if row["state"] == "done"]
+
+
+def measured_hours(out: Path, rows: Sequence[dict]) -> float:
+    """From the first job that began to the last that ended."""
+    ends = [(out / "rows" / f"{row['job']}.json").stat().st_mtime for row in rows]
+    return (max(ends) - min(e - r["seconds"] for e, r in zip(ends, rows, strict=True))) / 3600
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--jobs", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--start-seconds", type=float, default=10.0)
+    parser.add_argument("--lost-per-hour", type=float, default=0.0)
+    parser.add_argument("--longer", type=float, default=1.0, help="jobs take so many times as long")
+    given = parser.parse_args()
+    rows = rows_of(given.out)
+    seconds = [given.longer * row["seconds"] for row in rows]
+    if given.jobs:
+        seconds = random.Random(0).choices(seconds, k=given.jobs)
+    found = replay(seconds, Fleet(given.workers, given.start_seconds, given.lost_per_hour))
+    print(f"{len(seconds):,} jobs, {given.workers:,} workers: {found.hours:.3f} h, {found}")
+    if not given.jobs:
+        print(f"measured: {measured_hours(given.out, rows):.3f} h")
+
+
+if __name__ == "__main__":
+    main()

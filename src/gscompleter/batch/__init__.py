@@ -1,0 +1,1 @@
+"""Independent jobs: claimed, done once, resumed, shared among processes and machines."""

@@ -1,0 +1,136 @@
+"""Tasks of Ray, on a cluster that is there or on one of this machine alone."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from gscompleter.batch.jobs import Job, Outcome, Perform
+from gscompleter.errors import InputError, quoted
+from gscompleter.threads import bound_threads
+
+IN_FLIGHT = 2
+"""Tasks that wait or run, for each that the cluster has room for."""
+STORE_BYTES = 200 * 10**6
+"""Memory for what tasks return, on a cluster of this machine alone: rows, as the rest are files."""
+STOP_SECONDS = 20.0
+"""How long tasks that are stopped may take to give their claims back."""
+
+
+@dataclass(frozen=True)
+class RayEngine:
+    """Workers that are tasks of Ray."""
+
+    workers: int | None
+    """How many tasks run at once; None takes what the cluster has room for."""
+    threads: int
+    """CPUs of a task."""
+    gpus: float = 0.0
+    """GPUs of a task, also a part of one."""
+    address: str | None = None
+    """Of a cluster that is there; None starts one on this machine."""
+
+    def __call__(self, perform: Perform, jobs: Iterable[Job]) -> Iterator[Outcome]:
+        with self._cluster() as ray:
+            # A task that is lost is sent again by whoever keeps count of the attempts of a job.
+            task = ray.remote(done).options(
+                num_cpus=self.threads, num_gpus=self.gpus, max_retries=0
+            )
+            waiting = iter(jobs)
+            running: dict[Any, Job] = {}
+            try:
+                for _, job in zip(range(self._in_flight(ray)), waiting, strict=False):
+                    running[task.remote(perform, job, self.threads)] = job
+                while running:
+                    [ended], _ = ray.wait(list(running), num_returns=1)
+                    job = running.pop(ended)
+                    following = next(waiting, None)
+                    if following is not None:
+                        reference = task.remote(perform, following, self.threads)
+                        running[reference] = following
+                    yield outcome_of(ray, ended, job)
+            finally:
+                for reference in running:
+                    ray.cancel(reference)
+                if running:
+                    ray.wait(list(running), num_returns=len(running), timeout=STOP_SECONDS)
+
+    @contextlib.contextmanager
+    def _cluster(self) -> Iterator[Any]:
+        """Ray, connected; what was started is stopped at the end."""
+        ray = imported_ray()
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+        try:
+            ray.init(log_to_driver=False, logging_level="ERROR", **self._where())
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise InputError(
+                f"There is no cluster of Ray at {quoted(self.address)}: {quoted(str(error))}.",
+                "address",
+            ) from error
+        try:
+            # Ray has put handlers of its own in their place.
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+            yield ray
+        finally:
+            ray.shutdown()
+
+    def _where(self) -> dict[str, Any]:
+        if self.address is not None:
+            return {"address": self.address}
+        cpus = None if self.workers is None else self.workers * self.threads
+        return {
+            "address": "local",
+            "num_cpus": cpus,
+            "include_dashboard": False,
+            "object_store_memory": STORE_BYTES,
+        }
+
+    def _in_flight(self, ray: Any) -> int:
+        """How many tasks are sent before any is done."""
+        if self.workers is not None:
+            return self.workers
+        there = int(ray.cluster_resources().get("CPU", 1) // self.threads)
+        return IN_FLIGHT * max(1, there)
+
+
+def imported_ray() -> Any:
+    """The package; an InputError where it is not installed."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # Ray would otherwise say on standard error what it plans for its next versions.
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    try:
+        import ray
+    except ImportError as error:
+        raise InputError(
+            "The engine ray needs a package; install it with `pip install 'gscompleter[ray]'`."
+        ) from error
+    return ray
+
+
+def done(perform: Perform, job: Job, threads: int) -> Outcome:
+    """Do a job in a worker of Ray."""
+    bound_threads(threads)  # before the first job imports what reads it
+    return perform(job)
+
+
+def outcome_of(ray: Any, reference: Any, job: Job) -> Outcome:
+    """What became of the job of a task that is over.
+
+    Raises whatever ended the task but its worker or its node being lost.
+    """
+    try:
+        outcome: Outcome = ray.get(reference)
+    except (
+        ray.exceptions.WorkerCrashedError,
+        ray.exceptions.NodeDiedError,
+        ray.exceptions.OutOfMemoryError,
+        ray.exceptions.TaskCancelledError,
+        ray.exceptions.ObjectLostError,
+    ):
+        return Outcome(job, "lost")
+    return outcome

@@ -1,0 +1,41 @@
+"""The engine that a command's options name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gscompleter.batch.engines import Engine
+from gscompleter.batch.engines.local import LocalEngine, default_workers
+from gscompleter.batch.engines.ray import RayEngine
+from gscompleter.batch.engines.submitit import SubmititEngine
+from gscompleter.batch.places import is_address
+from gscompleter.batch.rounds import in_this_process
+from gscompleter.commands.options import EngineOptions
+from gscompleter.errors import InputError, quoted
+from gscompleter.threads import bound_threads, usable_cores
+
+
+def pairs(words: Sequence[str], option: str) -> dict[str, str]:
+    """`NAME=VALUE` as a mapping; an InputError where a word is none."""
+    for word in words:
+        if not word.partition("=")[0] or "=" not in word:
+            raise InputError(f"'{quoted(word)}' is not NAME=VALUE, as in resolution=256.", option)
+    return dict(tuple(word.split("=", 1)) for word in words)  # type: ignore[misc]
+
+
+def engine_for(options: EngineOptions, out: str) -> Engine:
+    """The engine that the options name. On this machine, how many threads compute is settled here,
+    as the workers inherit it."""
+    if options.engine is None:
+        return in_this_process
+    threads = options.threads or 1
+    if options.engine == "ray":
+        return RayEngine(options.workers, threads, options.gpus, options.address)
+    if options.engine == "submitit":
+        kept = "submitit" if is_address(out) else f"{out}/submitit"
+        slurm = pairs(options.slurm, "slurm")
+        return SubmititEngine(options.workers or 1, threads, options.gpus, Path(kept), slurm)
+    workers = options.workers or default_workers()
+    bound_threads(options.threads or max(1, usable_cores() // workers))
+    return LocalEngine(workers)

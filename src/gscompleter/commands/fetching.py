@@ -1,0 +1,41 @@
+"""Inputs of a job that lie in a store, fetched while the job needs them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from gscompleter.batch.places import is_address, store_of
+from gscompleter.errors import InputError, quoted
+
+
+@contextmanager
+def fetched(options: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """The options of a row with addresses replaced by files of this machine, as long as it lasts.
+
+    Raises:
+        InputError: where there is nothing at an address.
+    """
+    with TemporaryDirectory(prefix="gscompleter-") as folder:
+        yield {key: local(value, Path(folder) / key) for key, value in options.items()}
+
+
+def local(value: Any, folder: Path) -> Any:
+    """`value`, or what lies at the address that it is, copied into `folder`."""
+    if isinstance(value, list):
+        return [local(item, folder / str(number)) for number, item in enumerate(value)]
+    if not isinstance(value, str) or not is_address(value):
+        return value
+    store, path = store_of(value), folder / value.rstrip("/").rsplit("/", 1)[-1]
+    try:
+        found = store.isdir(value), store.isfile(value)
+        if not any(found):
+            raise InputError(f"There is nothing at {quoted(value)}; correct the address.")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        store.get(value.rstrip("/") + ("/" if found[0] else ""), str(path), recursive=found[0])
+    except OSError as error:
+        raise ConnectionError(f"{value} cannot be fetched: {error}") from error
+    return str(path)

@@ -1,0 +1,105 @@
+"""Words of a command line as options."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from contextlib import redirect_stderr
+from dataclasses import dataclass
+from io import StringIO
+from itertools import dropwhile, takewhile
+from typing import Any
+
+import tyro
+from tyro.constructors import ConstructorRegistry, StructTypeInfo
+
+from gscompleter.commands.generator_options import generator_flags
+from gscompleter.commands.options import FOUND
+from gscompleter.config import CompleterConfig, load_config
+from gscompleter.errors import InputError, quoted
+
+
+def sentence_of(error: InputError) -> str:
+    """What went wrong, and the option that can mend it."""
+    if error.argument is None:
+        return str(error)
+    return f"{str(error).removesuffix('.')} (--{error.argument.replace('_', '-')})."
+
+
+def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> Any:
+    """The options of the command that `words` name, one of the types that `command` is a union of.
+
+    Raises:
+        InputError: where they are wrong, or the config that they name is.
+        SystemExit: where they ask for help, which is printed.
+    """
+    said = StringIO()
+    try:
+        with redirect_stderr(said):
+            config, words = config_named(auto_counted(words))
+            return tyro.cli(
+                command,
+                prog="gscompleter",
+                description="Complete 3D Gaussian Splatting scenes: generate, then register.",
+                args=words,
+                config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+                registry=registry_from(config),
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise InputError(unboxed(said.getvalue(), words, names)) from None
+
+
+def auto_counted(words: Sequence[str]) -> list[str]:
+    """`words` with a number after `--auto`, which may stand alone."""
+    alone = [
+        w == "--auto" and not n.isdecimal() for w, n in zip(words, [*words, ""][1:], strict=True)
+    ]
+    counted = [(w, str(FOUND)) if a else (w,) for w, a in zip(words, alone, strict=True)]
+    return [word for pair in counted for word in pair]
+
+
+@dataclass(frozen=True)
+class NamedConfig:
+    """What is read before the rest: the config that single settings are applied over."""
+
+    config: str = "default"
+
+
+def config_named(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[str]]:
+    """What `--config NAME` names, and the other words, which may change some of it."""
+    if words[:1] not in (["complete"], ["live"]):
+        return CompleterConfig(), words
+    named, others = tyro.cli(
+        NamedConfig, prog="gscompleter", args=words, return_unknown_args=True, add_help=False
+    )
+    return load_config(named.config), others
+
+
+def registry_from(config: CompleterConfig) -> ConstructorRegistry:
+    """How tyro reads our classes: a CompleterConfig begins as `config`."""
+
+    def config_flags(info: StructTypeInfo) -> Any:
+        if info.type is not CompleterConfig or info.default == config:
+            return None
+        return ConstructorRegistry.get_struct_spec(StructTypeInfo.make(info.type, config, False))
+
+    registry = ConstructorRegistry()
+    registry.struct_rule(generator_flags)
+    registry.struct_rule(config_flags)
+    return registry
+
+
+def unboxed(box: str, words: Sequence[str], names: Collection[str]) -> str:
+    """The sentence in the box that tyro draws around an error; indented or below it stands help."""
+
+    def is_empty(line: str) -> bool:
+        return not line.strip("─- ")
+
+    lines = [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
+    said = takewhile(lambda line: not is_empty(line), dropwhile(is_empty, lines))
+    sentence = " ".join(line.strip() for line in said if not line.startswith(" " * 5))
+    usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
+    needed = "" if usage is None else f"; give {lines[usage].strip()}"
+    command = " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
+    return f"{quoted(sentence, 200).removesuffix('.')}{needed} (see {command} --help)."

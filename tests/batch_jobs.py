@@ -1,0 +1,77 @@
+"""Jobs that write a line and a result, for the workers of a batch to do and to be killed over."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gscompleter.batch.engines import Engine
+from gscompleter.batch.engines.local import LocalEngine
+from gscompleter.batch.engines.ray import RayEngine
+from gscompleter.batch.jobs import JOBS, Job, Outcome, missing, settle
+from gscompleter.batch.places import FolderPlace
+from gscompleter.batch.rounds import BatchRows, Rounds
+from gscompleter.errors import InputError
+
+
+@dataclass(frozen=True)
+class Writing:
+    """Does a job as its options say: `seconds` long, and in the way that `ends` names."""
+
+    out: str
+    retries: int = 2
+
+    def __call__(self, job: Job) -> Outcome:
+        place = FolderPlace(Path(self.out))
+        return settle(job, place, lambda: self.written(job), self.retries)
+
+    def written(self, job: Job) -> dict[str, Any]:
+        noted(Path(self.out) / "begun" / job.name)
+        time.sleep(job.options.get("seconds", 0.0))
+        ends = job.options.get("ends")
+        times = len((Path(self.out) / "begun" / job.name).read_text().split())
+        if ends == "always killed" or (ends == "killed once" and times == 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if ends == "sentence":
+            raise InputError("The scene is broken; mend it.")
+        if ends == "defect" or (ends == "defect once" and times == 1):
+            raise KeyError("a defect")
+        content = hashlib.sha256(job.name.encode()).hexdigest().encode()
+        FolderPlace(Path(self.out)).write(f"{JOBS}/{job.name}/result", content)
+        noted(Path(self.out) / "ended" / job.name)
+        return {"size": len(content)}
+
+
+def noted(path: Path) -> None:
+    """One more line, with the process that wrote it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        file.write(f"{os.getpid()}\n")
+
+
+def outcomes(out: Path, jobs: Sequence[Job], engine: Engine, retries: int = 2) -> list[Outcome]:
+    """What becomes of those of `jobs` that have no row."""
+    place = FolderPlace(out)
+    rounds = Rounds(place, BatchRows(place), missing(jobs, place, again=False), retries)
+    return list(rounds.outcomes(engine, Writing(str(out), retries)))
+
+
+def engine_named(name: str, workers: int) -> Engine:
+    return LocalEngine(workers) if name == "local" else RayEngine(workers, threads=1)
+
+
+def plain_jobs(count: int, seconds: float) -> list[Job]:
+    return [Job(f"job-{number:03d}", {"seconds": seconds}) for number in range(count)]
+
+
+if __name__ == "__main__":
+    engine, out, count, seconds, workers = sys.argv[1:]
+    jobs = plain_jobs(int(count), float(seconds))
+    outcomes(Path(out), jobs, engine_named(engine, int(workers)))

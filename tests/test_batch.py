@@ -1,0 +1,366 @@
+"""Batches: jobs that are done once, whatever is killed, and a page on all of them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import batch_jobs
+from batch_jobs import Writing, engine_named, outcomes, plain_jobs
+from command import run
+from gscompleter import InputError
+from gscompleter.batch import jobs as batch
+from gscompleter.batch.engines.local import LocalEngine
+from gscompleter.batch.engines.submitit import SubmititEngine
+from gscompleter.batch.jobs import Job, missing, settle
+from gscompleter.batch.manifest import read_manifest
+from gscompleter.batch.places import FolderPlace, StorePlace, lease, place_of
+from gscompleter.batch.rounds import BatchRows, Rounds, in_this_process
+from gscompleter.batch.shards import parse_shard
+from gscompleter.commands.row_options import options_of
+from gscompleter.errors import OutputError
+from scenes import camera_at, photographed
+from simulate_batch import Fleet, Replay, replay
+
+TESTS = Path(__file__).parent
+SAME = ("completed.ply", "context.ply", "generated.ply", "targets.json")
+"""What does not depend on who computed it, nor when; images/ do not either."""
+
+
+def until(condition, seconds: float = 120.0) -> None:
+    """Wait for a condition; a failure where it does not come."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "what was waited for never came"
+        time.sleep(0.02)
+
+
+def lines(folder: Path) -> dict[str, list[str]]:
+    """By the names of the files in a folder, their lines."""
+    return {path.name: path.read_text().split() for path in sorted(folder.glob("*"))}
+
+
+def started(engine: str, out: Path, count: int, seconds: float, workers: int) -> subprocess.Popen:
+    words = [sys.executable, TESTS / "batch_jobs.py", engine, out, count, seconds, workers]
+    path = os.pathsep.join(p for p in sys.path if p)
+    return subprocess.Popen(list(map(str, words)), env={**os.environ, "PYTHONPATH": path})
+
+
+def killed_and_started_again(engine: str, out: Path, count: int, seconds: float) -> None:
+    """A worker is killed in the middle of a job, then the driver; then it is started again."""
+    driver = started(engine, out, count, seconds, 2)
+    until(lambda: len(lines(out / "ended")) >= count // 4)
+    until(lambda: set(lines(out / "begun")) - set(lines(out / "ended")))
+    going = set(lines(out / "begun")) - set(lines(out / "ended"))
+    victims = [lines(out / "begun")[name][-1] for name in sorted(going)]
+    os.kill(int(victims[0]), signal.SIGKILL)
+    until(lambda: len(lines(out / "ended")) >= count // 2)
+    driver.kill()
+    driver.wait()
+    assert started(engine, out, count, seconds, 2).wait() == 0
+    ended = lines(out / "ended")
+    assert sorted(ended) == [job.name for job in plain_jobs(count, seconds)]
+    assert {name: len(pids) for name, pids in ended.items()} == dict.fromkeys(ended, 1)
+    assert len(list((out / "rows").glob("*.json"))) == count
+    assert max(len(pids) for pids in lines(out / "begun").values()) > 1  # somebody was killed
+    assert not list((out / "claims").glob("*"))
+
+
+def test_what_is_killed_goes_on_and_every_job_is_done_once(tmp_path):
+    killed_and_started_again("local", tmp_path, 8, 0.4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["local", "ray"])
+def test_of_two_hundred_jobs_each_is_done_once_whatever_is_killed(engine, tmp_path):
+    if engine == "ray":
+        pytest.importorskip("ray")
+    killed_and_started_again(engine, tmp_path, 200, 0.2)
+
+
+def test_three_runs_at_once_share_the_work(tmp_path):
+    runs = [started("local", tmp_path, 9, 0.2, 1) for _ in range(3)]
+    assert [one.wait() for one in runs] == [0, 0, 0]
+    ended = lines(tmp_path / "ended")
+    assert {name: len(pids) for name, pids in ended.items()} == {
+        job.name: 1 for job in plain_jobs(9, 0.2)
+    }
+    assert len({pids[0] for pids in ended.values()}) > 1
+
+
+def test_a_job_ends_as_a_row_with_its_reason(tmp_path, monkeypatch):
+    monkeypatch.setattr(batch, "RETRY_SECONDS", 0.0)
+    ends = ("sentence", "defect", "defect once", None)
+    jobs = [Job(str(end), {"ends": end}) for end in ends]
+    place, perform = FolderPlace(tmp_path), Writing(str(tmp_path), retries=2)
+    for job in jobs:
+        perform(job)
+    rows = {job.name: batch.read_row(place, job.name) for job in jobs}
+    told = {name: (row["state"], row["reason"], row["attempts"]) for name, row in rows.items()}
+    assert told == {
+        "sentence": ("failed", "The scene is broken; mend it.", 1),
+        "defect": ("failed", "KeyError: 'a defect'", 3),
+        "defect once": ("done", None, 2),
+        "None": ("done", None, 1),
+    }
+
+
+def test_a_job_that_kills_its_worker_is_given_up_and_the_others_are_done(tmp_path):
+    jobs = [Job("bad", {"ends": "always killed"}), Job("shy", {"ends": "killed once"}), Job("good")]
+    found = {o.job.name: o for o in outcomes(tmp_path, jobs, LocalEngine(1), retries=1)}
+    assert [found[name].state for name in ("bad", "shy", "good")] == ["failed", "done", "done"]
+    assert "lost 2 times" in found["bad"].reason or "killed 2 times" in found["bad"].reason
+    assert len(lines(tmp_path / "begun")["bad"]) == 2
+
+
+def test_attempts_of_earlier_runs_count(tmp_path):
+    claims = tmp_path / "claims"
+    claims.mkdir()
+    (claims / "bad").write_text("3")  # as three killed processes leave it
+    outcome = Writing(str(tmp_path), retries=2)(Job("bad"))
+    assert outcome.state == "failed"
+    assert "killed 3 times" in outcome.reason
+    assert not (tmp_path / "begun").exists()
+    (claims / "fair").write_text("2")
+    assert Writing(str(tmp_path), retries=2)(Job("fair")).state == "done"
+
+
+def test_what_somebody_else_does_is_waited_for(tmp_path):
+    place, job = FolderPlace(tmp_path), Job("one")
+
+    rounds = Rounds(place, BatchRows(place), [], retries=0)
+    with place.claimed("claims/one"):
+        assert place.is_held("claims/one")
+        assert Writing(str(tmp_path))(job).state == "elsewhere"
+        rounds.elsewhere.append(job)
+        assert list(rounds.done_by_others()) == []
+        assert rounds.elsewhere == [job]
+    assert not place.is_held("claims/one")
+    assert [o.state for o in rounds.outcomes(in_this_process, Writing(str(tmp_path)))] == ["done"]
+
+
+def test_a_full_disk_ends_the_run_and_loses_nothing(tmp_path, monkeypatch):
+    place = FolderPlace(tmp_path)
+    settle(Job("first"), place, lambda: {"size": 1}, retries=2)
+
+    def full() -> dict[str, int]:
+        raise OutputError("Cannot write it: there is no space left.")
+
+    with pytest.raises(OutputError, match="no space left"):
+        settle(Job("second"), place, full, retries=2)
+    assert [job.name for job in missing([Job("first"), Job("second")], place, False)] == ["second"]
+    assert os.listdir(tmp_path / "claims") == []
+    assert settle(Job("second"), place, lambda: {"size": 1}, retries=2).state == "done"
+
+
+def test_done_with_other_options_is_refused_and_failed_is_done_again(tmp_path):
+    place = FolderPlace(tmp_path)
+    perform = Writing(str(tmp_path))
+    perform(Job("good"))
+    perform(Job("bad", {"ends": "sentence"}))
+    with pytest.raises(InputError, match="job good done with other options"):
+        missing([Job("good", {"seconds": 1})], place, False)
+    assert missing([Job("bad", {"ends": "sentence"})], place, False) == []
+    assert len(missing([Job("bad", {"ends": "sentence"})], place, True)) == 1
+    perform(Job("bad", {"ends": "sentence"}))
+    mended = Job("bad", {})
+    assert missing([mended], place, False) == [mended]
+    assert perform(mended).state == "done"
+
+
+def test_in_a_store_one_holds_a_claim_until_it_is_not_renewed(tmp_path):
+    place = place_of(f"file://{tmp_path}/out")
+    assert isinstance(place, StorePlace)
+    with place.claimed("claims/one") as lost:
+        assert lost == 0
+        assert place.is_held("claims/one")
+        with place.claimed("claims/one") as other:
+            assert other is None
+    assert not place.is_held("claims/one")
+    old = json.loads(lease("someone", 1)) | {"renewed": time.time() - 1000}
+    place.write("claims/two", json.dumps(old).encode())
+    with place.claimed("claims/two") as lost:
+        assert lost == 2
+    assert place.names("claims") == set()
+
+
+@pytest.mark.parametrize(
+    ("text", "told", "shard"),
+    [
+        (None, {}, (0, 1)),
+        ("1/3", {}, (1, 3)),
+        ("auto", {"ID": "7", "MIN": "4", "COUNT": "5"}, (3, 5)),
+    ],
+)
+def test_a_shard_is_told_or_found_in_an_array(text, told, shard):
+    environment = {f"SLURM_ARRAY_TASK_{name}": value for name, value in told.items()}
+    assert parse_shard(text, environment) == shard
+
+
+def test_an_array_that_is_none_is_a_sentence():
+    with pytest.raises(InputError, match="SLURM_ARRAY_TASK_ID and .* are not set"):
+        parse_shard("auto", {})
+
+
+def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):
+    for name in ("one", "two scenes"):
+        (tmp_path / "scenes" / name).mkdir(parents=True)
+    (tmp_path / "m.csv").write_text(
+        "folder,target,film,config.holes.max_alpha\nscenes/one,4 6,yes,0.4\nscenes/two scenes,,,\n"
+    )
+    (tmp_path / "m.jsonl").write_text(
+        '{"folder": "scenes/one", "target": [4, 6], "film": true, "config": {"holes": '
+        '{"max_alpha": 0.4}}}\n{"folder": "scenes/two scenes"}\n'
+    )
+    by_csv = read_manifest(str(tmp_path / "m.csv"), {})
+    by_json = read_manifest(str(tmp_path / "m.jsonl"), {})
+    by_folder = read_manifest(str(tmp_path / "scenes"), {})
+    for jobs in (by_csv, by_json, by_folder):
+        assert [job.name for job in jobs] == ["one", "two-scenes"]
+    options = [[options_of(j.options, tmp_path / "o") for j in jobs] for jobs in (by_csv, by_json)]
+    assert options[0] == options[1]
+    assert options[0][0].target == ("4", "6")
+    assert options[0][0].film
+    assert options[0][0].config.holes.max_alpha == 0.4
+    assert options[0][1] == options_of(by_folder[1].options, tmp_path / "o")
+
+
+def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
+    manifest = tmp_path / "m.jsonl"
+    rows = [{"folder": "room"}, {"folder": "room", "seed": 1}, {"folder": "room", "name": "a/b"}]
+    manifest.write_text("\n".join(map(json.dumps, rows)))
+    assert [j.name for j in read_manifest(str(manifest), {})] == ["room-1", "room-2", "a-b"]
+    manifest.write_text("\n".join(map(json.dumps, [{"name": "x"}, {"name": "x"}])))
+    with pytest.raises(InputError, match="Two jobs have the name x"):
+        read_manifest(str(manifest), {})
+
+
+@pytest.mark.parametrize(
+    ("row", "sentence"),
+    [
+        ({"targt": 2}, "Unrecognized options: --targt"),
+        ({"resolution": "wide"}, "resolution"),
+        ({"out": "elsewhere"}, "no say in 'out'"),
+        ({"film": "perhaps"}, "must be true or false"),
+        ({"format": "--overwrite"}, "begins with a dash"),
+        ({"seed": -1}, "seed must be greater than or equal to 0"),
+        ({"folder": None}, "no folder"),
+    ],
+)
+def test_a_wrong_row_is_a_sentence(row, sentence, tmp_path):
+    with pytest.raises(InputError, match=sentence):
+        options_of({"folder": "room", **row}, tmp_path / "out")
+
+
+@pytest.fixture(scope="module")
+def manifest(tmp_path_factory) -> Path:
+    """Two rooms, a folder that is none, and a row with a wrong option."""
+    root = tmp_path_factory.mktemp("rooms")
+    for number in range(2):
+        places = ((-0.3 + 0.1 * number, 0), (0.1, 0), (0.7, 12))
+        photographed(root / f"room-{number}", [camera_at(x, yaw=yaw, size=48) for x, yaw in places])
+    common = {"context": [0, 1], "target": [2], "near": 0.5, "far": 20, "resolution": 48}
+    rows = [{"folder": f"room-{number}", **common} for number in range(2)]
+    rows += [{"folder": "nowhere", **common}, {"folder": "room-0", "name": "typo", "targt": 2}]
+    (root / "m.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    return root / "m.jsonl"
+
+
+def same_results(out: Path, other: Path, name: str) -> None:
+    one, two = out / "jobs" / name, other / name
+    files = [*SAME, *(f"images/{p.name}" for p in (one / "images").iterdir())]
+    for file in files:
+        assert (one / file).read_bytes() == (two / file).read_bytes(), file
+
+
+def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
+    manifest, tmp_path, monkeypatch
+):
+    out = tmp_path / "out"
+    words = ("batch", manifest, "--out", out, "--workers", 1, "--threads", 1, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    alone = ("--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20, "--resolution", 48)
+    room = manifest.parent / "room-1"
+    words_alone = ("complete", room, *alone, "--out", tmp_path / "room-1", "--quiet")
+    assert run(monkeypatch, *words_alone) == 0
+    same_results(out, tmp_path, "room-1")
+    rows = {p.stem: json.loads(p.read_text()) for p in (out / "rows").iterdir()}
+    assert {n: r["state"] for n, r in rows.items()} == {
+        "room-0": "done",
+        "room-1": "done",
+        "nowhere": "failed",
+        "typo": "failed",
+    }
+    assert "There is no " in rows["nowhere"]["reason"]
+    assert "--targt" in rows["typo"]["reason"]
+    assert rows["room-0"]["psnr_after"] > rows["room-0"]["psnr_before"]
+    assert {"open", "context", "lift", "report"} <= set(rows["room-0"]["stages"])
+    table = (out / "table.csv").read_text().splitlines()
+    assert len(table) == 5
+    page = (out / "index.html").read_text()
+    assert page.count("data:image/jpeg") == 2
+    assert 'href="jobs/room-0/report.html"' in page
+    assert (out / "jobs" / "room-0" / "report.html").is_file()
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")}
+    assert run(monkeypatch, *words) == 0
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")} == before
+
+
+def test_a_store_gets_the_same_results_and_needs_no_folder_here(manifest, tmp_path):
+    """The work of a worker, without the process around it."""
+    from gscompleter.commands.batch import CompletingJob
+
+    [job] = [j for j in read_manifest(str(manifest), {}) if j.name == "room-0"]
+    room = {**job.options, "folder": f"file://{job.options['folder']}"}
+    here, there = tmp_path / "here", tmp_path / "there"
+    assert CompletingJob(str(here), 0)(job).state == "done"
+    outcome = CompletingJob(f"file://{there}", 0)(Job("room-0", room))
+    assert outcome.state == "done", outcome.reason
+    same_results(here, there / "jobs", "room-0")
+    missing_there = {**room, "folder": f"file://{tmp_path}/nothing"}
+    outcome = CompletingJob(f"file://{there}", 0)(Job("gone", missing_there))
+    assert outcome.state == "failed"
+    assert "There is nothing at" in outcome.reason
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path, manifest, monkeypatch, capsys):
+    (tmp_path / "mine").write_text("")
+    assert run(monkeypatch, "batch", manifest, "--out", tmp_path, "--quiet") == 2
+    assert "holds something other than a batch" in capsys.readouterr().err
+    assert os.listdir(tmp_path) == ["mine"]
+
+
+@pytest.mark.slow
+def test_ray_does_what_is_told_and_tells_of_lost_workers(tmp_path):
+    pytest.importorskip("ray")
+    assert batch_jobs  # its folder is on the path of the workers
+    jobs = [Job("bad", {"ends": "always killed"}), *plain_jobs(3, 0.0)]
+    found = {o.job.name: o.state for o in outcomes(tmp_path, jobs, engine_named("ray", 1), 0)}
+    assert found == {"bad": "failed", "job-000": "done", "job-001": "done", "job-002": "done"}
+
+
+@pytest.mark.slow
+def test_submitit_does_the_shares_and_a_lost_one_is_done_again(tmp_path, monkeypatch):
+    pytest.importorskip("submitit")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
+    jobs = [Job("shy", {"ends": "killed once"}), *plain_jobs(4, 0.0)]
+    engine = SubmititEngine(2, 1, 0.0, tmp_path / "submitit", {})
+    found = {o.job.name: o.state for o in outcomes(tmp_path, jobs, engine, retries=1)}
+    assert found == dict.fromkeys((job.name for job in jobs), "done")
+    assert {name: len(pids) for name, pids in lines(tmp_path / "ended").items()} == {
+        job.name: 1 for job in jobs
+    }
+
+
+def test_a_simulation_counts_what_it_replays():
+    found = replay([1.0] * 10, Fleet(workers=2, start_seconds=3.0, lost_per_hour=0.0))
+    assert found == Replay(hours=8.0 / 3600, busy=10 / 16, repeated=0, given_up=0)
+    hard = replay([3600.0] * 50, Fleet(4, 0.0, lost_per_hour=1.0, retries=2))
+    assert hard.repeated > 20
+    assert hard.given_up > 0
+    assert hard.busy < 0.8
