@@ -1,16 +1,21 @@
 """Matching at the planes that a first guess leaves: the same costs and paths, at fewer planes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS
+from gscompleter.metrics.image import gradient_energy_ratio
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.bands import around, bands_of, every_plane, tiles_of
 from gscompleter.reconstructors.plane_sweep.matching import inverse_depth_planes, matched_costs
 from gscompleter.reconstructors.plane_sweep.measuring import fractions, swept
 from gscompleter.reconstructors.plane_sweep.rig import rig_of
+from gscompleter.render import load_renderer
+from gscompleter.types import sh_from_rgb
 from scenes import Room, camera_at, view_of
 
 SIZE = 200
@@ -144,3 +149,21 @@ def test_of_a_synthesized_image_only_what_is_wanted_is_lifted(rig):
     truth = views[0].depth.flatten()[found.pixel_index]
     assert ((z - truth).abs() / truth).median() < 0.02
     assert len(found.depths) == 2
+
+
+def test_what_is_lifted_shows_the_synthesized_image_as_sharply_as_it_is(rig):
+    views = rig[1]
+    wanted = torch.zeros(views[0].image.shape[:2], dtype=torch.bool)
+    wanted[40:100, 90:] = True
+    inner = torch.zeros_like(wanted)
+    inner[45:95, 95:-5] = True
+    lifted = PlaneSweep().lift(views, wanted).gaussians
+    plain = replace(lifted, sh=sh_from_rgb(views[0].image[wanted]))
+    drawn, blurred = (
+        load_renderer("cpu").render(g, views[0].camera).image for g in (lifted, plain)
+    )
+    ratios = [gradient_energy_ratio(x, views[0].image, inner) for x in (drawn, blurred)]
+    assert ratios[1] < 0.8
+    assert 0.9 < ratios[0] < 1.1
+    errors = [(x - views[0].image)[inner].square().mean() for x in (drawn, blurred)]
+    assert errors[0] < 0.5 * errors[1]

@@ -14,13 +14,16 @@ from torch import Tensor
 from gscompleter.errors import InputError
 from gscompleter.masks import dilate
 from gscompleter.metrics.fid import fid
+from gscompleter.metrics.flip import flip_map
 from gscompleter.metrics.geometry import (
     Alignment,
     abs_rel,
     alignment,
     cloud_distances,
 )
-from gscompleter.metrics.image import MAX_PSNR, masked_psnr, psnr, ssim
+from gscompleter.metrics.haarpsi import haarpsi
+from gscompleter.metrics.image import MAX_PSNR, gradient_energy_ratio, masked_psnr, psnr, ssim
+from gscompleter.metrics.scores import looks
 from gscompleter.render import load_renderer
 from gscompleter.stages.integration import hole_mask, keep_in_holes
 from gscompleter.types import Camera, DepthAffine, Gaussians, TargetCompletion
@@ -97,6 +100,103 @@ def test_masked_psnr_sees_its_pixels_only():
 def test_masked_psnr_of_no_pixel_is_none():
     image, truth = images()
     assert masked_psnr(image, truth, torch.zeros(truth.shape[:2], dtype=torch.bool)) is None
+
+
+# What does not reward blur
+
+
+def blurred(image: Tensor, sigma: float) -> Tensor:
+    return torch.from_numpy(gaussian_filter(image.numpy(), sigma, axes=(0, 1)))
+
+
+def left_half(image: Tensor) -> Tensor:
+    return (torch.arange(image.shape[1]) < image.shape[1] // 2).expand(image.shape[:2])
+
+
+def test_haarpsi_is_that_of_piq():
+    """Its answers to the same images, in float64."""
+    generator = torch.Generator().manual_seed(0)
+    for size, expected in (((32, 40), 0.6336810476687134), ((64, 64), 0.6368790044733689)):
+        truth = torch.rand(*size, 3, generator=generator)
+        image = (truth + 0.2 * torch.randn(*size, 3, generator=generator)).clamp(0, 1)
+        assert haarpsi(image, truth) == pytest.approx(expected, rel=1e-5)
+
+
+def test_haarpsi_of_a_step_by_hand():
+    """A black image has no wavelets: at half the size the similarity is c / (step² + c) where the
+    other has the step of its scale, and the weight is the step of the coarsest."""
+    truth, image = torch.zeros(32, 32, 3), torch.zeros(32, 32, 3)
+    truth[:, 16:] = 1.0
+    inner = torch.zeros(32, 32, dtype=torch.bool)
+    inner[16:18, 14:16] = True  # row 8, column 7 of 16 x 16: before the step
+    # Along the columns: 2 x 1/2 x 255, 8 x 1/4 x 255 and 32 x 1/8 x 255; down the rows nothing.
+    fine, middle, coarse = 255.0, 510.0, 1020.0
+    similar = (30 / (fine**2 + 30) + 30 / (middle**2 + 30)) / 2
+    # Chrominance is 0 in both, with half of that weight.
+    logistic = 1 / (1 + np.exp(-4.2 * np.array([similar, 1.0])))
+    mean = (coarse * logistic[0] + coarse / 2 * logistic[1]) / (1.5 * coarse)
+    expected = (np.log(mean / (1 - mean)) / 4.2) ** 2
+    assert haarpsi(image, truth, inner) == pytest.approx(expected, rel=1e-3)
+
+
+def test_blur_costs_by_haarpsi_and_takes_gradient_energy():
+    _, truth = images()
+    everywhere = torch.ones(truth.shape[:2], dtype=torch.bool)
+    softer = [truth, *(blurred(truth, sigma) for sigma in (0.5, 1.0, 2.0))]
+    similar = [haarpsi(image, truth, everywhere) for image in softer]
+    energies = [gradient_energy_ratio(image, truth, everywhere) for image in softer]
+    assert similar[0] == pytest.approx(1.0)
+    assert energies[0] == 1.0
+    for values in (similar, energies):
+        assert values == sorted(values, reverse=True)
+        assert values[-1] < 0.5 * values[0]
+
+
+def test_gradient_energy_by_hand():
+    """A ramp of half the slope has a quarter of the energy, and a constant none."""
+    ramp = torch.linspace(0, 1, 12)[None, :, None].expand(10, 12, 3)
+    everywhere = torch.ones(10, 12, dtype=torch.bool)
+    assert gradient_energy_ratio(ramp / 2, ramp, everywhere) == pytest.approx(0.25)
+    assert gradient_energy_ratio(ramp * 0 + 0.3, ramp, everywhere) == 0.0
+    assert gradient_energy_ratio(ramp, ramp * 0, everywhere) is None
+    only_green = torch.stack([ramp[..., 0] * 0, ramp[..., 1], ramp[..., 2] * 0], dim=-1)
+    assert gradient_energy_ratio(only_green, ramp, everywhere) == pytest.approx(0.587**2)
+
+
+def test_the_border_of_a_hole_is_no_gradient():
+    _, truth = images()
+    hole = left_half(truth)
+    outside_white = torch.where(hole[..., None], truth, 1.0)
+    assert gradient_energy_ratio(outside_white, truth, hole) == pytest.approx(1.0)
+    thin = torch.zeros_like(hole)
+    thin[5:7] = True
+    assert gradient_energy_ratio(truth, truth, thin) is None
+
+
+def test_looks_are_of_the_pixels_that_are_asked_for():
+    pytest.importorskip("flip_evaluator")
+    _, truth = images(size=64)
+    damaged = torch.where(left_half(truth)[..., None], blurred(truth, 2.0), truth)
+    inside = torch.arange(truth.shape[1]) < truth.shape[1] // 2 - 12
+    outside = torch.arange(truth.shape[1]) > truth.shape[1] // 2 + 12
+    bad, good = (
+        looks(damaged, truth, where.expand(truth.shape[:2])) for where in (inside, outside)
+    )
+    assert bad.flip > 0.1
+    assert bad.haarpsi < 0.5
+    assert bad.gradient_energy < 0.1
+    assert good.flip == pytest.approx(0.0, abs=1e-3)
+    assert good.haarpsi == pytest.approx(1.0)
+    assert good.gradient_energy == 1.0
+    nothing = looks(damaged, truth, torch.zeros(truth.shape[:2], dtype=torch.bool))
+    assert (nothing.flip, nothing.haarpsi, nothing.gradient_energy) == (None, None, None)
+
+
+def test_flip_is_none_without_its_package(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    image, truth = images()
+    assert flip_map(image, truth) is None
+    assert looks(image, truth, left_half(truth)).flip is None
 
 
 # Depth

@@ -104,8 +104,32 @@ def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
     assert content["methods"]["densify-100"]["align_f_score"]["value"] is None
     without = content["methods"]["full"]["lpips_vgg"]["value"] is None
     assert ("LPIPS: weights not available" in (finished / "tables.md").read_text()) == without
+    full, before = (content["methods"][name] for name in ("full", "context"))
+    assert full["hole_flip"]["value"] < 0.8 * before["hole_flip"]["value"]
+    assert full["hole_haarpsi"]["value"] > before["hole_haarpsi"]["value"]
+    assert 0 < full["hole_gradients"]["value"] < 10
+    assert "### Looks" in (finished / "tables.md").read_text()
     assert "seconds" not in json.dumps(content)
     assert set(read_json(finished / "timings.json")) == set(METHOD_NAMES)
+
+
+def test_rows_of_a_version_that_had_fewer_scores_still_make_tables(finished, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    for path in (out / "tasks").glob("*/*.json"):
+        row = read_json(path)
+        for step in row["steps"]:
+            del step["scores"]["hole_looks"], step["scores"]["observed_looks"]
+        path.write_text(json.dumps(row))
+    tables(out)
+    before, now = (
+        read_json(folder / "tables.json")["methods"]["full"] for folder in (finished, out)
+    )
+    assert now["psnr"] == before["psnr"]
+    assert now["hole_haarpsi"] == {"value": None, "cases": 0}
+    text = (out / "tables.md").read_text()
+    assert "HaarPSI" not in text
+    assert "scoring again adds the columns" in text
 
 
 def test_rows_that_are_lost_are_made_again_from_what_is_saved(finished, tasks, tmp_path):

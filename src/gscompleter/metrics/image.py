@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 MAX_PSNR = 100.0
 """PSNR of equal images, in dB, where the formula has no finite value."""
+
+LUMINANCE = (0.299, 0.587, 0.114)
+"""Shares of red, green and blue (ITU-R BT.601)."""
 
 
 def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
@@ -46,3 +50,27 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
             data_range=1.0,
         )
     )
+
+
+def gradient_energy_ratio(
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
+) -> float | None:
+    """Gradient energy of `image` over that of `truth`: 1 is as sharp as the photograph, 0 is flat.
+
+    The sum of squared central differences of the luminance, over the pixels of `where` whose four
+    neighbours lie in it too, so that the border of a hole is no gradient. It tells sharpness and
+    nothing of whether the edges are the true ones. None where there is no such pixel, or the
+    photograph has no gradient there.
+    """
+    there = where[1:-1, 1:-1] & where[:-2, 1:-1] & where[2:, 1:-1]
+    there = there & where[1:-1, :-2] & where[1:-1, 2:]
+    energies = [gradient_energy(x)[there].sum().item() for x in (image.clamp(0, 1), truth)]
+    return energies[0] / energies[1] if energies[1] > 0 else None
+
+
+def gradient_energy(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h-2 w-2"]:
+    """Squared length of the gradient of luminance per pixel, by central differences."""
+    luminance = image.double() @ image.new_tensor(LUMINANCE, dtype=torch.float64)
+    down = (luminance[2:, 1:-1] - luminance[:-2, 1:-1]) / 2
+    along = (luminance[1:-1, 2:] - luminance[1:-1, :-2]) / 2
+    return down**2 + along**2

@@ -9,8 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.metrics.flip import flip_map
 from gscompleter.metrics.geometry import abs_rel, alignment
-from gscompleter.metrics.image import MAX_PSNR, masked_psnr, ssim
+from gscompleter.metrics.haarpsi import haarpsi
+from gscompleter.metrics.image import MAX_PSNR, gradient_energy_ratio, masked_psnr, ssim
 from gscompleter.metrics.lpips import lpips_if_available
 from gscompleter.render import Renderer
 from gscompleter.stages.integration import hole_mask
@@ -53,6 +55,17 @@ class Quality:
 
 
 @dataclass(frozen=True)
+class Looks:
+    """Part of an image against its photograph, by what does not reward blur. None: of no pixel."""
+
+    flip: float | None
+    """Mean of the map of FLIP; None where flip-evaluator is missing, too."""
+    haarpsi: float | None
+    gradient_energy: float | None
+    """As a multiple of the photograph's; None where that is flat, too."""
+
+
+@dataclass(frozen=True)
 class Scores:
     """How a completion fares against the photographs it did not see. None: no truth exists."""
 
@@ -83,6 +96,10 @@ class Scores:
     """Chamfer distance between the two, as a share of the median depth at the target."""
     align_f_score: float | None = None
     """F-score between the two."""
+    hole_looks: Looks | None = None
+    """At the target, in the hole, after completion."""
+    observed_looks: Looks | None = None
+    """Of all other pixels."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +147,8 @@ def score(
         context_ssim=_changes(context, counted_ssim),
         depth_observed=abs_rel(now.depth, target.depth, ~holes & covered),
         depth_hole=abs_rel(now.depth, target.depth, holes & covered),
+        hole_looks=looks(target.compared(now.image), target.image, holes & counted),
+        observed_looks=looks(target.compared(now.image), target.image, ~holes & counted),
     )
     if added is not None and len(added) > 0:
         aligned = alignment(added, before, target.camera, renderer)
@@ -167,6 +186,18 @@ def counted_psnr(image: Float[Tensor, "h w 3"], photograph: View) -> float:
 def counted_ssim(image: Float[Tensor, "h w 3"], photograph: View) -> float:
     """SSIM, with what is to be ignored of the photograph taken for equal."""
     return ssim(photograph.compared(image), photograph.image)
+
+
+def looks(
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
+) -> Looks:
+    """FLIP, HaarPSI and the ratio of gradient energies over the pixels of `where`."""
+    errors = flip_map(image, truth)
+    return Looks(
+        None if errors is None or not where.any() else errors[where.cpu()].mean().item(),
+        haarpsi(image, truth, where),
+        gradient_energy_ratio(image, truth, where),
+    )
 
 
 def rim_error(

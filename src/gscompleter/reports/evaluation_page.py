@@ -13,14 +13,14 @@ from gscompleter.reports.figures import time_bars
 from gscompleter.reports.finished import as_written, check_results
 from gscompleter.reports.page import Picture, Table, gallery_of, rendered
 from gscompleter.reports.plain_words import shown
-from gscompleter.reports.summary import GEOMETRY, IMAGES, SEQUENCE, Column, stage_place
+from gscompleter.reports.summary import GEOMETRY, IMAGES, LOOKS, SEQUENCE, Column, stage_place
 
 TABLES = "tables.json"
 """The file that says a folder holds an evaluation."""
 TIMINGS = "timings.json"
 ADVICE = "let `tables` write it again"
 """What to do about a damaged file."""
-GROUPS = {"Images": IMAGES, "Geometry": GEOMETRY, "Sequences": SEQUENCE}
+GROUPS = {"Images": IMAGES, "Looks": LOOKS, "Geometry": GEOMETRY, "Sequences": SEQUENCE}
 """By their titles, the columns of the tables of scores."""
 PLOTS = {
     "gain_by_hole": "Gain at the target against the size of the hole",

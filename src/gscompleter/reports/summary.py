@@ -58,9 +58,10 @@ def gain_of(step: Step) -> float:
 
 
 def _at(*path: str) -> Callable[[Step], float | None]:
-    """What lies there in the scores of a step; None where a score on the way is None."""
+    """What lies there in the scores of a step; None where a score on the way is None, or is not
+    there because an earlier version scored the step."""
     return lambda step: reduce(
-        lambda found, key: None if found is None else found[key], path, step["scores"]
+        lambda found, key: None if found is None else found.get(key), path, step["scores"]
     )
 
 
@@ -103,6 +104,30 @@ IMAGES = (
 )
 """PSNR in dB: at the target; there in and outside of the holes of the scene before; beside the
 target; at the known views. The worst change is that of the known view that lost most."""
+
+LOOKS = (
+    Column("hole_flip", "FLIP in holes", 3, _at("hole_looks", "flip")),
+    Column("observed_flip", "FLIP outside", 3, _at("observed_looks", "flip")),
+    Column("hole_haarpsi", "HaarPSI in holes", 3, _at("hole_looks", "haarpsi")),
+    Column("observed_haarpsi", "HaarPSI outside", 3, _at("observed_looks", "haarpsi")),
+    Column(
+        "hole_gradients",
+        "gradient energy in holes",
+        2,
+        _at("hole_looks", "gradient_energy"),
+        over_tasks=statistics.median,
+    ),
+    Column(
+        "observed_gradients",
+        "gradient energy outside",
+        2,
+        _at("observed_looks", "gradient_energy"),
+        over_tasks=statistics.median,
+    ),
+)
+"""At the target, by what does not reward blur: 0 is best of FLIP, 1 of HaarPSI, and a gradient
+energy of 1 is as sharp as the photograph. Of these ratios the median over the tasks: where a
+photograph is nearly flat they are anything."""
 
 GEOMETRY = (
     Column("depth_observed", "AbsRel observed", 3, _at("depth_observed")),
@@ -156,7 +181,7 @@ class Summary:
     @property
     def groups(self) -> dict[str, tuple[Column, ...]]:
         """By the title of their table, the columns that may have a value."""
-        groups = {"Images": IMAGES, "Geometry": GEOMETRY}
+        groups = {"Images": IMAGES, "Looks": LOOKS, "Geometry": GEOMETRY}
         return {**groups, "Sequences": SEQUENCE} if self.sequences else groups
 
     @property

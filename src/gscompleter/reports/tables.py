@@ -18,6 +18,7 @@ from gscompleter.io.image import read_image
 from gscompleter.metrics.fid import fid
 from gscompleter.reports.summary import (
     IMAGES,
+    LOOKS,
     Cell,
     Column,
     Step,
@@ -33,6 +34,10 @@ from gscompleter.runs.store import step_path, task_folder, truth_path
 LPIPS_MISSING = (
     "LPIPS: weights not available. `gscompleter.metrics.lpips.load_lpips()` fetches them; then "
     "scoring again adds the column.\n"
+)
+FLIP_MISSING = (
+    "FLIP: not at hand. `pip install 'gscompleter[evaluation]'` brings it; then scoring again adds "
+    "the columns.\n"
 )
 
 
@@ -123,6 +128,8 @@ def score_markdown(summary: Summary, fids: Fid) -> str:
             parts.append(f"### {title}\n\n" + markdown(head, score_cells(summary, chosen)))
     if not any(column.key.startswith("lpips") for column in summary.present(IMAGES)):
         parts.append(LPIPS_MISSING)
+    if not any(column.key.endswith("flip") for column in summary.present(LOOKS)):
+        parts.append(FLIP_MISSING)
     parts.append(fid_markdown(summary, fids))
     if len(summary.gains) > 1:
         parts.append(gain_markdown(summary))

@@ -27,10 +27,10 @@ from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patche
 from gscompleter.interpolation import smoothed
 from gscompleter.types import Camera, SceneContext, View
 
-STRUCTURE_REACH = 0.1
+STRUCTURE_REACH = 0.15
 """How far into a hole structure is continued, relative to the longer side of the image; it fades
 out on the way. Nothing tells what lies deeper, and a wrong guess is worse than none."""
-TONE_RADIUS = 6
+TONE_RADIUS = 4
 """Pixels over which a hole keeps the mean colour of its smooth continuation. Patches alone look as
 plausible but drift in tone."""
 CRACK_WIDTH = 4

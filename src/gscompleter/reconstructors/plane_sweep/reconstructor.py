@@ -13,7 +13,7 @@ from torch import Tensor
 from gscompleter.kernels.sharing import side_by_side
 from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.matching.stereo_image import StereoImage
-from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance
+from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance, fit_colours
 from gscompleter.reconstructors.plane_sweep.confidence import Mask
 from gscompleter.reconstructors.plane_sweep.exposure import gains_of
 from gscompleter.reconstructors.plane_sweep.fusion import (
@@ -80,11 +80,12 @@ class PlaneSweep:
         )
 
     def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
-        """The Gaussians of the pixels `wanted` of the first view, a synthesized image, as they are.
+        """The Gaussians of the pixels `wanted` of the first view, a synthesized image.
 
-        What fills a hole is seen by no photograph that it could be fitted to; and its depth is that
-        of the surfaces around it, which half the size tells. Other views' depths are those that
-        were measured.
+        What fills a hole is seen by no photograph, so that its opacities are left alone; and its
+        depth is that of the surfaces around it, which half the size tells. Its colours are fitted
+        to the synthesized image itself, for drawing takes the half of its sharpness. Other views'
+        depths are those that were measured.
 
         Raises:
             InputError: as a call.
@@ -95,8 +96,11 @@ class PlaneSweep:
         layers = surfaces_of(rig.images[0], first), *map(as_measured, rig.images[1:], others)
         depths = depth_maps(layers, rig.unit, views)
         rows = torch.nonzero(wanted.reshape(-1))[:, 0]
-        gaussians = self.splat(views[0], depths[0])[rows]
-        return Reconstruction(gaussians, tuple(depths), torch.zeros_like(rows), rows)
+        blurred = self.splat(views[0], depths[0])[rows]
+        gaussians = fit_colours(blurred.to("cpu"), [views[0].to("cpu")], self.renderer)
+        return Reconstruction(
+            gaussians.to(rows.device), tuple(depths), torch.zeros_like(rows), rows
+        )
 
     def depths(self, views: Sequence[View]) -> list[DepthMap]:
         """z-depth of all pixels of `views`, valid where it was measured, and how sure of it."""
