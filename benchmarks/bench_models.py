@@ -34,6 +34,8 @@ MODELS = (
     "depthsplat-base-re10k",
     "depthsplat-large-re10k",
     "volsplat-re10k",
+    "da3-small",
+    "da3-base",
 )
 """One of each network; the default comes first, for the ratios."""
 
@@ -58,12 +60,11 @@ def model(
     """The reconstructor, with random weights if it has any, and how many."""
     if name not in PUBLISHED:
         return load_reconstructor(name), 0
-    from gscompleter.reconstructors.feed_forward import FeedForward
-    from gscompleter.reconstructors.feed_forward.build import network_of
+    from gscompleter.reconstructors.feed_forward.build import around, network_of
 
     torch.manual_seed(0)
     network = network_of(PUBLISHED[name]).eval().requires_grad_(False).to(device)
-    return FeedForward(network, dtype), sum(p.numel() for p in network.parameters())
+    return around(network, dtype), sum(p.numel() for p in network.parameters())
 
 
 def repeated(reconstruct: Reconstructor, views: list[View], repetitions: int) -> Measured:

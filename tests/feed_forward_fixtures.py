@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -22,6 +23,8 @@ from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussi
 from parity import relative_error
 
 STORED = Path(__file__).parent / "fixtures" / "feed_forward"
+EXTRA = os.environ.get("GSC_EXTRA_FIXTURES")
+"""A folder with more fixtures, in the layout of the stored ones; the tests take all that it has."""
 EVERY = 97
 """Of the values between the layers each 97th is stored."""
 
@@ -53,6 +56,11 @@ def published_shapes(model: str, name: str) -> dict[str, tuple[int, ...]]:
     """Names and shapes of all weights of the authors' network."""
     keys = json.loads((STORED / model / f"{name}.json").read_text())["keys"]
     return {key: tuple(shape) for key, (shape, _) in keys.items()}
+
+
+def extra(model: str, pattern: str = "*.npz") -> list[Path]:
+    """The files of a model in the folder of more fixtures."""
+    return sorted(Path(EXTRA, model).glob(pattern)) if EXTRA else []
 
 
 @dataclass(frozen=True)

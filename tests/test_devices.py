@@ -17,7 +17,16 @@ from gscompleter.generators.agreement import compare
 from gscompleter.generators.diffusion.position_ids import source_ids
 from gscompleter.generators.diffusion.source_depth import context_depth, from_disparity, rescaled
 from gscompleter.metrics.scores import Truth, score
-from gscompleter.reconstructors import reconstructed, tensors_in
+from gscompleter.reconstructors import Reconstructor, reconstructed, tensors_in
+from gscompleter.reconstructors.depth_anything import (
+    AnyViewDepth,
+    AnyViewGaussians,
+    DepthAnything,
+    DepthAnythingConfig,
+    Inference,
+    Sizing,
+)
+from gscompleter.reconstructors.depth_anything.config import VitConfig
 from gscompleter.reconstructors.feed_forward import (
     DepthSplat,
     FeedForward,
@@ -27,6 +36,7 @@ from gscompleter.reconstructors.feed_forward import (
 )
 from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
 from gscompleter.reconstructors.feed_forward.depthsplat import VARIANTS
+from gscompleter.reconstructors.from_depth import FromDepth
 from gscompleter.stages.anchor import lift
 from gscompleter.stages.context import depth_range_of_scene, init_context
 from gscompleter.stages.integration import keep_in_holes
@@ -92,6 +102,29 @@ def test_networks_reconstruct_where_the_views_lie_and_run_where_they_lie_themsel
     check_there(lift(moved, *there))
     assert not any(
         isinstance(tensor, There) for _, tensor in tensors_in(reconstructed(moved, pair), "it")
+    )
+
+
+@pytest.mark.parametrize("gaussians", [False, True])
+def test_depth_anything_reconstructs_where_the_views_lie(elsewhere, gaussians):
+    torch.manual_seed(0)
+    vit = VitConfig(64, 1, 4, (0, 1, 2, 3), 1)
+    network = DepthAnything(DepthAnythingConfig(vit, 32, (16,) * 4, gaussians)).eval()
+    network.requires_grad_(False)
+    pair = [view_of(Room(), camera_at(x, size=56), i) for i, x in enumerate((-0.3, 0.1))]
+    there = [view.to(DEVICE) for view in pair]
+
+    def psi() -> Reconstructor:
+        inference = Inference(Sizing(56))
+        if gaussians:
+            return AnyViewGaussians(network, inference)
+        return FromDepth(model=AnyViewDepth(network, inference))
+
+    check_there(reconstructed(psi(), there))
+    network.to(DEVICE)
+    check_there(lift(psi(), *there))
+    assert not any(
+        isinstance(tensor, There) for _, tensor in tensors_in(reconstructed(psi(), pair), "it")
     )
 
 

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from feed_forward_fixtures import STORED, Case, Pass, published_shapes, with_rule_v1
+from feed_forward_fixtures import STORED, Case, Pass, extra, published_shapes, with_rule_v1
 from gscompleter import GSCompleter, InputError
 from gscompleter.geometry import project, rotations_from, widened
 from gscompleter.reconstructors.feed_forward import (
@@ -108,6 +108,16 @@ def test_mvsplat_equals_the_authors_code_with_more_views_and_pixels(shared, case
 )
 def test_depthsplat_equals_the_authors_code_with_more_views_and_pixels(shared, case):
     check(shared / "fixtures" / "depthsplat" / f"{case}.npz", case.split("_")[0])
+
+
+@pytest.mark.parametrize("path", extra("mvsplat"), ids=lambda path: path.stem)
+def test_mvsplat_equals_the_authors_code_in_more_cases(path):
+    check(path, "mvsplat")
+
+
+@pytest.mark.parametrize("path", extra("depthsplat"), ids=lambda path: path.stem)
+def test_depthsplat_equals_the_authors_code_in_more_cases(path):
+    check(path, path.stem.split("_")[0])
 
 
 def test_weights_of_mvsplat_are_named_and_shaped_as_published():

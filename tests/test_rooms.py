@@ -51,7 +51,8 @@ def test_a_room_knows_only_those_below_it():
 
 
 def test_the_core_imports_no_particular_model():
-    models = ("plane_sweep", "feed_forward", "warp_inpaint", "diffusion", "oracle")
+    reconstructors = ("plane_sweep", "feed_forward", "depth_anything")
+    models = (*reconstructors, "warp_inpaint", "diffusion", "oracle")
     core = [PACKAGE / "completer.py", *sorted((PACKAGE / "stages").glob("*.py"))]
     found = [(path.name, name) for path in core for name in models if name in path.read_text()]
     assert found == []

@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 import torch
 
-from feed_forward_fixtures import Case, published_shapes
+from feed_forward_fixtures import Case, extra, published_shapes
 from gscompleter import GSCompleter, InputError
 from gscompleter.geometry import inside, project
 from gscompleter.reconstructors.feed_forward import FeedForward, VolSplat, VolSplatConfig
@@ -70,6 +70,11 @@ def test_voxels_with_neighbours_agree_with_the_authors_code():
 
 def test_voxels_of_the_published_size_agree_with_the_authors_code(shared):
     check(Case.load(shared / "fixtures" / "volsplat" / "v2_64x64_vox0.001.npz"))
+
+
+@pytest.mark.parametrize("path", extra("volsplat"), ids=lambda path: path.stem)
+def test_voxels_agree_with_the_authors_code_in_more_cases(path):
+    check(Case.load(path))
 
 
 def predict(network: VolSplat) -> VoxelGaussians:

@@ -93,6 +93,9 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_names_are_model_size_and_data_and_files_carry_them():
     for name, weights in PUBLISHED.items():
         assert name == weights.name
+        if name.startswith("da3-"):  # images of any shape; files are told apart by their folders
+            assert weights.repository == f"depth-anything/{weights.model}"
+            continue
         height, width = weights.image_size
         size = "" if (height, width) == (256, 256) else f"-{height}x{width}"
         assert name.endswith(size)
@@ -106,6 +109,11 @@ def test_names_are_model_size_and_data_and_files_carry_them():
             views = f"view{fewest}" if fewest == most else f"view{fewest}-{most}"
             assert views in weights.file
     assert len({(w.repository, w.file) for w in PUBLISHED.values()}) == len(PUBLISHED)
+
+
+def test_files_that_are_fetched_by_hand_do_not_meet_in_one_place():
+    places = [place_of(w) for w in PUBLISHED.values() if not w.name.endswith("-6view")]
+    assert len(set(places)) == len(places)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +151,7 @@ def test_every_file_without_a_plain_licence_says_why():
     for weights in PUBLISHED.values():
         started_from_nc = "-base-" in weights.name or "-large-" in weights.name
         on_dl3dv = "dl3dv" in weights.name or weights.gives == "depth"
-        unlicensed = weights.weights_licence == "not stated"
+        unlicensed = weights.weights_licence in ("not stated", "CC BY-NC 4.0")
         assert bool(weights.caution) == (started_from_nc or on_dl3dv or unlicensed), weights.name
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from gscompleter.matching.features import Pixels
 from gscompleter.matching.stereo_image import StereoImage, source_from_reference
@@ -17,7 +17,16 @@ MIN_PARALLAX = 1.0
 def inverse_depths(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> Float[np.ndarray, "k"]:
-    """Inverse z-depths in `reference` of the matches that lie on their epipolar lines.
+    """Inverse z-depths in `reference` of the matches that tell them."""
+    inverse, good = triangulate(reference, source, pixels, matched)
+    return inverse[good]
+
+
+def triangulate(
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Inverse z-depths in `reference` of all matches, and which of these lie on their epipolar
+    lines and can be trusted.
 
     A match that hardly moves tells nothing of depth.
     """
@@ -34,4 +43,4 @@ def inverse_depths(
     error = np.linalg.norm(at_depth[:, :2] / scale - matched, axis=1)
     start = at_infinity[:, :2] / np.where(ahead, at_infinity[:, 2], 1.0)[:, None]
     parallax = np.linalg.norm(start - matched, axis=1)
-    return inverse[ahead & (inverse > 0) & (error < MAX_ERROR) & (parallax > MIN_PARALLAX)]
+    return inverse, ahead & (inverse > 0) & (error < MAX_ERROR) & (parallax > MIN_PARALLAX)

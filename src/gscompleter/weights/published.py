@@ -58,8 +58,9 @@ class PublishedWeights:
     """Entry of the file that holds the tensors, where they do not lie at the top."""
     prefix: str = "encoder."
     """How the names of the network's tensors begin in the file."""
-    gives: Literal["Gaussians", "depth"] = "Gaussians"
-    """What the network predicts. Those of depth alone are no reconstructors."""
+    gives: Literal["Gaussians", "scene depth", "depth"] = "Gaussians"
+    """What the network predicts: Gaussians, depth in the unit of the scene, of which we make
+    Gaussians, or depth alone, which is no reconstructor."""
 
     @property
     def url(self) -> str:
@@ -70,8 +71,8 @@ class PublishedWeights:
 
     @property
     def is_reconstructor(self) -> bool:
-        """Whether it gives Gaussians, and to which network it belongs is known."""
-        return self.gives == "Gaussians" and self.network is not None
+        """Whether it gives Gaussians or what we make them of, and its network is known."""
+        return self.gives != "depth" and self.network is not None
 
     @property
     def pinned_by(self) -> str:
@@ -91,6 +92,7 @@ class PublishedWeights:
 
 FROM_DEPTH_ANYTHING = "training started from Depth Anything V2 {}, which is CC BY-NC 4.0"
 FROM_BASE, FROM_LARGE = FROM_DEPTH_ANYTHING.format("Base"), FROM_DEPTH_ANYTHING.format("Large")
+NON_COMMERCIAL = "the licence of the file, CC BY-NC 4.0, allows non-commercial use only"
 ON_DL3DV = "trained on DL3DV-10K, whose terms allow non-commercial research only"
 ON_DEPTH_DATA = f"{ON_DL3DV}, and on ScanNet, TartanAir and VKITTI2, which have their own terms"
 
@@ -161,6 +163,29 @@ def _depthsplat(
         weights_licence="MIT",
         caution=caution,
         source="https://huggingface.co/haofeixu/depthsplat",
+    )
+
+
+def _depth_anything(
+    name: str, repository: str, parameters: int, caution: str = NON_COMMERCIAL, **others: Any
+) -> PublishedWeights:
+    """A file of Depth Anything 3's authors: one in each of their repositories."""
+    return PublishedWeights(
+        name=name,
+        model=repository.upper(),
+        network=name,
+        repository=f"depth-anything/{repository}",
+        file="model.safetensors",
+        parameters=parameters,
+        image_size=(504, 504),
+        near_far=None,
+        code="https://github.com/ByteDance-Seed/Depth-Anything-3",
+        code_licence="Apache-2.0",
+        weights_licence="CC BY-NC 4.0" if caution else "Apache-2.0",
+        caution=caution,
+        source=f"https://huggingface.co/depth-anything/{repository}",
+        prefix="model.",
+        **{"views": (2, 18), **others},
     )
 
 
@@ -237,6 +262,27 @@ _FILES = (
         **DEPTH_ALONE,
     ),
     VOLSPLAT,
+    _depth_anything(
+        "da3-small",
+        "DA3-SMALL",
+        34_299_463,
+        "",
+        revision="e08cab65ca0ec38e7826075418411ab90cab4da3",
+        sha256="364492e38a3a06d221ac75da7f6621ada3f2361cd24fde11ba79091e9f40efcf",
+        gives="scene depth",
+    ),
+    _depth_anything("da3-base", "DA3-BASE", 135_366_599, "", gives="scene depth"),
+    _depth_anything("da3-large", "DA3-LARGE-1.1", 410_941_767, gives="scene depth"),
+    _depth_anything("da3-giant", "DA3-GIANT-1.1", 1_355_674_125),
+    _depth_anything(
+        "da3-metric-large",
+        "DA3METRIC-LARGE",
+        334_171_394,
+        "",
+        views=(1, 1),
+        gives="scene depth",
+    ),
+    _depth_anything("da3-nested-giant-large", "DA3NESTED-GIANT-LARGE-1.1", 1_689_845_519),
 )
 
 PUBLISHED: dict[str, PublishedWeights] = {weights.name: weights for weights in _FILES}

@@ -7,18 +7,34 @@ from pathlib import Path
 
 import torch
 
+from gscompleter.reconstructors import depth_anything
+from gscompleter.reconstructors.depth_anything import (
+    AnyViewDepth,
+    AnyViewGaussians,
+    DepthAnything,
+    DepthAnythingConfig,
+    Inference,
+    MetricDepthAnything,
+    MetricDepthConfig,
+    MetricViewDepth,
+    NestedConfig,
+    NestedDepthAnything,
+)
 from gscompleter.reconstructors.feed_forward.depthsplat import VARIANTS, DepthSplat
 from gscompleter.reconstructors.feed_forward.mvsplat import MVSplat
 from gscompleter.reconstructors.feed_forward.reconstructor import FeedForward
 from gscompleter.reconstructors.feed_forward.volsplat import VolSplat
+from gscompleter.reconstructors.from_depth import FromDepth
 from gscompleter.weights import PUBLISHED, PublishedWeights, fetch, load_strictly, read_state_dict
 from gscompleter.weights.fitting import shapes_of
 
-Network = MVSplat | DepthSplat | VolSplat
+DepthAnythings = DepthAnything | MetricDepthAnything | NestedDepthAnything
+Network = MVSplat | DepthSplat | VolSplat | DepthAnythings
+Reconstructs = FeedForward | FromDepth | AnyViewGaussians
 
 
 @lru_cache(maxsize=1)
-def build(name: str, weights: Path | None = None, device: str = "cpu") -> FeedForward:
+def build(name: str, weights: Path | None = None, device: str = "cpu") -> Reconstructs:
     """The reconstructor with the published weights of that name; the last one is kept.
 
     Args:
@@ -34,14 +50,44 @@ def build(name: str, weights: Path | None = None, device: str = "cpu") -> FeedFo
     state = read_state_dict(path, published)
     network = network_of(published)
     load_strictly(network, state, path, shapes_of_all)
-    return FeedForward(network.eval().requires_grad_(False).to(device))
+    return around(network.eval().requires_grad_(False).to(device))
+
+
+def around(network: Network, dtype: torch.dtype = torch.float32) -> Reconstructs:
+    """The Ψ of a network.
+
+    Args:
+        network: With its weights, on the device where it is to run.
+        dtype: In which it runs; anything but float32 takes a GPU.
+    """
+    inference = Inference(dtype=dtype)
+    if isinstance(network, MetricDepthAnything):
+        return FromDepth(model=MetricViewDepth(network, inference))
+    if isinstance(network, NestedDepthAnything):
+        return AnyViewGaussians(network, inference)
+    if isinstance(network, DepthAnything):
+        if network.gs_head is not None:
+            return AnyViewGaussians(network, inference)
+        return FromDepth(model=AnyViewDepth(network, inference))
+    return FeedForward(network, dtype)
 
 
 def network_of(published: PublishedWeights) -> Network:
     """The network that a file fits, with random weights, set up for what it was trained on."""
+    if published.name in depth_anything.VARIANTS:
+        return network_with(depth_anything.VARIANTS[published.name])
     if published.model == "DepthSplat":
         return DepthSplat(VARIANTS[variant_of(published)])
     return MVSplat() if published.model == "MVSplat" else VolSplat()
+
+
+def network_with(config: DepthAnythingConfig | MetricDepthConfig | NestedConfig) -> DepthAnythings:
+    """A network of Depth Anything 3, with random weights."""
+    if isinstance(config, NestedConfig):
+        return NestedDepthAnything(config)
+    if isinstance(config, MetricDepthConfig):
+        return MetricDepthAnything(config)
+    return DepthAnything(config)
 
 
 def variant_of(published: PublishedWeights) -> str:

@@ -111,13 +111,20 @@ class DinoV2(nn.Module):
         return maps
 
     def positions(self, rows: int, columns: int) -> Float[Tensor, "1 t c"]:
-        """The stored positions, resized to a grid of `rows` x `columns` patches.
+        """The stored positions on a grid of `rows` x `columns` patches."""
+        return resized_positions(self.pos_embed, rows, columns)
 
-        The tenth that is added to the size shifts where they are sampled, as in the original.
-        """
-        if rows == columns == GRID:
-            return self.pos_embed
-        stored = self.pos_embed[:, 1:].transpose(1, 2).unflatten(2, (GRID, GRID))
-        factors = ((rows + 0.1) / GRID, (columns + 0.1) / GRID)
-        resized = F.interpolate(stored, scale_factor=factors, mode="bicubic")
-        return torch.cat([self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2)], 1)
+
+def resized_positions(
+    stored: Float[Tensor, "1 s c"], rows: int, columns: int
+) -> Float[Tensor, "1 t c"]:
+    """Positions of the class token and of GRID x GRID patches, resized to `rows` x `columns`.
+
+    The tenth that is added to the size shifts where they are sampled, as in the original.
+    """
+    if rows == columns == GRID:
+        return stored
+    grid = stored[:, 1:].transpose(1, 2).unflatten(2, (GRID, GRID))
+    factors = ((rows + 0.1) / GRID, (columns + 0.1) / GRID)
+    resized = F.interpolate(grid, scale_factor=factors, mode="bicubic")
+    return torch.cat([stored[:, :1], resized.flatten(2).transpose(1, 2)], 1)

@@ -87,13 +87,33 @@ class Scratch(nn.Module):
         self.output_conv = nn.Identity() if out is None else out
 
     def forward(self, pyramid: Sequence[Float[Tensor, "n _ _ _"]]) -> Float[Tensor, "n c h w"]:
+        fusions = (self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4)
+        return self.output_conv(fused(self.levels(pyramid), *fusions))
+
+    def levels(self, pyramid: Sequence[Float[Tensor, "n _ _ _"]]) -> list[Float[Tensor, "n c _ _"]]:
+        """The maps of all levels, with the same number of channels."""
         layers = (self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn)
-        a, b, c, d = (layer(x) for layer, x in zip(layers, pyramid, strict=True))
-        x = self.refinenet4(d, c.shape[2:])
-        x = self.refinenet3.fused(x, c, b.shape[2:])
-        x = self.refinenet2.fused(x, b, a.shape[2:])
-        x = self.refinenet1.fused(x, a, (2 * a.shape[2], 2 * a.shape[3]))
-        return self.output_conv(x)
+        return [layer(x) for layer, x in zip(layers, pyramid, strict=True)]
+
+
+def fused(
+    levels: Sequence[Float[Tensor, "n c _ _"]],
+    finest: Fusion,
+    finer: Fusion,
+    coarser: Fusion,
+    coarsest: Coarsest,
+) -> Float[Tensor, "n c h w"]:
+    """Four levels, finest first, fused to twice the size of the finest."""
+    a, b, c, d = levels
+    x = coarsest(d, size_of(c))
+    x = coarser.fused(x, c, size_of(b))
+    x = finer.fused(x, b, size_of(a))
+    return finest.fused(x, a, (2 * a.shape[2], 2 * a.shape[3]))
+
+
+def size_of(x: Float[Tensor, "n c h w"]) -> tuple[int, int]:
+    """Height and width of a map."""
+    return x.shape[2], x.shape[3]
 
 
 class DptHead(nn.Module):

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.geometry import z_depths
 from gscompleter.reconstructors.feed_forward.depthsplat import DepthSplat
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
 from gscompleter.reconstructors.feed_forward.inputs import Crop, batch_of
 from gscompleter.reconstructors.feed_forward.mvsplat import MVSplat
+from gscompleter.reconstructors.feed_forward.precision import check_precision, lower_precision
 from gscompleter.reconstructors.feed_forward.volsplat import VolSplat, VoxelGaussians
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, observed
 
@@ -42,11 +42,7 @@ class FeedForward:
     stays in float32. A CPU takes float32 only. No test covers it on a GPU."""
 
     def __post_init__(self) -> None:
-        if self.dtype != torch.float32 and self.device.type != "cuda":
-            raise InputError(
-                f"The network lies on the {self.device.type} and {self.dtype} was asked for, "
-                "which needs a GPU; use float32."
-            )
+        check_precision(self.device, self.dtype)
 
     @property
     def device(self) -> torch.device:
@@ -65,9 +61,8 @@ class FeedForward:
         """
         config = self.network.config
         images, cameras, crops = batch_of(views, config.patch, config.near, config.far)
-        lower = torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32)
         # Not torch.inference_mode: the stages that follow optimise what comes from here.
-        with torch.no_grad(), lower:
+        with torch.no_grad(), lower_precision(self.device, self.dtype):
             predicted = self.network(images.to(self.device), cameras.to(self.device))
         if isinstance(predicted, VoxelGaussians):
             return reconstruction_of_voxels(predicted, views, crops)

@@ -1,0 +1,40 @@
+"""Ψ with weights: Depth Anything 3, a transformer that looks at any number of views.
+
+The code is our own, written from a description of the model; the modules are named as in the
+authors' files, so that these load without renaming.
+"""
+
+from gscompleter.reconstructors.depth_anything.config import (
+    VARIANTS,
+    DepthAnythingConfig,
+    MetricDepthConfig,
+    NestedConfig,
+)
+from gscompleter.reconstructors.depth_anything.inputs import Sizing
+from gscompleter.reconstructors.depth_anything.metric import MetricDepthAnything
+from gscompleter.reconstructors.depth_anything.nested import NestedDepthAnything
+from gscompleter.reconstructors.depth_anything.network import DepthAnything
+from gscompleter.reconstructors.depth_anything.normalisation import authors_units, scene_units
+from gscompleter.reconstructors.depth_anything.reconstructor import (
+    AnyViewDepth,
+    AnyViewGaussians,
+    Inference,
+    MetricViewDepth,
+)
+
+__all__ = [
+    "VARIANTS",
+    "AnyViewDepth",
+    "AnyViewGaussians",
+    "DepthAnything",
+    "DepthAnythingConfig",
+    "Inference",
+    "MetricDepthAnything",
+    "MetricDepthConfig",
+    "MetricViewDepth",
+    "NestedConfig",
+    "NestedDepthAnything",
+    "Sizing",
+    "authors_units",
+    "scene_units",
+]

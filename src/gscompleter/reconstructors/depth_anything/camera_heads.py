@@ -1,0 +1,66 @@
+"""Between cameras and tokens of the transformer."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.reconstructors.depth_anything.vit import Block
+from gscompleter.reconstructors.feed_forward.dino import Attention, Mlp
+
+HEADS = 16
+"""Heads of the attention among cameras, whatever the size of the network."""
+LAYERS = 4
+"""Layers of the transformer over cameras."""
+
+
+class PoseBranch(nn.Module):
+    """Nine numbers of a camera as a token."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(9, channels // 2)
+        self.fc2 = nn.Linear(channels // 2, channels)
+
+    def forward(self, numbers: Float[Tensor, "b v 9"]) -> Float[Tensor, "b v c"]:
+        return self.fc2(F.gelu(self.fc1(numbers)))
+
+
+class CameraEncoder(nn.Module):
+    """A token for each camera, which knows of the others of its scene."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.pose_branch = PoseBranch(channels)
+        self.token_norm = nn.LayerNorm(channels)
+        self.trunk = nn.Sequential(
+            *(
+                Block(channels, Attention(channels, HEADS), Mlp(channels), eps=1e-5)
+                for _ in range(LAYERS)
+            )
+        )
+        self.trunk_norm = nn.LayerNorm(channels)
+
+    def forward(self, numbers: Float[Tensor, "b v 9"]) -> Float[Tensor, "b v c"]:
+        """From `encoded` cameras."""
+        return self.trunk_norm(self.trunk(self.token_norm(self.pose_branch(numbers))))
+
+
+class CameraDecoder(nn.Module):
+    """The camera that a token tells."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.backbone = nn.Sequential(
+            nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels), nn.ReLU()
+        )
+        self.fc_t = nn.Linear(channels, 3)
+        self.fc_qvec = nn.Linear(channels, 4)
+        self.fc_fov = nn.Sequential(nn.Linear(channels, 2), nn.ReLU())
+
+    def forward(self, tokens: Float[Tensor, "b v c"]) -> Float[Tensor, "b v 9"]:
+        """Cameras to be `decoded`; their quaternions have any length."""
+        x = self.backbone(tokens)
+        return torch.cat([self.fc_t(x), self.fc_qvec(x), self.fc_fov(x)], dim=-1)

@@ -1,0 +1,99 @@
+"""What the heads have in common: four maps of patches, fused to a map of the image (DPT)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.reconstructors.depth_anything.vit import Tokens
+from gscompleter.reconstructors.feed_forward.dpt import Scratch
+
+HIDDEN = 32
+"""Channels before the last convolution of a head."""
+CODE_WEIGHT = 0.1
+"""Weight of the code that tells a map's pixels where they lie."""
+CODE_BASE = 100.0
+"""The slowest wave of the code is almost this many times longer than the fastest."""
+
+
+class Dpt(nn.Module):
+    """Tokens of four blocks as maps at 4, 2, 1 and 1/2 times the resolution of the patches."""
+
+    def __init__(self, channels: int, widths: Sequence[int], coded: bool) -> None:
+        """
+        Args:
+            channels: Of the tokens.
+            widths: Channels of the four levels, finest first.
+            coded: Whether each level is told where its pixels lie.
+        """
+        super().__init__()
+        self.coded = coded
+        self.projects = nn.ModuleList(nn.Conv2d(channels, width, 1) for width in widths)
+        self.resize_layers = nn.ModuleList(
+            [
+                nn.ConvTranspose2d(widths[0], widths[0], 4, 4),
+                nn.ConvTranspose2d(widths[1], widths[1], 2, 2),
+                nn.Identity(),
+                nn.Conv2d(widths[3], widths[3], 3, 2, 1),
+            ]
+        )
+
+    def pyramid(
+        self, tokens: Sequence[Tokens], rows: int, columns: int
+    ) -> list[Float[Tensor, "n _ _ _"]]:
+        """A map for each level, finest first, of all n = b v views."""
+        maps = []
+        for given, project, resize in zip(tokens, self.projects, self.resize_layers, strict=True):
+            patches = self.normed(given.patches).flatten(0, 1).transpose(1, 2)
+            x = project(patches.unflatten(2, (rows, columns)))
+            maps.append(resize(with_position(x, columns / rows) if self.coded else x))
+        return maps
+
+    def normed(self, patches: Float[Tensor, "b v p c"]) -> Float[Tensor, "b v p c"]:
+        """The patches as they come; a head may normalise them."""
+        return patches
+
+
+class ImageScratch(Scratch):
+    """Fuses the levels, and ends in two convolutions at the resolution of the image."""
+
+    def __init__(self, widths: Sequence[int], features: int, out: int) -> None:
+        super().__init__(widths, features, None)
+        self.output_conv1 = nn.Conv2d(features, features // 2, 3, 1, 1)
+        self.output_conv2 = last_convolutions(features // 2, out)
+
+
+def last_convolutions(channels: int, out: int) -> nn.Sequential:
+    """From the fused map to what a head tells."""
+    return nn.Sequential(nn.Conv2d(channels, HIDDEN, 3, 1, 1), nn.ReLU(), nn.Conv2d(HIDDEN, out, 1))
+
+
+def with_position(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:
+    """A map with waves over its columns added to the first half of its channels, and waves over
+    its rows to the second.
+
+    Args:
+        x: The map.
+        aspect: Width of the image over its height.
+    """
+    c, h, w = x.shape[1:]
+    diagonal = (aspect**2 + 1) ** 0.5
+    across = waves(places(w, aspect / diagonal, x.device), c // 4)[:, None, :].expand(-1, h, -1)
+    down = waves(places(h, 1 / diagonal, x.device), c // 4)[:, :, None].expand(-1, -1, w)
+    return x + CODE_WEIGHT * torch.cat([across, down])
+
+
+def places(count: int, extent: float, device: torch.device) -> Float[Tensor, "count"]:
+    """Centres of `count` cells between -extent and extent."""
+    last = extent * (count - 1) / count
+    return torch.linspace(-last, last, count, device=device)
+
+
+def waves(at: Float[Tensor, "m"], count: int) -> Float[Tensor, "k m"]:
+    """`count` sines of falling frequency at some places, then their cosines."""
+    k = torch.arange(count, device=at.device, dtype=torch.float64)
+    angles = (CODE_BASE ** (-k / count))[:, None] * at.double()
+    return torch.cat([angles.sin(), angles.cos()]).to(at.dtype)

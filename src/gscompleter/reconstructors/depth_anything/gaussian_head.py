@@ -1,0 +1,118 @@
+"""The head for Gaussians, and from its raw channels to Gaussians in the frame of its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain, pairwise
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.geometry import quats_from, quats_product
+from gscompleter.reconstructors.depth_anything.dpt import Dpt, ImageScratch, with_position
+from gscompleter.reconstructors.depth_anything.harmonics import turned_harmonics
+from gscompleter.reconstructors.depth_anything.poses import Poses
+from gscompleter.reconstructors.depth_anything.vit import Tokens
+from gscompleter.reconstructors.feed_forward.dino import PATCH
+from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians, damped
+from gscompleter.reconstructors.feed_forward.resampling import resized
+
+SH = 9
+"""Harmonics of a colour (degree 2)."""
+CHANNELS = (2, 3, 4, 3 * SH, 1, 1)
+"""Offset, scale, rotation, harmonics, offset of the depth, opacity."""
+SCALES = (1e-5, 30.0)
+"""Smallest and largest standard deviation, in tenths of what a pixel covers both ways."""
+
+
+def merged_images(features: int) -> nn.Sequential:
+    """Layers that add the image itself to what the transformer saw of it."""
+    widths = pairwise([3, features // 8, features // 4, features // 2])
+    layers = [(nn.Conv2d(a, b, 3, 1, 1), nn.GELU()) for a, b in widths]
+    return nn.Sequential(*chain.from_iterable(layers))
+
+
+class GaussianDpt(Dpt):
+    """Raw channels of a Gaussian for each pixel."""
+
+    scratch: ImageScratch
+
+    def __init__(self, channels: int, widths: Sequence[int], features: int) -> None:
+        super().__init__(channels, widths, coded=True)
+        self.scratch = ImageScratch(widths, features, sum(CHANNELS))
+        self.images_merger = merged_images(features)
+
+    def forward(
+        self, tokens: Sequence[Tokens], images: Float[Tensor, "b v 3 h w"]
+    ) -> Float[Tensor, "b v h w c"]:
+        """From tokens and normalised images."""
+        size = (images.shape[3], images.shape[4])
+        pyramid = self.pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
+        x = resized(self.scratch.output_conv1(self.scratch(pyramid)), size)
+        x = x + self.images_merger(images.flatten(0, 1))
+        raw = self.scratch.output_conv2(with_position(x, size[1] / size[0]))
+        return raw.movedim(1, -1).unflatten(0, images.shape[:2])
+
+
+def gaussians_from(
+    raw: Float[Tensor, "b v h w c"],
+    depth: Float[Tensor, "b v h w"],
+    poses: Poses,
+    factors: Float[Tensor, "b"],
+) -> PixelGaussians:
+    """Gaussians in the frame of `poses`, whose centres and depths are multiplied by `factors`.
+
+    The head has learnt with predicted cameras and with z-depth taken for the length of the ray.
+    """
+    offset, scale, rotation, sh, closer, opacity = raw.split(CHANNELS, dim=-1)
+    factor = factors[:, None, None, None]
+    distance = (depth + closer[..., 0]) * factor
+    turns = poses.c2w[..., :3, :3]
+    rays = F.normalize(torch.einsum("bvij,bvhwj->bvhwi", turns, z_rays(offset, poses.K)), dim=-1)
+    centers = factor[..., None] * poses.centers[:, :, None, None]
+    return PixelGaussians(
+        distance,
+        centers + rays * distance[..., None],
+        turned_quats(rotation, turns),
+        sizes(scale, poses.K) * distance[..., None],
+        opacity[..., 0].sigmoid(),
+        turned_harmonics(damped(sh), turns),
+    )
+
+
+def z_rays(
+    offsets: Float[Tensor, "b v h w 2"], K: Float[Tensor, "b v 3 3"]
+) -> Float[Tensor, "b v h w 3"]:
+    """Directions in camera axes through a point of each pixel, `offsets` pixels off its centre."""
+    h, w = offsets.shape[2:4]
+    x = torch.arange(w, device=offsets.device) + 0.5
+    y = torch.arange(h, device=offsets.device) + 0.5
+    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) + offsets
+    points = F.pad(points, (0, 1), value=1.0)
+    return torch.einsum("bvij,bvhwj->bvhwi", torch.linalg.inv(K), points)
+
+
+def sizes(
+    scale: Float[Tensor, "b v h w 3"], K: Float[Tensor, "b v 3 3"]
+) -> Float[Tensor, "b v h w 3"]:
+    """Standard deviations at a distance of 1."""
+    low, high = SCALES
+    pixel = 0.1 * (1 / K[..., 0, 0] + 1 / K[..., 1, 1])
+    return (low + (high - low) * scale.sigmoid()) * pixel[..., None, None, None]
+
+
+def turned_quats(
+    raw: Float[Tensor, "b v h w 4"], turns: Float[Tensor, "b v 3 3"]
+) -> Float[Tensor, "b v h w 4"]:
+    """wxyz quaternions of Gaussians whose cameras are turned.
+
+    Raw ones are xyzw. The authors' code changes them to wxyz, turns them as if they were xyzw
+    still, and shows the result as wxyz. For a camera that is not turned that is right; for others
+    it is no rotation of the Gaussian, but the published weights were trained with it.
+    """
+    x, y, z, w = F.normalize(raw, dim=-1, eps=1e-8).unbind(-1)
+    taken = torch.stack([z, w, x, y], dim=-1)  # (w, x, y, z) read as xyzw, in our order
+    turned = quats_product(quats_from(turns)[:, :, None, None], taken)
+    return torch.where(turned[..., :1] < 0, -turned, turned).roll(-1, -1)

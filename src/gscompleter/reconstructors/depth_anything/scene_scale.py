@@ -1,0 +1,54 @@
+"""How long a metre is in a scene whose poses tell no scale: as its features tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from gscompleter.errors import InputError
+from gscompleter.geometry import sample
+from gscompleter.matching.depth_range import MIN_MATCHES
+from gscompleter.matching.neighbours import neighbours_among
+from gscompleter.matching.stereo_image import stereo_images
+from gscompleter.matching.triangulation import triangulate
+from gscompleter.types import DepthMap, View
+
+
+def units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) -> float:
+    """Scene units to a metre: the median over features that two photographs share.
+
+    Args:
+        views: Photographs whose poses have any scale.
+        metres: Their z-depths in metres.
+
+    Raises:
+        InputError: where too few features have a depth.
+    """
+    images, unit = stereo_images(views)
+    neighbours = neighbours_among(images)
+    ratios = [np.zeros(0)]
+    for i, j in neighbours.pairs:
+        a, b = neighbours.matches[i, j]
+        if len(a):
+            for one, two, at, to in ((i, j, a, b), (j, i, b, a)):
+                inverse, good = triangulate(images[one], images[two], at, to)
+                known = depths_at(metres[one], at)
+                good &= known > 0
+                ratios.append(unit / (inverse[good] * known[good]))
+    found = np.concatenate(ratios)
+    if len(found) < MIN_MATCHES:
+        raise InputError(
+            f"The photographs share {len(found)} features whose depth is known, and the length of "
+            f"a metre in this scene takes {MIN_MATCHES}; choose another reconstructor, or frames "
+            "that show more of the same."
+        )
+    return float(np.median(found))
+
+
+def depths_at(depth: DepthMap, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:
+    """z-depth at pixel coordinates, 0 where it is not valid."""
+    known = (depth.depth * depth.valid).cpu()[..., None]
+    return sample(known, torch.from_numpy(pixels).float(), "nearest")[..., 0].double().numpy()

@@ -1,0 +1,190 @@
+"""A plain DINOv2 transformer whose later blocks look at one view and at all views by turns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from gscompleter.reconstructors.depth_anything.config import VitConfig
+from gscompleter.reconstructors.depth_anything.reference_view import balanced_view, order_from
+from gscompleter.reconstructors.depth_anything.rotary import (
+    Turns,
+    places_among_views,
+    places_in_view,
+    turns_at,
+)
+from gscompleter.reconstructors.feed_forward import dino
+from gscompleter.reconstructors.feed_forward.dino import (
+    GRID,
+    PATCH,
+    LayerScale,
+    Mlp,
+    PatchEmbedding,
+    resized_positions,
+)
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """What a block hands on."""
+
+    patches: Float[Tensor, "b v p c"]
+    """Of each patch, row by row."""
+    camera: Float[Tensor, "b v c"]
+    """Of each view as a whole."""
+
+    def float(self) -> Tokens:
+        """The same in float32, which heads take whatever the transformer ran in."""
+        return Tokens(self.patches.float(), self.camera.float())
+
+
+class PlacedAttention(dino.Attention):
+    """Attention of tokens that know where they lie."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__(channels, heads)
+        self.q_norm = nn.LayerNorm(channels // heads)
+        self.k_norm = nn.LayerNorm(channels // heads)
+
+    def forward(  # type: ignore[override]
+        self, x: Float[Tensor, "n t c"], turns: Turns
+    ) -> Float[Tensor, "n t c"]:
+        q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        q, k = turns(self.q_norm(q)), turns(self.k_norm(k))
+        return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+
+
+class GatedMlp(nn.Module):
+    """Two linear layers, the wide one gated (SwiGLU)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        hidden = -(-(4 * channels * 2 // 3) // 8) * 8
+        self.w12 = nn.Linear(channels, 2 * hidden)
+        self.w3 = nn.Linear(hidden, channels)
+
+    def forward(self, x: Float[Tensor, "n t c"]) -> Float[Tensor, "n t c"]:
+        gate, value = self.w12(x).chunk(2, dim=-1)
+        return self.w3(F.silu(gate) * value)
+
+
+class Block(nn.Module):
+    """A layer of a transformer."""
+
+    def __init__(self, channels: int, attention: nn.Module, mlp: nn.Module, eps: float) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(channels, eps=eps)
+        self.attn = attention
+        self.ls1 = LayerScale(channels)
+        self.norm2 = nn.LayerNorm(channels, eps=eps)
+        self.mlp = mlp
+        self.ls2 = LayerScale(channels)
+
+    def forward(self, x: Float[Tensor, "n t c"], *turns: Turns) -> Float[Tensor, "n t c"]:
+        x = x + self.ls1(self.attn(self.norm1(x), *turns))
+        return x + self.ls2(self.mlp(self.norm2(x)))
+
+
+class AnyViewVit(nn.Module):
+    """A vision transformer over the views of a scene.
+
+    The first blocks see each view alone, as in DINOv2. Then a token that tells the camera takes
+    the place of the class token, and odd blocks see all views together.
+    """
+
+    def __init__(self, config: VitConfig) -> None:
+        super().__init__()
+        self.config = config
+        channels, start = config.channels, config.alternates_from
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, channels))
+        if start is not None:
+            self.camera_token = nn.Parameter(torch.zeros(1, 2, channels))
+        self.pos_embed = nn.Parameter(torch.zeros(1, GRID**2 + 1, channels))
+        self.patch_embed = PatchEmbedding(channels)
+        self.blocks = nn.ModuleList(self.block(i) for i in range(config.blocks))
+        self.norm = nn.LayerNorm(channels)
+
+    def block(self, number: int) -> Block:
+        """A new block, which knows of places where views alternate."""
+        c = self.config
+        attention = PlacedAttention if self.alternates(number) else dino.Attention
+        mlp = GatedMlp(c.channels) if c.gated else Mlp(c.channels)
+        return Block(c.channels, attention(c.channels, c.heads), mlp, eps=1e-6)
+
+    def alternates(self, number: int) -> bool:
+        """Whether a block is one of those that know of other views."""
+        start = self.config.alternates_from
+        return start is not None and number >= start
+
+    def forward(
+        self, images: Float[Tensor, "b v 3 h w"], cameras: Float[Tensor, "b v c"] | None = None
+    ) -> list[Tokens]:
+        """What the four chosen blocks hand on.
+
+        Args:
+            images: Normalised, their sides multiples of 14.
+            cameras: A token for each camera; None where poses are not known.
+        """
+        scenes, views = images.shape[:2]
+        x = self.embedded(images)
+        size = (images.shape[3] // PATCH, images.shape[4] // PATCH)
+        within = turns_at(places_in_view(*size, images.device))
+        among = turns_at(places_among_views(views, size[0] * size[1], images.device))
+        order = torch.arange(views, device=images.device).expand(scenes, -1)
+        start = self.config.alternates_from
+        handed_on, local = [], x
+        for number, block in enumerate(self.blocks):
+            if start is not None and number == start - 1 and cameras is None and views > 2:
+                order = order_from(balanced_view(x[:, :, 0].float()), views)
+                x, local = reordered(x, order), reordered(local, order)
+            if number == start:
+                x = torch.cat([self.camera_tokens(cameras, scenes, views), x[:, :, 1:]], dim=2)
+            if not self.alternates(number):
+                local = x = block(x.flatten(0, 1)).unflatten(0, (scenes, views))
+            elif number % 2:
+                x = block(x.flatten(1, 2), among).unflatten(1, (views, -1))
+            else:
+                local = x = block(x.flatten(0, 1), within).unflatten(0, (scenes, views))
+            if number in self.config.outputs:
+                back = order.argsort(dim=1)
+                handed_on.append(self.handed_on(reordered(local, back), reordered(x, back)))
+        return handed_on
+
+    def embedded(self, images: Float[Tensor, "b v 3 h w"]) -> Float[Tensor, "b v t c"]:
+        """The class token and the patches of each view, with their positions."""
+        patches = self.patch_embed(images.flatten(0, 1))
+        size = (images.shape[3] // PATCH, images.shape[4] // PATCH)
+        tokens = torch.cat([self.cls_token.expand(len(patches), -1, -1), patches], 1)
+        tokens = tokens + resized_positions(self.pos_embed, *size)
+        return tokens.unflatten(0, images.shape[:2])
+
+    def camera_tokens(
+        self, cameras: Float[Tensor, "b v c"] | None, scenes: int, views: int
+    ) -> Float[Tensor, "b v 1 c"]:
+        """Those that are known, or learned ones: one for the first view, one for all others."""
+        if cameras is not None:
+            return cameras[:, :, None]
+        first, other = self.camera_token[:, :1], self.camera_token[:, 1:]
+        return torch.cat([first, other.expand(-1, views - 1, -1)], 1)[:, :, None].expand(
+            scenes, -1, -1, -1
+        )
+
+    def handed_on(self, local: Float[Tensor, "b v t c"], x: Float[Tensor, "b v t c"]) -> Tokens:
+        """The tokens of a block, and beside them those of the last block that saw views alone.
+
+        Of patches only the block's own half is normalised, of cameras neither.
+        """
+        normed = self.norm(x)
+        if self.config.alternates_from is None:
+            return Tokens(normed[:, :, 1:], x[:, :, 0])
+        patches = torch.cat([local[:, :, 1:], normed[:, :, 1:]], -1)
+        return Tokens(patches, torch.cat([local[:, :, 0], x[:, :, 0]], -1))
+
+
+def reordered(x: Float[Tensor, "b v t c"], order: Int[Tensor, "b v"]) -> Float[Tensor, "b v t c"]:
+    """The views of each scene in another order."""
+    return x.take_along_dim(order[:, :, None, None], dim=1)

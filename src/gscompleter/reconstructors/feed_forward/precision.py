@@ -1,0 +1,21 @@
+"""In which precision networks run."""
+
+from __future__ import annotations
+
+import torch
+
+from gscompleter.errors import InputError
+
+
+def check_precision(device: torch.device, dtype: torch.dtype) -> None:
+    """Raise an InputError where a network on `device` cannot run in `dtype`."""
+    if dtype != torch.float32 and device.type != "cuda":
+        raise InputError(
+            f"The network lies on the {device.type} and {dtype} was asked for, which needs a GPU; "
+            "use float32."
+        )
+
+
+def lower_precision(device: torch.device, dtype: torch.dtype) -> torch.autocast:
+    """Within it, networks run in `dtype`; geometry stays in float32 by itself."""
+    return torch.autocast(device.type, dtype, enabled=dtype != torch.float32)

@@ -1,0 +1,128 @@
+"""A scene of what is known of depth in every pixel of each view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance, fit_colours
+from gscompleter.reconstructors.plane_sweep.confidence import Mask
+from gscompleter.reconstructors.plane_sweep.exposure import gains_of
+from gscompleter.reconstructors.plane_sweep.fusion import (
+    Layer,
+    Transforms,
+    finest_pixels,
+    free_pixels,
+)
+from gscompleter.reconstructors.plane_sweep.gaussians import discs, normals_of
+from gscompleter.reconstructors.plane_sweep.joint_fit import fit_jointly
+from gscompleter.render import Renderer, load_renderer
+from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
+
+MIN_ALPHA = 0.7
+"""Alpha below which a surface that no view was to show is shown by the view that meets the gap."""
+
+
+@dataclass(frozen=True)
+class Splatter:
+    """Splats depths and fits the Gaussians to the photographs."""
+
+    disc_sigma: float = 0.6
+    """Standard deviation of a Gaussian across the line of sight, in pixels."""
+    renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
+    """Draws Gaussians while they are fitted."""
+
+    def scene(
+        self,
+        views: Sequence[View],
+        depths: Sequence[DepthMap],
+        layers: Sequence[Layer],
+        transforms: Transforms,
+    ) -> Reconstruction:
+        """Gaussians of what `views` show.
+
+        Two views keep all of their pixels. Of more views each surface is kept once, by the view
+        that sees it best, and nothing where another view sees through it. Where their exposures
+        differ clearly, they are evened out: the Gaussians have the mean one.
+
+        Args:
+            views: Photographs.
+            depths: Of all of their pixels, in scene units.
+            layers: The same, per widest baseline.
+            transforms: From the pixels of each view to those of the others.
+        """
+        gains = gains_among(layers, transforms)
+        device = views[0].image.device
+        even = map(View.evened, views, gains.to(device))
+        parts = [self.splat(view, depth) for view, depth in zip(even, depths, strict=True)]
+        every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
+        chosen = self.chosen(every, on_cpu, layers, transforms)
+        fitted = self.fitted(every[chosen], on_cpu, gains)
+        rows = [torch.arange(len(part)) for part in parts]
+        numbers = [torch.full((len(part),), i) for i, part in enumerate(parts)]
+        return Reconstruction(
+            fitted.to(device),
+            tuple(depths),
+            torch.cat(numbers)[chosen].to(device),
+            torch.cat(rows)[chosen].to(device),
+            None if (gains == 1).all() else gains.to(device),
+        )
+
+    def wanted_of(
+        self, views: Sequence[View], depths: Sequence[DepthMap], wanted: Bool[Tensor, "h w"]
+    ) -> Reconstruction:
+        """The Gaussians of the pixels `wanted` of the first view, in colours fitted to it."""
+        rows = torch.nonzero(wanted.reshape(-1))[:, 0]
+        blurred = self.splat(views[0], depths[0])[rows]
+        gaussians = fit_colours(blurred.to("cpu"), [views[0].to("cpu")], self.renderer)
+        return Reconstruction(
+            gaussians.to(rows.device), tuple(depths), torch.zeros_like(rows), rows
+        )
+
+    def chosen(
+        self,
+        every: Gaussians,
+        views: Sequence[View],
+        layers: Sequence[Layer],
+        transforms: Transforms,
+    ) -> Bool[Tensor, "n"]:
+        """Which of the Gaussians of all pixels make the scene."""
+        if len(views) == 2:
+            return torch.ones(len(every), dtype=torch.bool)
+        free = free_pixels(layers, transforms)
+        kept = as_rows(finest_pixels(layers, free, transforms))
+        start = 0
+        for view, mask in zip(views, free, strict=True):
+            alpha = self.renderer.render(every[kept], view.camera).alpha
+            gap = torch.from_numpy(mask) & (alpha < MIN_ALPHA)
+            kept[start : start + gap.numel()] |= gap.reshape(-1)
+            start += gap.numel()
+        return kept
+
+    def fitted(
+        self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
+    ) -> Gaussians:
+        """`gaussians` fitted to `views`, which are brighter by `gains` than they are."""
+        if len(views) == 2:
+            return fit_appearance(gaussians, views, self.renderer)
+        return fit_jointly(gaussians, views, gains, self.renderer)
+
+    def splat(self, view: View, depth: DepthMap) -> Gaussians:
+        """A disc for every pixel of `view`."""
+        return discs(view, depth.depth, normals_of(depth.depth, view), self.disc_sigma)
+
+
+def gains_among(layers: Sequence[Layer], transforms: Transforms) -> Float[Tensor, "views 3"]:
+    """By how much each photograph is brighter than the mean of all; two keep their exposures."""
+    gains = gains_of(layers, transforms) if len(layers) > 2 else np.ones((len(layers), 3))
+    return torch.from_numpy(gains).float()
+
+
+def as_rows(masks: Sequence[Mask]) -> Bool[Tensor, "n"]:
+    """Masks of the views one after the other, row by row."""
+    return torch.cat([torch.from_numpy(mask).reshape(-1) for mask in masks])

@@ -1,0 +1,568 @@
+"""Depth Anything 3: equal to the authors' code, and a reconstructor like any other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from depth_anything_fixtures import (
+    FIXTURES,
+    OFFICIAL,
+    STAND_INS,
+    errors_in,
+    gaussian_errors,
+    images_and_poses,
+    network_for,
+    shapes_in,
+)
+from feed_forward_fixtures import Case, extra
+from gscompleter import GSCompleter, InputError
+from gscompleter.geometry import project, rotation_about, rotations_from, unproject
+from gscompleter.reconstructors import depth_anything, load_reconstructor
+from gscompleter.reconstructors.depth_anything import (
+    VARIANTS,
+    AnyViewDepth,
+    AnyViewGaussians,
+    DepthAnything,
+    DepthAnythingConfig,
+    Inference,
+    MetricDepthAnything,
+    MetricDepthConfig,
+    MetricViewDepth,
+    NestedConfig,
+    NestedDepthAnything,
+    Sizing,
+)
+from gscompleter.reconstructors.depth_anything.alignment import (
+    similarity_between,
+    similarity_of_most,
+)
+from gscompleter.reconstructors.depth_anything.config import VitConfig
+from gscompleter.reconstructors.depth_anything.harmonics import turned_harmonics
+from gscompleter.reconstructors.depth_anything.images import normalised_images
+from gscompleter.reconstructors.depth_anything.inputs import Window, batch_of, seen_of
+from gscompleter.reconstructors.depth_anything.metric import MetricDepth
+from gscompleter.reconstructors.depth_anything.network import Prediction
+from gscompleter.reconstructors.depth_anything.normalisation import (
+    authors_units,
+    scene_units,
+    seen_from_first,
+)
+from gscompleter.reconstructors.depth_anything.poses import Poses, decoded, encoded
+from gscompleter.reconstructors.depth_anything.reconstructor import in_world
+from gscompleter.reconstructors.feed_forward.build import around, network_with
+from gscompleter.reconstructors.from_depth import FromDepth
+from gscompleter.render.spherical_harmonics import sh_basis
+from gscompleter.types import View
+from parity import assert_within, relative_error
+from scenes import Room, camera_at, view_of
+
+BOUND = 5e-5
+"""Largest difference from the authors' code, of the array's largest value."""
+ROTATIONS = 1e-4
+"""Likewise of quaternions, which were made from matrices."""
+LONG = ("gs-giantlike_pose_v2_70x98", "gs-giantlike_pose_v3_42x56", "small_nopose_v1_518x518")
+"""Cases of large networks or images."""
+
+
+# The authors' code
+
+
+def cases(folder: list[Path]) -> list[object]:
+    """Files with the outputs of a network."""
+    paths = [path for path in folder if path.stem.split("_")[0] in STAND_INS]
+    return [pytest.param(path, id=path.stem) for path in paths]
+
+
+def check(path: Path) -> None:
+    """Each array that is stored, between the layers and at the end."""
+    errors = errors_in(path)
+    rotations = {name: error for name, error in errors.items() if name.endswith("rotations")}
+    assert_within({name: e for name, e in errors.items() if name not in rotations}, BOUND)
+    stored = [name for name in Case.load(path).values if name.startswith(("out_", "mid_"))]
+    told = ("pose_scale", "align_raised", "world", "mid_stride")
+    missing = [
+        name
+        for name in stored
+        if not any(known.startswith(name) for known in errors) and not any(t in name for t in told)
+    ]
+    assert missing == []
+    if rotations:
+        assert_within(rotations, ROTATIONS)
+
+
+def test_a_network_with_gaussians_equals_the_authors_code():
+    check(FIXTURES / "gs-tiny_pose_v3clamp_42x56.npz")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "small_pose_v2_70x98",
+        "small_pose_b2v2_56x84",
+        "small_nopose_v2_56x70",
+        "small_nopose_v5_42x56",
+        "metric-tiny_v1_56x84",
+        "nested-tiny_v2_56x84",
+        "gs-tiny_pose_v2_56x84",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in (
+                "small_pose_v3_70x98",
+                "small_nopose_v3_70x98",
+                "metric-tiny_v2_70x98",
+                "gs-tiny_pose_v3_70x98",
+                "gs-tiny_nopose_v2_56x70",
+                *LONG,
+            )
+        ),
+    ],
+)
+def test_every_network_equals_the_authors_code(shared, name):
+    check(shared / "fixtures" / "da3" / f"{name}.npz")
+
+
+@pytest.mark.parametrize("path", cases(extra("da3")))
+def test_every_network_equals_the_authors_code_in_more_cases(path):
+    check(path)
+
+
+@pytest.mark.parametrize("name", ["da3-small", "da3-giant"])
+def test_weights_are_named_and_shaped_as_published(name):
+    check_names(FIXTURES / f"keys-{name}.json")
+
+
+def test_weights_of_all_networks_are_named_and_shaped_as_published(shared):
+    lists = sorted((shared / "fixtures" / "da3").glob("keys-*.json"))
+    assert len(lists) == 8
+    for path in lists:
+        check_names(path)
+
+
+@pytest.mark.parametrize("path", extra("da3", "keys-*.json"), ids=lambda path: path.stem)
+def test_weights_are_named_and_shaped_as_in_more_lists(path):
+    check_names(path)
+
+
+def check_names(path: Path) -> None:
+    name = path.stem.removeprefix("keys-")
+    with torch.device("meta"):
+        network = network_with(VARIANTS[OFFICIAL[name]] if name in OFFICIAL else STAND_INS[name])
+    ours = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    assert ours == shapes_in(path)
+
+
+@pytest.mark.parametrize("path", [FIXTURES / "align.npz", *extra("da3", "align*.npz")])
+def test_cameras_are_normalised_and_aligned_as_by_the_authors(path):
+    case = Case.load(path)
+    counts = [int(name.rsplit("_", 1)[1]) for name in case.values if name.startswith("in_c2w")]
+    assert counts
+    for count in counts:
+        given = Poses(case.tensor(f"in_c2w_{count}")[None], torch.eye(3).repeat(1, count, 1, 1))
+        told = seen_from_first(given, authors_units(given.centers))
+        expected = case.tensor(f"out_ext_norm_{count}")
+        assert relative_error(told.w2c[0], expected) < BOUND
+        w2c = case.tensor(f"in_pred_w2c_{count}").double()
+        found = (-w2c[:, :, :3].transpose(1, 2) @ w2c[:, :, 3:])[..., 0].numpy()
+        if f"out_align_s_{count}" not in case.values:
+            continue
+        ours = similarity_of_most(given.centers[0].double().numpy(), found)
+        for name, value in (("r", ours.rotation), ("t", ours.shift), ("s", ours.scale)):
+            theirs = case.tensor(f"out_align_{name}_{count}")
+            assert relative_error(torch.as_tensor(value, dtype=torch.float64), theirs) < BOUND, name
+        scale = similarity_between(found, told.centers[0].double().numpy()).scale
+        assert scale == pytest.approx(float(case.values[f"out_pose_scale_{count}"]), rel=BOUND)
+
+
+def check_world(path: Path) -> None:
+    """What the network set before its own cameras, before the given ones."""
+    case = Case.load(path)
+    images, told = images_and_poses(case)
+    given = Poses(case.tensor("in_c2w"), case.tensor("in_intrinsics_px"))
+    with torch.no_grad():
+        predicted = network_for(path.stem.split("_")[0])(images, told)
+    errors = gaussian_errors(in_world(predicted, given), case, "out_world_")
+    rotations = errors.pop("out_world_rotations")
+    assert rotations < ROTATIONS
+    assert len(errors) >= 2
+    assert_within(errors, BOUND)
+
+
+def test_gaussians_are_brought_to_the_given_cameras():
+    check_world(FIXTURES / "gs-tiny_pose_v3clamp_42x56.npz")
+
+
+def test_gaussians_of_two_views_are_brought_to_the_given_cameras(shared):
+    check_world(shared / "fixtures" / "da3" / "gs-tiny_pose_v2_56x84.npz")
+
+
+@pytest.mark.parametrize("path", [p for p in extra("da3") if p.stem.startswith("gs-")])
+def test_gaussians_are_brought_to_the_given_cameras_in_more_cases(path):
+    if "out_world_means" not in Case.load(path).values:
+        pytest.skip("no poses were given")
+    check_world(path)
+
+
+def check_images(path: Path) -> None:
+    """Sizes, intrinsics, and pixels but for the rounding of another OpenCV."""
+    case = Case.load(path)
+    numbers = [name.rsplit("_", 1)[1] for name in case.values if name.startswith("in_image")]
+    assert numbers
+    for number in numbers:
+        bound, fit = str(case.values[f"in_method_{number}"]).split("_bound_")
+        side, fit = {"upper": "longer", "lower": "shorter"}[bound], {"resize": "resized"}.get(fit)
+        sizing = Sizing(int(case.values[f"in_res_{number}"]), side, fit or "cropped")
+        image, expected = case.values[f"in_image_{number}"], case.values[f"out_image_{number}"]
+        seen, window = seen_of(image, sizing)
+        assert seen.shape == expected.shape
+        apart = np.abs(seen.astype(int) - expected)
+        assert apart.max() <= 1
+        assert (apart > 0).mean() < 0.02
+        h, w = image.shape[:2]
+        camera = replace(camera_at(), K=case.tensor(f"in_K_{number}"), width=w, height=h)
+        assert relative_error(window.intrinsics(camera), case.tensor(f"out_K_{number}")) < BOUND
+        if f"out_tensor_{number}" in case.values:
+            tensor = normalised_images(torch.from_numpy(expected[None].copy()))[..., ::3, ::3]
+            assert relative_error(tensor, case.tensor(f"out_tensor_{number}")) < BOUND
+
+
+def test_photographs_are_resized_as_by_the_authors(shared):
+    check_images(shared / "fixtures" / "da3" / "preprocess.npz")
+
+
+@pytest.mark.parametrize("path", extra("da3", "preprocess*.npz"), ids=lambda path: path.stem)
+def test_photographs_are_resized_as_by_the_authors_in_more_cases(path):
+    check_images(path)
+
+
+# Cameras
+
+
+def turned_cameras(count: int = 3) -> Poses:
+    generator = torch.Generator().manual_seed(0)
+    c2w = torch.eye(4).repeat(1, count, 1, 1)
+    c2w[0, :, :3, :3] = rotations_from(torch.randn(count, 4, generator=generator))
+    c2w[0, :, :3, 3] = torch.randn(count, 3, generator=generator)
+    K = torch.tensor([[50.0, 0.0, 42.0], [0.0, 60.0, 28.0], [0.0, 0.0, 1.0]])
+    return Poses(c2w, K.repeat(1, count, 1, 1))
+
+
+def test_nine_numbers_tell_a_camera():
+    poses = turned_cameras()
+    again = decoded(encoded(poses, (56, 84)), (56, 84))
+    assert relative_error(again.c2w, poses.c2w) < 1e-5
+    assert relative_error(again.K, poses.K) < 1e-5
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_the_network_is_told_the_same_in_any_unit(count):
+    poses = turned_cameras(count)
+    moved = poses.c2w.clone()
+    moved[..., :3, 3] *= 1e-4
+    small = replace(poses, c2w=moved)
+    ours = [seen_from_first(p, scene_units(p.centers)).c2w for p in (poses, small)]
+    assert relative_error(ours[1], ours[0]) < 1e-5
+    assert (
+        torch.equal(ours[0][:, 0], torch.eye(4)[None])
+        or ours[0][:, 0].sub(torch.eye(4)).abs().max() < 1e-6
+    )
+    theirs = [seen_from_first(p, authors_units(p.centers)).c2w for p in (poses, small)]
+    assert relative_error(theirs[1], theirs[0]) > 0.1
+
+
+def test_the_unit_of_many_cameras_is_the_authors():
+    centers = turned_cameras(5).centers
+    assert torch.equal(scene_units(centers), authors_units(centers))
+
+
+def test_cameras_in_one_place_are_refused():
+    views = [view_of(Room(), camera_at(size=28))] * 2
+    with pytest.raises(InputError, match="2 cameras stand in one place"):
+        AnyViewDepth(knowing(views))(views)
+
+
+def test_the_scale_of_cameras_on_one_line_is_told():
+    line = np.arange(4.0)[:, None] * np.array([1.0, 2.0, -1.0])
+    for count in (2, 4):
+        found = similarity_between(line[:count], 3 * line[:count] + 1)
+        assert found.scale == pytest.approx(3)
+
+
+def test_a_minority_of_wrong_cameras_is_left_out():
+    given = np.random.default_rng(0).normal(size=(12, 3))
+    found = 2 * given
+    found[:2] += 5
+    assert similarity_of_most(given, found).scale == pytest.approx(2)
+    assert abs(similarity_between(given, found).scale - 2) > 0.05
+
+
+def test_harmonics_turn_with_what_they_colour():
+    generator = torch.Generator().manual_seed(0)
+    sh = torch.randn(1, 1, 1, 1, 9, 3, generator=generator)
+    turn = rotations_from(torch.randn(4, generator=generator))
+    directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=-1)
+    turned = turned_harmonics(sh, turn[None, None])[0, 0, 0, 0]
+    before = sh_basis(directions, 9) @ sh[0, 0, 0, 0]
+    assert relative_error(sh_basis(directions @ turn.T, 9) @ turned, before) < 1e-5
+
+
+# Ψ
+
+TINY = DepthAnythingConfig(VitConfig(64, 1, 4, (0, 1, 2, 3), 1), 32, (16, 16, 16, 16))
+TINY_GAUSSIANS = replace(TINY, gaussians=True)
+TINY_METRIC = MetricDepthConfig(VitConfig(64, 1, 4, (0, 1, 2, 3), None), 32, (16, 16, 16, 16))
+SIZE = 56
+QUICK = Inference(Sizing(SIZE))
+
+
+class Knowing(DepthAnything):
+    """A network that sees the truth in a unit and in axes of its own."""
+
+    def __init__(self, depth: Tensor, raw: Tensor | None = None) -> None:
+        super().__init__(TINY)
+        self.depth, self.raw = depth, raw
+
+    def forward(self, images: Tensor, poses: Poses | None = None) -> Prediction:
+        factor = 7.0
+        turn = rotation_about(torch.tensor([0.0, 0.6, 0.8]), 0.3)
+        c2w = poses.c2w.clone()
+        if self.raw is None:
+            c2w[..., :3, :] = turn @ c2w[..., :3, :]
+        c2w[..., :3, 3] *= factor
+        unit = (poses.centers[0, 1] - poses.centers[0, 0]).norm()
+        depth = factor * unit * self.depth[None]
+        predicted = Poses(c2w, poses.K)
+        return Prediction(depth, 1 + self.depth[None], encoded(poses, (1, 1)), predicted, self.raw)
+
+
+def photographs(unit: float = 1.0, size: int = SIZE) -> list[View]:
+    """Two of a room, turned cameras, in a unit of the scene."""
+    cameras = [camera_at(x, yaw=yaw, size=size) for x, yaw in ((-0.3, 20), (0.1, -5))]
+    views = [view_of(Room(), camera, i) for i, camera in enumerate(cameras)]
+    return [scaled(view, unit) for view in views]
+
+
+def scaled(view: View, unit: float) -> View:
+    """The same photograph in a scene of another unit."""
+    camera = view.camera
+    c2w = camera.c2w.clone()
+    c2w[:3, 3] *= unit
+    near, far = camera.near * unit, camera.far * unit
+    return replace(
+        view, camera=replace(camera, c2w=c2w, near=near, far=far), depth=unit * view.depth
+    )
+
+
+def knowing(views: list[View]) -> Knowing:
+    """The truth, with lengths in baselines."""
+    baseline = (views[1].camera.center - views[0].camera.center).norm().clamp_min(1e-9)
+    return Knowing(torch.stack([view.depth for view in views]) / baseline)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_depths_are_brought_to_the_unit_of_the_cameras(unit):
+    views = photographs(unit)
+    for found, view in zip(AnyViewDepth(knowing(views), QUICK)(views), views, strict=True):
+        assert found.valid.all()
+        assert relative_error(found.depth, view.depth) < 1e-4
+        assert 0 < found.confidence.min() < found.confidence.max() < 1
+
+
+def test_gaussians_of_true_depth_draw_the_photographs():
+    views = photographs()
+    psi = FromDepth(model=AnyViewDepth(knowing(views), QUICK))
+    found = psi(views)
+    assert len(found.gaussians) == 2 * SIZE * SIZE
+    for view in views:
+        image = psi.renderer.render(found.gaussians, view.camera).image
+        error = (image - view.image).square().mean()
+        assert error < 0.1 * view.image.var()
+    _, z = project(found.gaussians.means, views[0].camera)
+    own = found.view_index == 0
+    assert relative_error(z[own], views[0].depth.flatten()) < 1e-4
+    assert torch.equal(found.pixel_index[own], torch.arange(SIZE * SIZE))
+
+
+def test_three_views_keep_each_surface_once():
+    cameras = [camera_at(x, size=SIZE) for x in (-0.2, 0.0, 0.2)]
+    views = [view_of(Room(), camera, i) for i, camera in enumerate(cameras)]
+    found = FromDepth(model=AnyViewDepth(knowing(views), QUICK))(views)
+    assert SIZE * SIZE < len(found.gaussians) < 2 * SIZE * SIZE
+
+
+def test_only_wanted_gaussians_are_lifted():
+    views = photographs()
+    psi = FromDepth(model=AnyViewDepth(knowing(views), QUICK))
+    wanted = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    wanted[10:20, 5:9] = True
+    found = psi.lift(views, wanted)
+    assert torch.equal(found.pixel_index, wanted.flatten().nonzero()[:, 0])
+    points = unproject(views[0].depth, views[0].camera)[wanted]
+    assert relative_error(found.gaussians.means, points) < 1e-4
+
+
+def test_gaussians_of_the_head_stand_where_the_given_cameras_see_them():
+    """Of a network whose depth is, as the head takes it, the length of the ray."""
+    views = photographs(unit=50.0)
+    network = knowing(views)
+    lengths = torch.stack([v.camera.z_rays().norm(dim=-1) for v in views])
+    network.depth = network.depth * lengths
+    network.raw = torch.zeros(1, 2, SIZE, SIZE, 38)
+    found = AnyViewGaussians(network, QUICK)(views)
+    points = torch.cat([unproject(v.depth, v.camera).reshape(-1, 3) for v in views])
+    assert relative_error(found.gaussians.means, points) < 1e-4
+    for known, view in zip(found.depths, views, strict=True):
+        assert relative_error(known.depth, view.depth) < 1e-4
+        assert known.valid.all()
+    assert torch.equal(found.pixel_index, torch.arange(SIZE * SIZE).repeat(2))
+    pixel = points.sub(views[0].camera.center).norm(dim=-1) / views[0].camera.K[0, 0]
+    ratio = found.gaussians.scales[: SIZE * SIZE, 0] / pixel[: SIZE * SIZE]
+    assert torch.allclose(ratio, torch.tensor(3.0), rtol=1e-3)  # 15 tenths, both ways
+
+
+class KnowingMetric(MetricDepthAnything):
+    """A metric network that sees the truth, and the sky in the first rows."""
+
+    def __init__(self, metres: Tensor, focal: float) -> None:
+        super().__init__(TINY_METRIC)
+        self.metres = metres * 300 / focal
+
+    def forward(self, images: Tensor) -> MetricDepth:
+        sky = torch.zeros_like(self.metres)
+        sky[:, :4] = 1
+        return MetricDepth(self.metres[None], sky[None])
+
+
+def test_metres_are_brought_to_the_unit_that_shared_features_tell():
+    size = 168
+    views = photographs(unit=3.7, size=size)
+    metres = torch.stack([view.depth for view in views]) / 3.7
+    network = KnowingMetric(metres, float(views[0].camera.K[0, 0]))
+    for found, view in zip(
+        MetricViewDepth(network, Inference(Sizing(size)))(views), views, strict=True
+    ):
+        ratio = found.depth[4:] / view.depth[4:]
+        assert torch.allclose(ratio, torch.ones(()), rtol=0.05)
+        assert not found.valid[:4].any()
+        assert found.valid[4:].all()
+        assert (found.depth[:4] > view.depth[4:].quantile(0.95)).all()
+
+
+def test_photographs_without_features_tell_no_metre():
+    views = [replace(view, image=torch.full_like(view.image, 0.5)) for view in photographs()]
+    network = KnowingMetric(torch.stack([view.depth for view in views]), 50.0)
+    with pytest.raises(InputError, match="share 0 features .* takes 12"):
+        MetricViewDepth(network, QUICK)(views)
+
+
+def test_maps_of_a_resized_window_are_read_where_their_pixels_lie():
+    """The inverse depth of a plane is linear in the pixel, so that nothing is lost."""
+    camera = replace(camera_at(size=60), height=40)
+    window = Window(top=3, left=5, height=70, width=80, across=1.5, down=2.0)
+
+    def plane(x: Tensor, y: Tensor) -> Tensor:
+        return 1 / (0.2 + 0.001 * x + 0.003 * y)
+
+    x, y = torch.arange(80) + 0.5 + 5, torch.arange(70) + 0.5 + 3
+    depth = plane(x / 1.5, y[:, None] / 2.0)
+    found = window.depth_map(depth, torch.full_like(depth, 0.8), camera)
+    assert found.depth.shape == (40, 60)
+    u, v = torch.arange(60) + 0.5, torch.arange(40) + 0.5
+    inside = (u * 1.5 >= 5) & (u * 1.5 <= 85) & (v[:, None] * 2 >= 3) & (v[:, None] * 2 <= 73)
+    assert torch.equal(found.valid, inside)
+    well = inside & (u * 1.5 > 6) & (u * 1.5 < 84) & (v[:, None] * 2 > 4) & (v[:, None] * 2 < 72)
+    assert relative_error(found.depth[well], plane(u, v[:, None])[well]) < 1e-5
+    assert (found.confidence[~inside] == 0).all()
+
+
+def test_each_pixel_of_the_window_belongs_to_the_pixel_it_lies_in():
+    views = photographs(size=40)
+    (image,) = batch_of(views[:1], Sizing(56), 1).windows
+    numbers = image.pixel_index(views[0].camera).view(56, 56)
+    assert numbers[0, 0] == 0
+    assert numbers[55, 55] == 40 * 40 - 1
+    assert numbers[28, 14] == 20 * 40 + 10
+
+
+@cache
+def random(config: DepthAnythingConfig | MetricDepthConfig | NestedConfig):
+    torch.manual_seed(0)
+    return network_with(config).eval().requires_grad_(False)
+
+
+def psi_of(config: DepthAnythingConfig | NestedConfig) -> FromDepth | AnyViewGaussians:
+    if isinstance(config, DepthAnythingConfig) and not config.gaussians:
+        return FromDepth(model=AnyViewDepth(random(config), QUICK))
+    return AnyViewGaussians(random(config), QUICK)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [TINY, TINY_GAUSSIANS, NestedConfig(TINY_GAUSSIANS, TINY_METRIC)],
+    ids=["depth", "gaussians", "nested"],
+)
+def test_smoke_a_completion_runs_with_random_weights(config):
+    """It says nothing of quality: only that all stages take what such a model gives."""
+    views = [view_of(Room(), camera_at(x, size=48), i) for i, x in enumerate((-0.3, 0.1))]
+    completion = GSCompleter(psi_of(config))(views, camera_at(0.7, yaw=12, size=48))
+    (result,) = completion.targets
+    assert result.reference is not None
+    assert completion.scene.means.isfinite().all()
+    assert torch.equal(completion.scene.means[: len(completion.context)], completion.context.means)
+
+
+def test_the_same_views_give_the_same_bytes():
+    views = photographs()
+    first, second = (psi_of(TINY)(views).gaussians for _ in range(2))
+    assert torch.equal(first.means, second.means)
+    assert torch.equal(first.opacities, second.opacities)
+
+
+@pytest.mark.parametrize("config", [TINY_GAUSSIANS, TINY_METRIC], ids=["gaussians", "metric"])
+def test_heads_and_geometry_stay_exact_where_the_transformer_runs_in_lower_precision(config):
+    """On a CPU, where this can be tried."""
+    batch = batch_of(photographs(), QUICK.sizing, 2)
+    told = seen_from_first(batch.poses, scene_units(batch.poses.centers))
+    given = (batch.images,) if config is TINY_METRIC else (batch.images, told)
+    found = []
+    for lower in (False, True):
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=lower):
+            found.append(random(config)(*given))
+    for name in ("depth", "sky" if config is TINY_METRIC else "raw"):
+        exact, lower = (getattr(each, name) for each in found)
+        assert lower.dtype == torch.float32
+        assert not torch.equal(lower, exact)
+        assert relative_error(lower, exact) < 0.1
+
+
+def test_each_kind_of_network_becomes_its_own_reconstructor():
+    assert isinstance(around(random(TINY)).model, AnyViewDepth)
+    assert isinstance(around(random(TINY_METRIC)).model, MetricViewDepth)
+    assert isinstance(around(random(TINY_GAUSSIANS)), AnyViewGaussians)
+    nested = random(NestedConfig(TINY_GAUSSIANS, TINY_METRIC))
+    assert isinstance(nested, NestedDepthAnything)
+    assert isinstance(around(nested), AnyViewGaussians)
+
+
+def test_wrong_views_and_precisions_are_refused_with_a_sentence():
+    with pytest.raises(InputError, match="1 view was given, and the model matches at least 2"):
+        AnyViewDepth(random(TINY), QUICK)(photographs()[:1])
+    with pytest.raises(InputError, match="cpu and torch.bfloat16 was asked for"):
+        around(random(TINY), torch.bfloat16)
+
+
+def test_a_file_as_published_fills_the_network(tmp_path, monkeypatch):
+    safetensors = pytest.importorskip("safetensors.torch")
+    monkeypatch.setattr(depth_anything, "VARIANTS", {"da3-base": TINY})
+    path = tmp_path / "model.safetensors"
+    state = {f"model.{name}": value for name, value in random(TINY).state_dict().items()}
+    safetensors.save_file(state, path)
+    loaded = load_reconstructor("da3-base", path)
+    for name, value in loaded.model.network.state_dict().items():
+        assert torch.equal(value, state[f"model.{name}"])
