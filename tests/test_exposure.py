@@ -8,7 +8,7 @@ import torch
 
 from gscompleter import GSCompleter, View, load_renderer
 from gscompleter.metrics.image import psnr
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, reconstructor
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, splatter
 from gscompleter.reconstructors.plane_sweep.exposure import gains_of
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.rig import rig_of
@@ -59,7 +59,7 @@ def made():
 def uneven():
     """What is made of the same photographs by who takes them for alike."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reconstructor, "gains_of", lambda layers, _: np.ones((len(layers), 3)))
+        patch.setattr(splatter, "gains_of", lambda layers, _: np.ones((len(layers), 3)))
         return PlaneSweep()(photographs())
 
 

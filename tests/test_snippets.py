@@ -36,6 +36,7 @@ SIDE = 32
 """Pixels of its photographs."""
 
 NOT_RUN = {
+    "batch": "needs a manifest; test_batch.py has some",
     "live": "serves until it is closed; test_live.py presses its buttons",
     "poses": "needs photographs that COLMAP can match; test_poses.py has them",
     "demo": "takes half a minute; `make release-check` runs it",
