@@ -193,3 +193,27 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
 def answer(phi, nearest, target, context) -> Synthesis:
     """What a generator, or a plain function, makes of one request."""
     return as_generator(phi).synthesize([Request(nearest, target, context)])[0]
+
+
+def open_street(camera: Camera) -> View:
+    """A street under a sky without clouds: ground and two rows of houses of different heights
+    and distances. The depth of the sky is infinite."""
+    origin, rays = camera.center.double(), camera.z_rays().double()
+    down = rays[..., 1]
+    depth = ((1.5 - origin[1]) / down).where(down > 0, torch.inf)
+    for number in range(12):
+        start = 3.0 + 2.5 * number
+        for side in (-1.0, 1.0):
+            x = side * (2.0 + 0.5 * ((number * 7) % 3))
+            low = torch.tensor([min(x, 2 * x), -0.5 - 0.7 * ((number * 5) % 4), start]).double()
+            high = torch.tensor([max(x, 2 * x), 1.5, start + 1.6]).double()
+            to_low, to_high = (low - origin) / rays, (high - origin) / rays
+            enter = torch.minimum(to_low, to_high).nan_to_num(-torch.inf).amax(-1)
+            leave = torch.maximum(to_low, to_high).nan_to_num(torch.inf).amin(-1)
+            depth = torch.minimum(depth, enter.where((enter < leave) & (enter > 0), torch.inf))
+    sky = torch.isinf(depth)
+    points = origin + depth.where(~sky, 1.0)[..., None] * rays
+    above = torch.nn.functional.normalize(rays, dim=-1)[..., 1:2]
+    heaven = torch.tensor([0.75, 0.85, 0.95]) + 0.1 * above
+    image = torch.where(sky[..., None], heaven, 0.8 * texture(points))
+    return View(image.float(), camera, depth=depth.float())

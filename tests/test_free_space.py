@@ -59,7 +59,7 @@ def test_what_lies_behind_the_wall_or_in_a_hole_stays():
 def test_what_finds_no_place_is_told():
     config = FreeSpaceConfig(num_steps=3)
     _, placed = respect_free_space(
-        floaters(2.0), TARGET, [WITNESS], [wall(100.0)], "constant", config
+        floaters(2.0), TARGET, [WITNESS], [wall(4.0)], "constant", config
     )
     assert not placed.any()
 

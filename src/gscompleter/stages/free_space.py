@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import FreeSpaceConfig
-from gscompleter.geometry import project, slide
+from gscompleter.geometry import project, slide, z_depths
+from gscompleter.sky import shows_sky, sky_depth
 from gscompleter.types import Camera, Gaussians, Render
 
 STEP = 0.04
@@ -55,6 +56,13 @@ def respect_free_space(
         if len(waiting) == 0:
             break
         ratio[waiting] = (1 + STEP) ** (step + 1)
+    if any(shows_sky(render, camera) for render, camera in zip(renders, cameras, strict=True)):
+        # What is seen through all the way to the sky is sky.
+        behind = (1 + STEP) * sky_depth(target) / z_depths(gaussians.means[waiting], target)
+        means = target.center + behind[:, None] * offsets[waiting]
+        found = ~seen_through(means, cameras, renders)
+        ratio[waiting[found]] = behind[found]
+        waiting = waiting[~found]
     placed = torch.ones_like(ratio, dtype=torch.bool)
     placed[waiting] = config.num_steps == 0
     return slide(gaussians, target, ratio, footprint), placed

@@ -18,7 +18,9 @@ from gscompleter.geometry import slide, z_depths
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, Renderer
+from gscompleter.sky import surfaces_in
 from gscompleter.stages.alignment import fit_bridge
+from gscompleter.stages.sky_in_holes import sky_into_holes
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
 
 OCCLUSION_TOLERANCE = 0.05
@@ -74,6 +76,7 @@ def register(
         registered = carry_into_holes(
             coarse, registered, lift.pixel_index, scene, reference.camera, config
         )
+        registered = sky_into_holes(registered, lift.pixel_index, scene, reference)
     return Registration(registered, affine, losses)
 
 
@@ -133,7 +136,7 @@ def register_along_rays(
     config: RegistrationConfig,
 ) -> tuple[Gaussians, tuple[float, ...]]:
     """Minimise Eq. 11 over one distance per Gaussian; also returns the loss of each iteration."""
-    objective = Objective.of(frozen_target.context, at_anchor, reference, config)
+    objective = Objective.of(frozen_target.context, at_anchor, reference, anchor, config)
     alone = drawn_alone(coarse, reference.camera, objective.target_depth.valid, renderer, config)
     parameters = torch.zeros(
         (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
@@ -197,14 +200,19 @@ class Objective:
 
     @staticmethod
     def of(
-        at_target: Render, at_anchor: Render, reference: View, config: RegistrationConfig
+        at_target: Render,
+        at_anchor: Render,
+        reference: View,
+        anchor: Camera,
+        config: RegistrationConfig,
     ) -> Objective:
         """The objective that draws the candidates to the scene as both cameras see it."""
-        anchor_depth = at_anchor.depth_map()
+        anchor_depth = surfaces_in(at_anchor, anchor)
         seen = anchor_depth.depth[anchor_depth.valid]
         relative = config.step == "relative" and len(seen) > 0
         unit = seen.median().item() if relative else 1.0
-        return Objective(at_target.depth_map(), anchor_depth, reference.image, unit, config)
+        target_depth = surfaces_in(at_target, reference.camera)
+        return Objective(target_depth, anchor_depth, reference.image, unit, config)
 
     def __call__(
         self,

@@ -38,6 +38,9 @@ def hidden_from_others(background: Map, neighbours: Sequence[Neighbour]) -> Mask
         )
         known = (error >= 0) & (ratio > 1e-3)
         before = known & (error > MAX_RETURN_ERROR) & (ratio > 1)
-        hidden |= before
+        within, _ = stereo.reproject(
+            background * ratio, other.inverse, other.other_from_this, other.this_from_other
+        )
+        hidden |= before & (within >= 0)
         seen |= known & ~before
     return hidden & ~seen

@@ -13,11 +13,14 @@ from torch import Tensor
 from gscompleter.kernels.sharing import side_by_side
 from gscompleter.matching.depth_range import depth_range_of
 from gscompleter.matching.stereo_image import StereoImage
+from gscompleter.reconstructors.plane_sweep.confidence import Mask
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.measuring import Measured, inverse_at, measured
+from gscompleter.reconstructors.plane_sweep.open_sky import skies, sky_above, sky_shown, without
 from gscompleter.reconstructors.plane_sweep.rig import Rig, rig_of
 from gscompleter.reconstructors.plane_sweep.splatter import Splatter
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
+from gscompleter.sky import SKY_DEPTH, is_sky
 from gscompleter.types import DepthMap, Reconstruction, View
 
 HALVED_FROM = 192
@@ -49,15 +52,19 @@ class PlaneSweep(Splatter):
         What fills a hole is seen by no photograph, so that its opacities are left alone; and its
         depth is that of the surfaces around it, which half the size tells. Its colours are fitted
         to the synthesized image itself, for drawing takes the half of its sharpness. Other views'
-        depths are those that were measured.
+        depths are those that were measured. The sky tells no depth here; the scene has it.
 
         Raises:
             InputError: as a call.
         """
         views = ranged(views)
         rig = rig_of(views)
-        first, *others = matched(rig, views, halves=True)
-        layers = surfaces_of(rig.images[0], first), *map(as_measured, rig.images[1:], others)
+        first, second = matched(rig, views, halves=True)
+        open_there = sky_above(rig.images[1], second)
+        layers = [
+            surfaces_of(rig.images[0], without(first, sky_shown(rig, open_there))),
+            as_measured(rig.images[1], without(second, open_there)),
+        ]
         return self.wanted_of(views, depth_maps(layers, rig.unit, views), wanted)
 
     def depths(self, views: Sequence[View]) -> list[DepthMap]:
@@ -69,7 +76,9 @@ class PlaneSweep(Splatter):
     def layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
         """What stereo says of each view."""
         found = matched(rig, views, halves=len(views) > 2)
-        return side_by_side(surfaces_of, rig.images, found)
+        seen = skies(rig, found)
+        surfaces = side_by_side(surfaces_of, rig.images, map(without, found, seen))
+        return list(map(before_sky, surfaces, found, seen))
 
 
 def ranged(views: Sequence[View]) -> list[View]:
@@ -104,11 +113,22 @@ def as_measured(image: StereoImage, found: Measured) -> Layer:
     return Layer(image, inverse_at(full.planes, full.index), full.confidence)
 
 
+def before_sky(layer: Layer, found: Measured, sky: Mask) -> Layer:
+    """`layer` with the sky of its view behind it, which is sure."""
+    beyond = np.float32(found.planes[0] / SKY_DEPTH)
+    inverse = np.where(sky, beyond, layer.inverse)
+    return replace(
+        layer, inverse=inverse, confidence=np.where(sky, np.float32(1), layer.confidence)
+    )
+
+
 def depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> list[DepthMap]:
-    """z-depths in scene units, on the device of the views."""
+    """z-depths in scene units, on the device of the views; those of the sky tell nothing."""
     depths = []
     for layer, view in zip(layers, views, strict=True):
         depth = torch.from_numpy(np.float32(unit) / layer.inverse)
         confidence = torch.from_numpy(layer.confidence).to(view.image.device)
-        depths.append(DepthMap(depth.to(confidence.device), confidence > 0, confidence))
+        depth = depth.to(confidence.device)
+        valid = (confidence > 0) & ~is_sky(depth, view.camera)
+        depths.append(DepthMap(depth, valid, confidence.where(valid, 0.0)))
     return depths

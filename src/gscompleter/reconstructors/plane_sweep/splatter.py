@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gscompleter.reconstructors.plane_sweep.appearance import fit_appearance, fit_colours
@@ -22,6 +22,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
 from gscompleter.reconstructors.plane_sweep.gaussians import discs, normals_of
 from gscompleter.reconstructors.plane_sweep.joint_fit import fit_jointly
 from gscompleter.render import Renderer, load_renderer
+from gscompleter.sky import is_sky, sky_behind, with_sky_of
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
 
 MIN_ALPHA = 0.7
@@ -58,18 +59,21 @@ class Splatter:
         """
         gains = gains_among(layers, transforms)
         device = views[0].image.device
-        even = map(View.evened, views, gains.to(device))
+        even = list(map(View.evened, views, gains.to(device)))
         parts = [self.splat(view, depth) for view, depth in zip(even, depths, strict=True)]
         every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
         chosen = self.chosen(every, on_cpu, layers, transforms)
-        fitted = self.fitted(every[chosen], on_cpu, gains)
-        rows = [torch.arange(len(part)) for part in parts]
-        numbers = [torch.full((len(part),), i) for i, part in enumerate(parts)]
+        behind = [self.sky_behind(view, depth) for view, depth in zip(even, depths, strict=True)]
+        made = merge([every[chosen], *(gaussians.to("cpu") for gaussians, _ in behind)])
+        fitted = with_sky_of(made, self.fitted(made, on_cpu, gains), on_cpu[0].camera)
+        rows = torch.cat([torch.arange(len(part)) for part in parts])[chosen]
+        numbers = torch.cat([torch.full((len(part),), i) for i, part in enumerate(parts)])[chosen]
+        more = [torch.full((len(pixels),), i) for i, (_, pixels) in enumerate(behind)]
         return Reconstruction(
             fitted.to(device),
             tuple(depths),
-            torch.cat(numbers)[chosen].to(device),
-            torch.cat(rows)[chosen].to(device),
+            torch.cat([numbers, *more]).to(device),
+            torch.cat([rows, *(pixels.cpu() for _, pixels in behind)]).to(device),
             None if (gains == 1).all() else gains.to(device),
         )
 
@@ -115,6 +119,10 @@ class Splatter:
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
         """A disc for every pixel of `view`."""
         return discs(view, depth.depth, normals_of(depth.depth, view), self.disc_sigma)
+
+    def sky_behind(self, view: View, depth: DepthMap) -> tuple[Gaussians, Int[Tensor, "n"]]:
+        """The sky behind what stands before it in `view`, and the pixels it lies at."""
+        return sky_behind(view, is_sky(depth.depth, view.camera), self.disc_sigma)
 
 
 def gains_among(layers: Sequence[Layer], transforms: Transforms) -> Float[Tensor, "views 3"]:

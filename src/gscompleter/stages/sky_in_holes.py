@@ -1,0 +1,57 @@
+"""Stage 3, ours: a hole beside the sky that shows the sky's colour is sky.
+
+No photograph saw it, so that nothing measured a depth there, and what was lifted hangs at that of
+the roofs and trees around.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gscompleter.geometry import at_depths, z_depths
+from gscompleter.sky import is_sky, sky_depth
+from gscompleter.types import DepthMap, Gaussians, View
+
+LIKE = 0.1
+"""Largest difference of colour to the nearest sky, in any channel, of a hole that is sky."""
+
+
+def sky_into_holes(
+    candidates: Gaussians, pixel_index: Int[Tensor, "n"], scene: DepthMap, reference: View
+) -> Gaussians:
+    """`candidates`, those of holes that continue the sky at its depth.
+
+    Args:
+        candidates: Where they stand.
+        pixel_index: The pixel of the reference that each came from.
+        scene: What the target sees of the scene; a hole is where it is not valid.
+        reference: The synthesized image and the target camera.
+    """
+    camera = reference.camera
+    sky = scene.valid & is_sky(scene.depth, camera)
+    if not sky.any():
+        return candidates
+    continued = continuing(sky, scene.valid, reference.image).flatten()[pixel_index]
+    depths = z_depths(candidates.means, camera)
+    return at_depths(candidates, camera, depths.where(~continued, sky_depth(camera)))
+
+
+def continuing(
+    sky: Bool[Tensor, "h w"], known: Bool[Tensor, "h w"], image: Float[Tensor, "h w 3"]
+) -> Bool[Tensor, "h w"]:
+    """The pixels of a hole whose nearest `known` pixel is `sky`, and of its colour."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).cpu().numpy().astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    label = torch.from_numpy(labels).long().to(known.device)
+    pixel = torch.zeros(int(label.max()) + 1, dtype=torch.long, device=known.device)
+    at = torch.nonzero(known.flatten())[:, 0]
+    pixel[label.flatten()[at]] = at
+    nearest = pixel[label]
+    colours = image.reshape(-1, 3)[nearest]
+    like = (image - colours).abs().amax(dim=-1) < LIKE
+    return ~known & sky.flatten()[nearest] & like

@@ -1,0 +1,156 @@
+"""The sky: a layer of its own outdoors, and none indoors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gscompleter.geometry import project
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
+from gscompleter.render import load_renderer
+from gscompleter.sky import SKY_DEPTH, is_sky, sky_behind, surfaces_in
+from gscompleter.stages.free_space import respect_free_space
+from gscompleter.stages.sky_in_holes import sky_into_holes
+from gscompleter.types import SH_C0, DepthMap, View, sh_from_rgb
+from scenes import (
+    Room,
+    camera_at,
+    cast,
+    gaussians_of,
+    open_street,
+    view_of,
+)
+
+FAR = 40.0
+
+
+def street(z: float) -> View:
+    return open_street(replace(camera_at(z=z, size=96, focal=0.8), near=1.0, far=FAR))
+
+
+@pytest.fixture(scope="module")
+def reconstructed():
+    views = [street(0.6), street(0.0)]
+    return views, PlaneSweep()(views)
+
+
+def test_the_sky_of_a_street_lies_far_behind_its_far_plane(reconstructed):
+    views, found = reconstructed
+    for view, depth in zip(views, found.depths, strict=True):
+        truth = torch.isinf(view.depth)
+        sky = is_sky(depth.depth, view.camera)
+        assert (sky & truth).sum() > 0.85 * truth.sum()
+        assert (sky & ~truth).sum() < 0.03 * (~truth).sum()
+        assert not (depth.valid & sky).any()
+
+
+@pytest.mark.parametrize("z", [-0.6, -1.2])
+def test_the_sky_stays_sky_where_the_camera_backs_away(reconstructed, z):
+    _, found = reconstructed
+    view = street(z)
+    render = load_renderer("cpu").render(found.gaussians, view.camera)
+    truth = torch.isinf(view.depth)
+    seen = truth & (render.alpha > 0.5)
+    assert seen.sum() > 0.7 * truth.sum()
+    error = (render.image - view.image).abs().amax(dim=-1)[seen]
+    assert error.median() < 0.02
+    assert is_sky(render.depth[seen], view.camera).float().mean() > 0.8
+
+
+def test_the_sky_is_not_brighter_at_its_edges_than_any_photograph(reconstructed):
+    views, found = reconstructed
+    camera = views[0].camera
+    in_sky = is_sky((found.gaussians.means - camera.center).norm(dim=-1), camera)
+    colours = found.gaussians.sh[in_sky, 0] * SH_C0 + 0.5
+    shown = torch.cat([view.image[torch.isinf(view.depth)] for view in views])
+    assert in_sky.any()
+    assert colours.amax() <= shown.amax() + 1e-4
+
+
+def test_an_even_ceiling_is_no_sky():
+    def view(z: float) -> View:
+        camera = replace(camera_at(z=z), near=0.5, far=20.0)
+        image, depth = cast(Room(), camera)
+        y = (camera.center + depth[..., None] * camera.z_rays())[..., 1]
+        return View(torch.where((y < -1.49)[..., None], 0.95, image), camera, depth=depth)
+
+    views = [view(0.2), view(0.0)]
+    depths = PlaneSweep().depths(views)
+    assert not any(is_sky(d.depth, v.camera).any() for d, v in zip(depths, views, strict=True))
+
+
+def test_a_hole_beside_the_sky_is_sky_if_it_shows_its_colour():
+    camera = replace(camera_at(size=16), near=0.5, far=10.0)
+    image = torch.full((16, 16, 3), 0.8)
+    image[:, :3] = 0.2
+    depth = torch.full((16, 16), SKY_DEPTH * 10.0)
+    depth[8:] = 5.0
+    valid = torch.ones(16, 16, dtype=torch.bool)
+    valid[:, :6] = False
+    view = View(image, camera)
+    candidates = gaussians_of(view, torch.full((16, 16), 5.0))
+    moved = sky_into_holes(candidates, torch.arange(256), DepthMap(depth, valid), view)
+    z = (moved.means - camera.center)[:, 2].reshape(16, 16)
+    assert is_sky(z[:8, 3:6], camera).all()
+    z[:8, 3:6] = 5.0
+    torch.testing.assert_close(z, torch.full((16, 16), 5.0), atol=1e-4, rtol=0)
+
+
+def test_without_a_sky_no_candidate_moves():
+    view = view_of(Room(), camera_at(size=16))
+    candidates = gaussians_of(view)
+    scene = DepthMap(view.depth, torch.ones(16, 16, dtype=torch.bool))
+    assert sky_into_holes(candidates, torch.arange(256), scene, view) is candidates
+
+
+def test_the_sky_goes_on_behind_what_stands_before_it():
+    camera = replace(camera_at(size=32), near=0.5, far=10.0)
+    image = torch.full((32, 32, 3), 0.8)
+    sky = torch.ones(32, 32, dtype=torch.bool)
+    sky[:, 4:28] = False
+    image[~sky] = 0.1
+    gaussians, pixels = sky_behind(View(image, camera), sky, 0.6)
+    where = torch.zeros(32 * 32, dtype=torch.bool)
+    where[pixels] = True
+    assert where.reshape(32, 32)[:, 4:8].all()
+    assert where.reshape(32, 32)[:, 24:28].all()
+    assert len(pixels) == 8 * 32
+    torch.testing.assert_close(gaussians.sh, sh_from_rgb(torch.full((256, 3), 0.8)))
+
+
+def test_what_would_stand_before_the_sky_becomes_sky():
+    camera = replace(camera_at(size=16), near=0.5, far=10.0)
+    view = View(torch.full((16, 16, 3), 0.5), camera)
+    scene = gaussians_of(view, torch.full((16, 16), SKY_DEPTH * 10.0))
+    aside = replace(camera_at(x=0.3, size=16), near=0.5, far=10.0)
+    seen = load_renderer("cpu").render(scene, camera)
+    candidates = gaussians_of(View(view.image, aside), torch.full((16, 16), 2.0))
+    moved, placed = respect_free_space(candidates, aside, [camera], [seen], "constant")
+    inner = project(candidates.means, camera)[0].sub(8).abs().amax(dim=-1) < 6
+    assert placed[inner].all()
+    assert is_sky(moved.means[inner, 2], camera).all()
+
+
+def test_only_surfaces_are_compared_with_surfaces():
+    camera = replace(camera_at(size=16), near=0.5, far=10.0)
+    depth = torch.full((16, 16), 5.0)
+    depth[:8] = SKY_DEPTH * 10.0
+    image = torch.full((16, 16, 3), 0.5)
+    render = load_renderer("cpu").render(gaussians_of(View(image, camera), depth), camera)
+    valid = surfaces_in(render, camera).valid
+    assert not valid[:6].any()
+    assert valid[10:].all()
+
+
+def test_what_another_view_could_not_have_seen_is_hidden_by_nothing():
+    """Four columns leave the other image at the depth of what it shows in their direction."""
+    there, back = np.eye(3, 4, dtype=np.float32), np.eye(3, 4, dtype=np.float32)
+    there[0, 3], back[0, 3] = -10, 10
+    near = Neighbour(np.full((32, 32), 0.5, np.float32), there, back)
+    hidden = hidden_from_others(np.full((32, 32), 0.1, np.float32), [near])
+    assert hidden[:, 6:].all()
+    assert not hidden[:, :4].any()
