@@ -20,6 +20,8 @@ from gscompleter.reconstructors.plane_sweep.rig import Rig
 
 Map = Float32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
+OtherMask = Bool[np.ndarray, "a b"]
+"""Of an image that may have another size."""
 Plane = Float64[np.ndarray, "3"]
 
 EVEN = 0.012
@@ -59,7 +61,7 @@ def skies(rig: Rig, found: Sequence[Measured]) -> list[Mask]:
     ]
 
 
-def sky_shown(rig: Rig, sky_of_second: Mask) -> Mask:
+def sky_shown(rig: Rig, sky_of_second: OtherMask) -> Mask:
     """The sky in the first view of a pair, as far as the second shows it in the same direction."""
     first = rig.images[0]
     return even_above(first) & (at_infinity(first.size, sky_of_second, rig, 0, 1) == 1)
@@ -143,7 +145,7 @@ def on_one_plane(outline: Mask, heights: Map) -> float:
     return float((np.abs(sites @ plane - values) < PLANE_TOLERANCE).mean())
 
 
-def confirmed(number: int, sky: Mask, others: Sequence[Mask], rig: Rig) -> bool:
+def confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig) -> bool:
     """Whether most of `sky` is that of the views that look there, too."""
     shown = [
         at_infinity(sky.shape, other, rig, number, i)[sky]
@@ -156,7 +158,7 @@ def confirmed(number: int, sky: Mask, others: Sequence[Mask], rig: Rig) -> bool:
 
 
 def at_infinity(
-    size: tuple[int, ...], mask: Mask, rig: Rig, this: int, other: int
+    size: tuple[int, ...], mask: OtherMask, rig: Rig, this: int, other: int
 ) -> Float32[np.ndarray, "h w"]:
     """What `mask` of view `other` says in the direction of each pixel of view `this`: 1 or 0, and
     -1 where it does not look."""
