@@ -29,7 +29,8 @@ from gscompleter.types import Camera, SceneContext, View
 
 STRUCTURE_REACH = 0.15
 """How far into a hole structure is continued, relative to the longer side of the image; it fades
-out on the way. Nothing tells what lies deeper, and a wrong guess is worse than none."""
+out on the second half of the way. Nothing tells what lies deeper, and a wrong guess is worse than
+none."""
 TONE_RADIUS = 4
 """Pixels over which a hole keeps the mean colour of its smooth continuation. Patches alone look as
 plausible but drift in tone."""
@@ -73,7 +74,7 @@ class WarpInpaint:
         patched = fill_by_patches(tone, ~undecided, log_depth, sources, self.seed)
         detail = patched - tone
         detail = detail - smoothed(detail, undecided, TONE_RADIUS)
-        fading = (1 - away / reach).clamp_min(0)
+        fading = (2 * (1 - away / reach)).clamp(0, 1)
         return torch.where(undecided[..., None], tone + fading[..., None] * detail, tone)
 
 
