@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-import batch_jobs
 from batch_jobs import Writing, engine_named, outcomes, plain_jobs
 from command import run
 from gscompleter import InputError
@@ -336,9 +335,9 @@ def test_a_folder_of_something_else_is_refused(tmp_path, manifest, monkeypatch, 
 
 
 @pytest.mark.slow
-def test_ray_does_what_is_told_and_tells_of_lost_workers(tmp_path):
+def test_ray_does_what_is_told_and_tells_of_lost_workers(tmp_path, monkeypatch):
     pytest.importorskip("ray")
-    assert batch_jobs  # its folder is on the path of the workers
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
     jobs = [Job("bad", {"ends": "always killed"}), *plain_jobs(3, 0.0)]
     found = {o.job.name: o.state for o in outcomes(tmp_path, jobs, engine_named("ray", 1), 0)}
     assert found == {"bad": "failed", "job-000": "done", "job-001": "done", "job-002": "done"}
