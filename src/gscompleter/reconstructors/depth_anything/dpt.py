@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gscompleter.reconstructors.depth_anything.vit import Tokens
-from gscompleter.reconstructors.feed_forward.dpt import Scratch
+from gscompleter.reconstructors.feed_forward.dpt import Scratch, projections, resizers
 
 HIDDEN = 32
 """Channels before the last convolution of a head."""
@@ -31,15 +31,8 @@ class Dpt(nn.Module):
         """
         super().__init__()
         self.coded = coded
-        self.projects = nn.ModuleList(nn.Conv2d(channels, width, 1) for width in widths)
-        self.resize_layers = nn.ModuleList(
-            [
-                nn.ConvTranspose2d(widths[0], widths[0], 4, 4),
-                nn.ConvTranspose2d(widths[1], widths[1], 2, 2),
-                nn.Identity(),
-                nn.Conv2d(widths[3], widths[3], 3, 2, 1),
-            ]
-        )
+        self.projects = projections(channels, widths)
+        self.resize_layers = resizers(widths)
 
     def pyramid(
         self, tokens: Sequence[Tokens], rows: int, columns: int

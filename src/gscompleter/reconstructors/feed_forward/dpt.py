@@ -116,6 +116,23 @@ def size_of(x: Float[Tensor, "n c h w"]) -> tuple[int, int]:
     return x.shape[2], x.shape[3]
 
 
+def projections(channels: int, widths: Sequence[int]) -> nn.ModuleList:
+    """From the maps of a transformer to the channels of the four levels, finest first."""
+    return nn.ModuleList(nn.Conv2d(channels, width, 1) for width in widths)
+
+
+def resizers(widths: Sequence[int]) -> nn.ModuleList:
+    """To 4, 2, 1 and 1/2 times the resolution of the transformer's maps."""
+    return nn.ModuleList(
+        [
+            nn.ConvTranspose2d(widths[0], widths[0], 4, 4),
+            nn.ConvTranspose2d(widths[1], widths[1], 2, 2),
+            nn.Identity(),
+            nn.Conv2d(widths[3], widths[3], 3, 2, 1),
+        ]
+    )
+
+
 class DptHead(nn.Module):
     """Joins the transformer's maps with others, and fuses them."""
 
@@ -137,15 +154,8 @@ class DptHead(nn.Module):
         """
         super().__init__()
         self.layout = layout
-        self.projects = nn.ModuleList(nn.Conv2d(vit_channels, width, 1) for width in widths)
-        self.resize_layers = nn.ModuleList(
-            [
-                nn.ConvTranspose2d(widths[0], widths[0], 4, 4),
-                nn.ConvTranspose2d(widths[1], widths[1], 2, 2),
-                nn.Identity(),
-                nn.Conv2d(widths[3], widths[3], 3, 2, 1),
-            ]
-        )
+        self.projects = projections(vit_channels, widths)
+        self.resize_layers = resizers(widths)
         self.concat_projects = nn.ModuleList(
             nn.Conv2d(sum(width if name == VIT else CHANNELS[name] for name in names), width, 1)
             for names, width in zip(layout, widths[:3], strict=True)
