@@ -189,3 +189,10 @@ def _over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
         rgba = np.array(image.convert("RGBA")).astype(np.uint16)
         return ((rgba[..., :3] * rgba[..., 3:] + 127) // 255).astype(np.uint8)
     return np.array(image.convert("RGB"))
+
+
+def jpeg_of(image: Image.Image, quality: int) -> bytes:
+    """`image` as a JPEG file, of a quality from 1 to 95."""
+    file = io.BytesIO()
+    image.save(file, format="JPEG", quality=quality)
+    return file.getvalue()

@@ -16,7 +16,7 @@ from PIL import Image
 from gscompleter.batch.jobs import JOBS, THUMBNAILS, Job, read_row
 from gscompleter.batch.places import Place
 from gscompleter.errors import InputError
-from gscompleter.io.image import read_pixels
+from gscompleter.io.image import jpeg_of, read_pixels
 from gscompleter.reports.page import NAME, QUALITY, Picture, rendered
 from gscompleter.reports.plain_words import shown
 
@@ -92,9 +92,7 @@ def thumbnail_of(folder: Path) -> bytes | None:
     both = Image.new("RGB", (sum(image.width for image in small) + 4, HEIGHT), "white")
     both.paste(small[0], (0, 0))
     both.paste(small[1], (small[0].width + 4, 0))
-    file = io.BytesIO()
-    both.save(file, format="JPEG", quality=QUALITY)
-    return file.getvalue()
+    return jpeg_of(both, QUALITY)
 
 
 def sized(image: Image.Image) -> Image.Image:

@@ -22,7 +22,7 @@ from PIL import Image
 from gscompleter import __version__
 from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
-from gscompleter.io.image import image_size, read_pixels
+from gscompleter.io.image import image_size, jpeg_of, read_pixels
 
 NAME = "report.html"
 """The file in the output folder."""
@@ -117,14 +117,16 @@ def shrunk(image: Image.Image, scale: float, exact: bool) -> Image.Image:
 
 def data_uri(image: Image.Image, exact: bool) -> str:
     """`image` as the address of itself: a PNG where it is exact, else a JPEG."""
+    kind, content = ("png", png_of(image)) if exact else ("jpeg", jpeg_of(image, QUALITY))
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def png_of(image: Image.Image) -> bytes:
+    """`image` as a PNG file, by a palette where it has few colours."""
     file = io.BytesIO()
-    if exact:
-        colours = image.getcolors(256)
-        (image.quantize(256) if colours else image).save(file, format="PNG", compress_level=6)
-    else:
-        image.save(file, format="JPEG", quality=QUALITY)
-    kind = "png" if exact else "jpeg"
-    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"
+    colours = image.getcolors(256)
+    (image.quantize(256) if colours else image).save(file, format="PNG", compress_level=6)
+    return file.getvalue()
 
 
 def rendered(template: str, values: Mapping[str, object]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from gscompleter.data.scene import load_cameras
 from gscompleter.errors import InputError, quoted
 from gscompleter.frames.similarity import moved_camera
 from gscompleter.io.files import COMPLETED, CONTEXT, SUMMARY, TARGETS
-from gscompleter.io.image import read_pixels
+from gscompleter.io.image import jpeg_of, read_pixels
 from gscompleter.io.json_file import read_json
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.sog import META
@@ -245,9 +244,7 @@ def thumbnail_of(path: Path) -> bytes | None:
         return None
     image = Image.fromarray(read_pixels(path))
     image.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
-    file = io.BytesIO()
-    image.save(file, "JPEG", quality=THUMBNAIL_QUALITY)
-    return file.getvalue()
+    return jpeg_of(image, THUMBNAIL_QUALITY)
 
 
 def _lost(summary: Summary) -> str:
