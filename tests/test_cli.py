@@ -207,6 +207,7 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--auto", 2), "Targets are named, and others are to be found besides; "),
         (("--auto",), "complete the result for the others (--auto)."),
         (("--near", 0), "near"),
+        (("--generator", "oracle", "--generator=oracle"), "--generator is given twice"),
         (("--near", -1), "near"),
         (("--far", "nan"), "far"),
         (("--resolution", 0, 64), "resolution"),

@@ -146,6 +146,8 @@ def test_doctor_tells_of_what_is_missing_and_for_what(monkeypatch, capsys):
     assert not found["extras", "film"]["there"]
     assert "--film" in found["extras", "film"]["told"]
     assert "pip install 'gscompleter[poses]'" in found["extras", "poses"]["told"]
+    assert not found["extras", "ray"]["there"]
+    assert "older than this extra" in found["extras", "ray"]["told"]
     assert run(monkeypatch, "doctor") == 0
     assert "missing: not-there, for photographs whose" in capsys.readouterr().out
 

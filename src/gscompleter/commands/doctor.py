@@ -112,6 +112,10 @@ def packages() -> Iterator[Found]:
 def extras() -> Iterator[Found]:
     """What `pip install 'gscompleter[EXTRA]'` adds."""
     for extra, purpose in PURPOSES.items():
+        if not required(extra):
+            why = f"what is installed is older than this extra, or this Python is; for {purpose}"
+            yield Found("extras", extra, False, why)
+            continue
         versions = {requirement.name: installed(requirement) for requirement in required(extra)}
         missing = [name for name, there in versions.items() if there is None]
         listed = ", ".join(missing or [f"{name} {there}" for name, there in versions.items()])

@@ -32,6 +32,7 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
         InputError: where they are wrong, or the config that they name is.
         SystemExit: where they ask for help, which is printed.
     """
+    check_once(words)
     said = StringIO()
     try:
         with redirect_stderr(said):
@@ -48,6 +49,21 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
         if not stop.code:
             raise
         raise InputError(unboxed(said.getvalue(), words, names)) from None
+
+
+def check_once(words: Sequence[str]) -> None:
+    """Refuse an option that is named twice, for the later one alone would count.
+
+    Raises:
+        InputError: where `words` hold one.
+    """
+    named = [word.split("=")[0].replace("_", "-") for word in words if word.startswith("--")]
+    twice = next((name for name in named if named.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(
+            f"{quoted(twice)} is given twice, and only one of them would count; name it once, with "
+            "all its values after it."
+        )
 
 
 def auto_counted(words: Sequence[str]) -> list[str]:
