@@ -28,12 +28,15 @@ IMPORT_ALL = "import gscompleter; [getattr(gscompleter, name) for name in gscomp
 IMPORT_EXTRA = """
 import sys
 from importlib import import_module
-from importlib.metadata import packages_distributions
+from importlib.metadata import distribution
 from gscompleter.commands.doctor import required
-wanted = {requirement.name.replace("_", "-").lower() for requirement in required(sys.argv[1])}
-for module, places in packages_distributions().items():
-    ours = any(place.replace("_", "-").lower() in wanted for place in places)
-    if ours and module.isidentifier() and module != "__pycache__":
+for name in {requirement.name for requirement in required(sys.argv[1])}:
+    paths = [path.parts for path in distribution(name).files]
+    folders = {parts[0] for parts in paths if parts[1:] == ("__init__.py",)}
+    alone = {parts[0][:-3] for parts in paths if len(parts) == 1 and parts[0].endswith(".py")}
+    modules = sorted(module for module in folders | alone if module.isidentifier())
+    assert modules, name
+    for module in modules:
         import_module(module)
         print("imported", module)
 """
