@@ -31,6 +31,7 @@ from gscompleter.stages.anchor import (
 from gscompleter.stages.candidates import shrunk
 from gscompleter.stages.compared_depths import compared_depths
 from gscompleter.stages.context import exposed_alike, init_context, working_range
+from gscompleter.stages.contradiction import contradicted
 from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.harm import do_no_harm, error_with_loss, is_undone, squared_error
@@ -206,6 +207,8 @@ class GSCompleter:
                 context, gains = init_context(self.reconstructor, views)
                 views = exposed_alike(views, gains)
             completion = Completion(context, context, views, (), (), {}, others, gains=gains)
+            if scene is None:
+                completion = self.wary_of_what_moved(completion)
             if scene is not None and witnesses is not None:
                 completion = replace(completion, evidence=self.evidence(completion))
             allowed = self.allowed_errors(completion)
@@ -553,6 +556,18 @@ class GSCompleter:
     def holes(self, sight: Sight) -> Bool[Tensor, "h w"]:
         """Where the scene has a hole at the wider camera, by the settings of this completer."""
         return hole_mask(sight.alpha, self.config.holes)
+
+    def wary_of_what_moved(self, completion: Completion) -> Completion:
+        """`completion`, whose photographs say where others contradict them."""
+        views, drawn = completion.views, contexts_of(self.at(completion, completion.views))
+        masks = contradicted(views, drawn, self.config.contradiction)
+        return replace(
+            completion,
+            views=tuple(
+                replace(view, contradicted=mask) if mask.any() else view
+                for view, mask in zip(views, masks, strict=True)
+            ),
+        )
 
     def allowed_errors(self, completion: Completion) -> tuple[float, ...]:
         """Largest mean squared error that each photograph may have once all is done."""

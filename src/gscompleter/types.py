@@ -123,12 +123,20 @@ class View(Movable):
     ignored: Bool[Tensor, "h w"] | None = None
     """True where the photograph is to be ignored, such as where something moves: nothing is made of
     it there, and nothing compared with it. None where all of it counts."""
+    contradicted: Bool[Tensor, "h w"] | None = None
+    """True where other photographs show something else in its place, so that something moved: what
+    is completed takes nothing from there. None where that was not asked."""
 
     @property
     def counted(self) -> Bool[Tensor, "h w"]:
         """True where the photograph is not to be ignored."""
         everywhere = torch.ones_like(self.image[..., 0], dtype=torch.bool)
         return everywhere if self.ignored is None else ~self.ignored
+
+    @property
+    def trusted(self) -> Bool[Tensor, "h w"]:
+        """True where what is completed may follow the photograph."""
+        return self.counted if self.contradicted is None else self.counted & ~self.contradicted
 
     def compared(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
         """`image` as it is held against the photograph: the same as this where it is ignored."""

@@ -104,6 +104,16 @@ class HoleConfig(Settings):
 
 
 @dataclass(frozen=True)
+class ContradictionConfig(Settings):
+    """Where photographs contradict each other, because something moved. What is completed takes
+    nothing from there. A scene that was brought is not asked."""
+
+    min_difference: Annotated[float, Interval(gt=0, le=1)] | None = 0.12
+    """Difference of colour, in [0, 1], from which two photographs of the same surface show
+    different things; None asks nothing, as in the paper."""
+
+
+@dataclass(frozen=True)
 class SupportConfig(Settings):
     """What is doubted of a scene that was brought. Of one that Ψ made of the photographs nothing
     is."""
@@ -214,6 +224,8 @@ class CompleterConfig(Settings):
     """How candidates keep out of space that photographs saw through."""
     holes: HoleConfig = HoleConfig()
     """What counts as a hole."""
+    contradiction: ContradictionConfig = ContradictionConfig()
+    """What counts as having moved between photographs."""
     support: SupportConfig = SupportConfig()
     """What counts as no hole only as far as photographs support it."""
     refine: RefineConfig = RefineConfig()
@@ -251,6 +263,7 @@ class CompleterConfig(Settings):
             holes=HoleConfig(neighbourhood=None),
             harm=HarmConfig(tolerance=None, max_loss=None),
             support=SupportConfig(doubts=False),
+            contradiction=ContradictionConfig(min_difference=None),
         )
 
 

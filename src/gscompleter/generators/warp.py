@@ -12,6 +12,7 @@ from gscompleter.coverage import COVERED
 from gscompleter.generators.harmonize import gains
 from gscompleter.generators.smooth import continued
 from gscompleter.geometry import baseline_between, inside, project, sample, unproject
+from gscompleter.masks import dilate
 from gscompleter.types import Camera, Render, SceneContext, View
 
 DEPTH_TOLERANCE = 0.03
@@ -20,8 +21,11 @@ relative to the depth, at which the weight of the photograph has fallen to 1/e."
 SHARPNESS = 4.0
 """Power of the weights: larger ones prefer the nearest photograph to the average."""
 SHOWN = 1.0
-"""Weight of a photograph, before that power, from which it shows a surface whose colour in the
-scene is not believed: as much as one at its depth that looks from a radian aside."""
+"""Weight of a photograph, before that power, from which it shows a surface: as much as one at its
+depth that looks from a radian aside."""
+AROUND = 4
+"""Pixels around what moved in which the colour of the render is not believed: at its edges no depth
+is right."""
 
 
 @dataclass(frozen=True)
@@ -51,18 +55,22 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
     A photograph counts where the scene, seen from its camera, lies at the depth of the surface:
     elsewhere something stands before it. What no photograph shows keeps the colour of the render,
     where this is believed; where it is not, a hole remains unless a photograph shows the surface.
+    What only contradicted photographs show is not known, for it moved or something moved before it,
+    nor is what none shows around that.
     All are brought to the exposure of `nearest`.
     """
     scene = context.at_target
     known = ~context.holes
     points = unproject(scene.depth, target)
     colours, weights = [], []
+    in_doubt = torch.zeros_like(known)
     for view, render in zip(context.views, context.at_views, strict=True):
         pixels, z = project(points, view.camera)
         visible = _visibility(pixels, z, view, render)
+        shown = (visible * _closeness(points, target, view)) ** SHARPNESS
         colours.append(sample(view.image, pixels))
-        counted = _counted(view, pixels)
-        weights.append((visible * counted * _closeness(points, target, view)) ** SHARPNESS)
+        weights.append(shown * _trusted(view, pixels))
+        in_doubt |= (shown > SHOWN**SHARPNESS) & _contradicted(view, pixels)
 
     baselines = [baseline_between(nearest.camera, view.camera) for view in context.views]
     reference = baselines.index(min(baselines))
@@ -77,6 +85,7 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
     image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
     if context.believed is not None:
         known = known | ((scene.alpha >= context.max_alpha) & (total > SHOWN**SHARPNESS))
+    known = known & ~(dilate(in_doubt, AROUND) & (total < SHOWN**SHARPNESS))
     return Warped(image.clamp(0, 1), known, scene.depth, tuple(factors))
 
 
@@ -96,7 +105,7 @@ def with_unexplained(warped: Warped, target: Camera, context: SceneContext) -> W
         pixels, z = project(points, view.camera)
         empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
         unexplained = empty & inside(pixels, z, view.camera) & ~warped.known
-        unexplained = unexplained & _counted(view, pixels)
+        unexplained = unexplained & _trusted(view, pixels)
         weight = unexplained * _closeness(points, target, view) ** SHARPNESS
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
         total = total + weight
@@ -136,9 +145,16 @@ def _visibility(
     return torch.exp(-(error**2)) * visible
 
 
-def _counted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
-    """Where a photograph is not to be ignored at `pixels`, nor beside them."""
-    return sample((~view.counted)[..., None].float(), pixels)[..., 0] == 0
+def _trusted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
+    """Where a photograph may be followed at `pixels`, and beside them."""
+    return sample((~view.trusted)[..., None].float(), pixels)[..., 0] == 0
+
+
+def _contradicted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
+    """Where others contradict a photograph at `pixels`, or beside them."""
+    if view.contradicted is None:
+        return torch.zeros_like(pixels[..., 0], dtype=torch.bool)
+    return sample(view.contradicted[..., None].float(), pixels)[..., 0] > 0
 
 
 def _closeness(points: Float[Tensor, "h w 3"], target: Camera, view: View) -> Float[Tensor, "h w"]:

@@ -93,9 +93,9 @@ def sources_of(context: SceneContext, warped: Warped) -> Sources:
         (gain * view.image.cpu()).clamp(0, 1)
         for view, gain in zip(context.views, warped.gains, strict=True)
     ]
-    counted = [view.counted.cpu() for view in context.views]
+    trusted = [view.trusted.cpu() for view in context.views]
     return Sources.stacked(
         [*photographs, warped.image],
-        [*counted, warped.known],
+        [*trusted, warped.known],
         [*(render.depth.cpu() for render in context.at_views), warped.depth],
     )

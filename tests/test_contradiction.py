@@ -1,0 +1,134 @@
+"""What moved between photographs is found where they contradict each other, and is not completed
+with."""
+
+from functools import cache
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter import GSCompleter
+from gscompleter.config import CompleterConfig, ContradictionConfig
+from gscompleter.geometry import project, sample, unproject
+from gscompleter.stages.contradiction import contradicted
+from gscompleter.types import Camera, Completion, Render, TargetCompletion, View
+from scenes import Room, camera_at, cast, texture, view_of
+
+SIZE = 96
+OUTSIDE = Room().boxes[0]
+IN_FRONT = ((-0.3, -0.3, 1.8), (0.3, 1.5, 2.1))
+ROOM = Room(boxes=(OUTSIDE, IN_FRONT))
+CAMERAS = (camera_at(0, 0, size=SIZE), camera_at(0, -0.3, size=SIZE))
+PLACES = (-0.55, 0.9)
+"""Where something red stands in the first photograph, half hidden, and in the second, in x."""
+
+
+def with_something_red(camera: Camera, x: float) -> tuple[View, Bool[Tensor, "h w"]]:
+    """A photograph of the room with a red box at `x`, whose texture goes with it, and its pixels.
+    The depth is that of the room."""
+    box = ((x - 0.3, 0.1, 2.6), (x + 0.3, 0.9, 3.0))
+    image, depth = cast(ROOM, camera)
+    _, nearest = cast(Room(boxes=(*ROOM.boxes, box)), camera)
+    red = nearest < depth - 1e-3
+    points = unproject(nearest, camera) - torch.tensor([x, 0.0, 0.0])
+    colour = texture(points) * torch.tensor([1.0, 0.15, 0.15]) + torch.tensor([0.2, 0.0, 0.0])
+    shown = torch.where(red[..., None], colour.clamp(0, 1), image)
+    return View(shown, camera, depth=depth), red
+
+
+def photographed() -> tuple[list[View], list[Bool[Tensor, "h w"]]]:
+    views, reds = zip(*map(with_something_red, CAMERAS, PLACES), strict=True)
+    return list(views), list(reds)
+
+
+@cache
+def beginning(min_difference: float | None) -> Completion:
+    """The scene of these photographs, as it is without targets."""
+    config = CompleterConfig(contradiction=ContradictionConfig(min_difference))
+    return GSCompleter(config=config).begin(photographed()[0])
+
+
+def carried(mask: Bool[Tensor, "h w"], at: Camera, view: View) -> Bool[Tensor, "h w"]:
+    """Where a mask over the image of another camera lies in a view of the room."""
+    assert view.depth is not None
+    pixels, _ = project(unproject(view.depth, view.camera), at)
+    return sample(mask[..., None].float(), pixels)[..., 0] > 0.5
+
+
+def as_seen(views: list[View]) -> list[Render]:
+    """What Ψ makes of them at best: the room, where nothing moved."""
+    return [Render(v.image, v.depth, torch.ones_like(v.depth)) for v in views]
+
+
+def is_red(colours: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
+    return colours[..., 0] > 2.2 * colours[..., 1:].amax(dim=-1) + 0.05
+
+
+def test_what_moved_is_found_in_both_photographs():
+    views, reds = photographed()
+    begun = beginning(0.12)
+    for k, (view, red) in enumerate(zip(begun.views, reds, strict=True)):
+        assert view.contradicted is not None
+        found, other = view.contradicted, 1 - k
+        here = red | carried(reds[other], CAMERAS[other], views[k])
+        assert (found & red).sum() >= 0.8 * red.sum()
+        assert (found & here).sum() >= 0.8 * here.sum()
+        assert (found & here).sum() >= 0.7 * found.sum()
+
+
+def test_a_room_in_which_nothing_moved_is_trusted():
+    cameras = (camera_at(-0.1, size=SIZE), camera_at(0.2, size=SIZE))
+    begun = GSCompleter().begin([view_of(Room(), camera) for camera in cameras])
+    assert all((~view.trusted).float().mean() <= 0.005 for view in begun.views)
+
+
+def test_exposure_is_no_contradiction():
+    views = [view_of(ROOM, camera) for camera in CAMERAS]
+    darker = View(0.6 * views[1].image, CAMERAS[1], depth=views[1].depth)
+    pair = [views[0], darker]
+    assert not any(mask.any() for mask in contradicted(pair, as_seen(pair)))
+
+
+def test_of_three_photographs_most_decide():
+    """Two see the wall, where something red stands before it in the first."""
+    third = camera_at(-0.3, -0.15, size=SIZE)
+    red_view, red = with_something_red(CAMERAS[0], PLACES[0])
+    views = [red_view, view_of(ROOM, CAMERAS[1]), view_of(ROOM, third)]
+    first, second, last = contradicted(views, as_seen(views))
+    assert (first & red).sum() >= 0.8 * red.sum()
+    for mask, view in zip((second, last), views[1:], strict=True):
+        behind = carried(red, CAMERAS[0], view)
+        assert (mask & behind).sum() <= 0.2 * behind.sum()
+    both = contradicted(views[:2], as_seen(views[:2]))
+    behind = carried(red, CAMERAS[0], views[1])
+    assert (both[1] & behind).sum() >= 0.8 * behind.sum()
+
+
+def completed(min_difference: float | None) -> TargetCompletion:
+    """A hole behind what stands in front, beside something red, from farther to the left."""
+    target, begun = camera_at(-0.4, -0.1, size=SIZE), beginning(min_difference)
+    return GSCompleter().advance(begun, target).targets[0]
+
+
+def test_holes_are_not_painted_with_what_moved():
+    wary, credulous = completed(0.12), completed(None)
+    assert wary.reference is not None
+    assert credulous.reference is not None
+    truth = is_red(cast(ROOM, wary.target)[0])
+
+    def reds(result: TargetCompletion, image: Float[Tensor, "h w 3"]) -> float:
+        return (is_red(image) & ~truth)[result.hole_mask].float().mean().item()
+
+    assert reds(credulous, credulous.reference.image) > 0.1
+    assert reds(credulous, credulous.after.image) > 0.1
+    assert reds(wary, wary.reference.image) < 0.3 * reds(credulous, credulous.reference.image)
+    assert reds(wary, wary.after.image) < 0.3 * reds(credulous, credulous.after.image)
+
+
+def test_the_context_stays_as_it_is():
+    with_check, without = beginning(0.12), beginning(None)
+    assert torch.equal(with_check.context.means, without.context.means)
+    assert torch.equal(with_check.context.sh, without.context.sh)
+    assert with_check.allowed_errors == without.allowed_errors
+    assert all(view.contradicted is None for view in without.views)
+    assert CompleterConfig.paper().contradiction.min_difference is None
