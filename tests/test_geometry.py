@@ -13,6 +13,7 @@ from gscompleter.geometry import (
     project,
     quats_from,
     quats_product,
+    reaching,
     rotation_about,
     rotation_between,
     rotations_from,
@@ -21,7 +22,8 @@ from gscompleter.geometry import (
     share_of_turn,
     unproject,
 )
-from scenes import Room, camera_at, cast
+from gscompleter.render import load_renderer
+from scenes import Room, camera_at, cast, random_gaussians
 
 
 def test_a_point_behind_a_pixel_projects_to_that_pixels_centre():
@@ -126,3 +128,19 @@ def test_of_the_two_ways_to_turn_the_shorter_one_is_shared():
     turn = rotation_about(down, math.radians(270))
     expected = rotation_about(down, -math.radians(45))
     assert torch.allclose(share_of_turn(turn, 0.5), expected, atol=1e-6)
+
+
+def test_what_a_camera_sees_within_a_mask_reaches_it():
+    """Large and small Gaussians around a camera, each of them opaque and drawn by itself."""
+    camera, mask = camera_at(size=32), torch.zeros(32, 32, dtype=torch.bool)
+    mask[4:9, 20:30] = True
+    gaussians = random_gaussians(120, seed=3)
+    gaussians.scales[::3] *= 8
+    gaussians.means[::4, 0] += 1.5
+    gaussians.opacities[:] = 1
+    render = load_renderer("cpu").render
+    alone = [render(gaussians[k : k + 1], camera).alpha for k in range(len(gaussians))]
+    seen = torch.stack([(alpha > 0)[mask].any() for alpha in alone])
+    found = reaching(gaussians, camera, mask)
+    assert (found | ~seen).all()
+    assert 10 < seen.sum() <= found.sum() < len(gaussians) / 2

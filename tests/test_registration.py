@@ -10,7 +10,7 @@ from gscompleter.geometry import project, slide
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.reference import ReferenceView
-from gscompleter.stages.registration import apply_affine, register
+from gscompleter.stages.registration import Objective, apply_affine, register
 from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
@@ -136,6 +136,51 @@ def test_what_is_fixed_while_candidates_slide_changes_no_loss(config, bound):
     if bound < 1e-4:
         assert_close(ours.gaussians.means, plain.gaussians.means, "means", 1e-4)
         assert_close(ours.gaussians.scales, plain.gaussians.scales, "scales", 1e-4)
+
+
+@pytest.mark.parametrize("config", [RegistrationConfig(), PAPER], ids=["ours", "paper"])
+def test_only_candidates_that_reach_what_is_compared_are_drawn(config, monkeypatch):
+    """Neither camera of a room of which only a corner is known compares what lies elsewhere. The
+    result has the bytes of a run that draws all candidates."""
+    drawn = []
+
+    @dataclass(frozen=True)
+    class Counting(CpuRenderer):
+        def render(self, gaussians, camera):
+            drawn.append(len(gaussians))
+            return super().render(gaussians, camera)
+
+    def registered_to_a_corner():
+        reference, anchor = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
+        pixels = torch.arange(SIZE * SIZE).view(SIZE, SIZE)[: SIZE // 4, : SIZE // 4].flatten()
+        corner, drawn[:] = gaussians_of(anchor)[pixels], []
+        lift = lifted(reference, anchor, bumpy())
+        scene = CPU.freeze(corner, TARGET), CPU.render(corner, ANCHOR)
+        generator = torch.Generator().manual_seed(0)
+        return register(lift, *scene, reference, ANCHOR, Counting(), generator, config)
+
+    fewer = registered_to_a_corner()
+    # The paper's loss of colour looks at all of the target.
+    assert 0 < max(drawn) <= (SIZE**2 if config.rgb_weight > 0 else 0.3 * SIZE**2)
+    monkeypatch.setattr(
+        Objective, "reached_by", lambda _, candidates, *__: torch.ones(len(candidates)) > 0
+    )
+    every = registered_to_a_corner()
+    assert max(drawn) == SIZE**2
+    assert fewer.losses == every.losses
+    assert torch.equal(fewer.gaussians.means, every.gaussians.means)
+    assert torch.equal(fewer.gaussians.scales, every.gaussians.scales)
+
+
+def test_where_nothing_is_compared_candidates_stay():
+    reference, anchor = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
+    nothing = gaussians_of(anchor)[:0]
+    lift, scene = lifted(reference, anchor, 1.0), CPU.freeze(nothing, TARGET)
+    generator = torch.Generator().manual_seed(0)
+    at_anchor = CPU.render(nothing, ANCHOR)
+    result = register(lift, scene, at_anchor, reference, ANCHOR, CPU, generator)
+    assert_close(result.gaussians.means, lift.gaussians.means, "means", 1e-6)
+    assert set(result.losses) == {0.0}
 
 
 def test_free_motion_leaves_the_pixels():

@@ -26,6 +26,8 @@ PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 ROUNDING = 1e-5
 """Largest difference of drawings and of gradients, of the largest value. At most 5.1e-6 was
 measured, and 6.4e-6 with kernels compiled without fused multiplications."""
+FOLDED = 3e-4
+"""The same of what is drawn of fragments: a pixel may be closed a few faint splats later."""
 
 
 def in_dtype(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
@@ -207,6 +209,13 @@ def test_a_frozen_view_keeps_no_splat_that_no_tile_draws():
     assert_same_drawing(frozen.context, CPU.render(opaque, CAMERA))
 
 
+def test_tiles_find_their_splats_in_the_order_in_which_they_name_them():
+    context, _ = context_and_new()
+    frozen = CPU.freeze(context[torch.randperm(len(context))], CAMERA)
+    seen = dict.fromkeys(frozen.layer.entries.tolist())
+    assert list(seen) == list(range(len(frozen.layer.splats)))
+
+
 def test_only_tiles_that_something_new_touches_are_drawn(monkeypatch):
     """Of the nine tiles the new Gaussian lies within one, forward and backward."""
     drawn = count_tiles(monkeypatch)
@@ -303,6 +312,63 @@ def test_a_plan_of_colours_is_the_composite_in_these_colours():
         )
         assert_same_drawing(planned, truth)
         assert_close(slope, expected, "slope of colours")
+
+
+@pytest.mark.parametrize("name", ["random", "harmonics", "room"])
+def test_a_plan_of_appearances_is_the_composite_that_looks_like_this(name):
+    """In front of the context, within it and behind it; to what a closed pixel may be off by."""
+    _, new = context_and_new()
+    frozen = CPU.freeze(SCENES[name], CAMERA)
+    plan, generator = frozen.plan_appearance(new), torch.Generator().manual_seed(0)
+    for share in (1.0, 0.5, 0.1):
+        leaves = {
+            "opacities": share * new.opacities,
+            "sh": torch.randn(len(new), 4, 3, generator=generator),
+        }
+        planned, slopes = image_gradients(plan, leaves)
+        truth, expected = image_gradients(
+            lambda opacities, sh: frozen.composite(replace(new, opacities=opacities, sh=sh)).image,
+            leaves,
+        )
+        assert_close(planned, truth, "image", FOLDED)
+        assert_close(slopes["opacities"], expected["opacities"], "slope of opacities", 10 * FOLDED)
+        assert_close(slopes["sh"], expected["sh"], "slope of harmonics", FOLDED)
+
+
+def image_gradients(function, values: dict[str, torch.Tensor]):
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    image = function(**leaves)
+    weight = torch.linspace(0, 1, image.numel()).view_as(image)
+    slopes = torch.autograd.grad((image * weight).sum(), list(leaves.values()))
+    return image.detach(), dict(zip(leaves, slopes, strict=True))
+
+
+def test_what_is_closed_by_something_solid_is_closed_at_the_same_splat():
+    """A wall behind a wall behind a wall, of which a pixel drops the very one that closes it."""
+    wall = gaussians_of(view_of(Room(), camera_at(size=64)))
+    context = merge([placed(wall, 1.0), placed(wall, 1.02)])
+    frozen, new = CPU.freeze(context, CAMERA), merge([placed(wall, 0.98), placed(wall, 1.01)])
+    for opacity in (0.3, 0.9, 0.97):
+        opacities = torch.full((len(new),), opacity)
+        planned = frozen.plan_appearance(new)(opacities, new.sh)
+        truth = frozen.composite(replace(new, opacities=opacities)).image
+        assert_close(planned, truth, "image", FOLDED)
+
+
+def placed(gaussians: Gaussians, share: float) -> Gaussians:
+    """The Gaussians at a share of their distance from the world's origin."""
+    return replace(gaussians, means=share * gaussians.means)
+
+
+def test_what_looks_otherwise_costs_what_is_new_however_much_is_frozen():
+    """Faint splats all over the image: ten times as many of them leave the fragments as many."""
+    _, new = context_and_new()
+    few, many = (random_gaussians(count, seed=7) for count in (200, 2000))
+    counts = []
+    for context in (few, many):
+        faint = replace(context, opacities=0.02 * context.opacities)
+        counts.append(len(CPU.freeze(faint, CAMERA).plan_appearance(new).fragments.pixels))
+    assert counts[0] == counts[1] > 0
 
 
 def masked(render: Render, where: torch.Tensor) -> Render:

@@ -9,8 +9,13 @@ from typing import Literal
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gscompleter.types import Camera, Gaussians, Window
+
+FOOTPRINT = 3.4
+"""Standard deviations from its centre within which a Gaussian is drawn: beyond sqrt(2 log 255) the
+alpha of the most opaque is below 1/255."""
 
 
 def unproject(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w 3"]:
@@ -71,6 +76,26 @@ def slide(
     means = camera.center + ratio[:, None] * (gaussians.means - camera.center)
     scales = gaussians.scales * ratio[:, None] if footprint == "constant" else gaussians.scales
     return replace(gaussians, means=means, scales=scales, encoded=None)
+
+
+def reaching(gaussians: Gaussians, camera: Camera, where: Bool[Tensor, "h w"]) -> Bool[Tensor, "n"]:
+    """Which Gaussians `camera` may see at pixels `where` it is asked for; at least those it does.
+
+    Each is taken for the square about its widest footprint that is drawn (`FOOTPRINT`), in which
+    pixels are counted by sums over the rectangles from the corner of the image.
+    """
+    pixels, z = project(gaussians.means, camera)
+    size = torch.tensor([camera.width, camera.height], device=pixels.device)
+    K = camera.K.to(pixels.device)
+    centre, focal = K[:2, 2], K.diagonal()[:2]
+    tangents = (torch.maximum(centre, size - centre) + 0.15 * size) / focal
+    stretch = (focal * (1 + tangents**2).sqrt()).max()
+    radius = FOOTPRINT * (stretch * gaussians.scales.amax(dim=1) / z.clamp_min(1e-12) + 1)
+    corners = torch.stack([pixels - radius[:, None], pixels + radius[:, None] + 1])
+    (left, top), (right, bottom) = (c.unbind(-1) for c in corners.minimum(size).clamp_min(0).long())
+    sums = pad(where.long().cumsum(0).cumsum(1), (1, 0, 1, 0))
+    count = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    return (z > 0) & (count > 0)
 
 
 def at_depths(gaussians: Gaussians, camera: Camera, depths: Float[Tensor, "n"]) -> Gaussians:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, conv2d, interpolate, pad
+from torch.nn.functional import avg_pool2d, interpolate, pad
 
 
 def fill_smoothly(
@@ -17,12 +17,19 @@ def fill_smoothly(
     membrane that is clamped to what is known.
     """
     weight = known.to(values.dtype)
-    filled = push_pull(values[..., None], weight)[None, None, ..., 0]
-    kernel = values.new_tensor([[0, 1, 0], [1, 0, 1], [0, 1, 0]])[None, None] / 4
+    filled = push_pull(values[..., None], weight)[..., 0]
     for _ in range(num_relaxations):
-        around = conv2d(pad(filled, (1, 1, 1, 1), mode="replicate"), kernel)
-        filled = torch.where(known, values, around)
-    return filled[0, 0]
+        filled = torch.where(known, values, mean_of_neighbours(filled))
+    return filled
+
+
+def mean_of_neighbours(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """The mean of the four pixels around each; the border is extended."""
+    padded = pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    total = padded[:-2, 1:-1] + padded[2:, 1:-1]
+    total += padded[1:-1, :-2]
+    total += padded[1:-1, 2:]
+    return total.div_(4)
 
 
 def push_pull(

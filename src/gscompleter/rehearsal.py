@@ -57,6 +57,8 @@ def render_with(renderer: str) -> None:
     moved = observed(means, gaussians.quats, gaussians.scales, opacities, gaussians.sh)
     frozen.composite(moved).image.sum().backward()
     frozen.plan(gaussians)(opacities).image.sum().backward()
+    sh = gaussians.sh.clone().requires_grad_()
+    frozen.plan_appearance(gaussians)(opacities, sh).sum().backward()
     colours = torch.rand(len(gaussians), 3, requires_grad=True)
     frozen.plan_colours(gaussians)(colours).image.sum().backward()
     depths = torch.full((len(gaussians),), DEPTH, requires_grad=True)

@@ -7,7 +7,8 @@ LLVM does not find these vectors by itself, so the loop over the rows is written
 (the intrinsics below); it turns them into whatever the processor has.
 
 Two lists are walked at once, merged by depth: `context`, which is frozen and gets no gradient, and
-`new`, which does. Drawing a single scene leaves the context empty.
+`new`, which does. Drawing a single scene leaves the context empty. Where new splats keep their
+place and change but their looks, the context is folded into their pixels once (`Fragments`).
 
 Every kernel works on a range (begin, end) of its elements, writes to its own part of the outputs
 and releases the interpreter lock: the caller shares ranges among threads, and the result does not
@@ -38,6 +39,9 @@ TANGENT_MARGIN = np.float32(0.15)
 MIN_ALPHA = np.float32(1 / 255)
 MAX_ALPHA = np.float32(0.999)
 MIN_TRANSMITTANCE = np.float32(1e-4)
+SOLID = np.float32(0.5)
+"""Alpha above which a frozen splat is not folded with others. Where a pixel is closed among what is
+folded, its colour is off by at most `MIN_TRANSMITTANCE / SOLID`."""
 
 X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
 """Columns of the splats."""
@@ -801,6 +805,23 @@ def fill_entries(
                     slot += 1
 
 
+@njit(cache=True, nogil=True)
+def number_by_use(entries, count):
+    """The splats 0..count that are named by `entries` [e] int32, in the order in which they are
+    named first [m] int32, and the entries as places in that order [e] int32."""
+    numbers = np.full(count, -1, np.int32)
+    order, renamed = np.empty(count, np.int32), np.empty_like(entries)
+    used = 0
+    for place in range(len(entries)):
+        i = entries[place]
+        if numbers[i] < 0:
+            numbers[i] = used
+            order[used] = i
+            used += 1
+        renamed[place] = numbers[i]
+    return order[:used], renamed
+
+
 @njit(cache=True)
 def _depth_at(splats, entries, place, begin, end, beyond):
     """Depth of an entry, or `beyond` where the place lies outside of begin..end."""
@@ -1182,3 +1203,351 @@ def project_backward(
         d_means[i, 0] = d_x + (d_dx - direction_x * radial) * inverse_distance
         d_means[i, 1] = d_y + (d_dy - direction_y * radial) * inverse_distance
         d_means[i, 2] = d_z + (d_dz - direction_z * radial) * inverse_distance
+
+
+# ---- Fragments: new splats that keep their place, in a frozen layer that is folded once --------
+
+
+class Fragments(NamedTuple):
+    """The pixels of new splats, tile by tile and in each front to back.
+
+    All that is frozen between two fragments of a pixel is folded into one transmittance and one
+    colour. Frozen splats that are `SOLID` have fragments of their own where anything new is before
+    them, so that a pixel is closed at the very splat at which `composite` closes it.
+    """
+
+    tiles: np.ndarray
+    """The tiles that have any [t] int64."""
+    entry_start: np.ndarray
+    """Where the entries of each of these start [t + 1] int64."""
+    names: np.ndarray
+    """Which new splat each entry is, or the complement of which frozen one [e] int32."""
+    slots: np.ndarray
+    """Where the gradient of each entry goes; -1 for a frozen one [e] int32."""
+    start: np.ndarray
+    """Where the fragments of each entry start [e + 1] int64."""
+    pixels: np.ndarray
+    """Pixel of each fragment within its tile, row by row [f] uint8."""
+    falloffs: np.ndarray
+    """Its alpha at opacity 1, of a frozen one its alpha [f] float32."""
+    before: np.ndarray
+    """Transmittance, and colour, of what is folded between it and the one before [f, 4] float32."""
+    behind: np.ndarray
+    """Colour of what is folded behind the last one of each pixel [h, w, 3] float32."""
+
+
+@njit(cache=True, fastmath={"contract"})
+def _within(boxes, i, left, top):
+    """Columns and rows that splat i may touch of the tile at (left, top): x from, x to, y from,
+    y to (excluded)."""
+    return (
+        max(np.int64(boxes[i, 0]) - left, 0),
+        min(np.int64(boxes[i, 1]) - left, TILE),
+        max(np.int64(boxes[i, 2]) - top, 0),
+        min(np.int64(boxes[i, 3]) - top, TILE),
+    )
+
+
+@njit(cache=True, nogil=True)
+def bound_fragments(begin, end, tiles, tiles_x, context, new, bounds):
+    """The most entries and fragments that each of tiles[begin:end] can have.
+
+    context, new: Layer. bounds [t, 2] int64 is written.
+    """
+    _, c_opacities, c_boxes, c_start, c_entries = context
+    _, _, n_boxes, n_start, n_entries = new
+    for index in range(begin, end):
+        tile = tiles[index]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        entries = fragments = 0
+        for place in range(n_start[tile], n_start[tile + 1]):
+            x_from, x_to, y_from, y_to = _within(n_boxes, n_entries[place], left, top)
+            entries += 1
+            fragments += (x_to - x_from) * (y_to - y_from)
+        for place in range(c_start[tile], c_start[tile + 1]):
+            if c_opacities[c_entries[place]] > SOLID:
+                x_from, x_to, y_from, y_to = _within(c_boxes, c_entries[place], left, top)
+                entries += 1
+                fragments += (x_to - x_from) * (y_to - y_from)
+        bounds[index, 0], bounds[index, 1] = entries, fragments
+
+
+@njit(cache=True, fastmath={"contract"})
+def _covered(pixel, alpha, red, green, blue):
+    """A pixel (its transmittance, which gets a minus where nothing more passes, and its colour)
+    with a splat behind what it shows."""
+    transmittance = pixel[0]
+    after = transmittance * (np.float32(1) - alpha)
+    if after <= MIN_TRANSMITTANCE:
+        return -transmittance, pixel[1], pixel[2], pixel[3]
+    weight = transmittance * alpha
+    return after, pixel[1] + weight * red, pixel[2] + weight * green, pixel[3] + weight * blue
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def find_fragments(begin, end, context, new, new_slots, room, found, counts):
+    """Find the fragments in tiles[begin:end] of two layers, and fold what is frozen.
+
+    context, new: Layer; the opacities of `new` are 1. new_slots [entries] int32: their slots.
+    room [t + 1, 2] int64: where each tile has room in `found` for entries and fragments.
+    found: Fragments, which are written there. counts [t, 2] int64: how many each tile has.
+    """
+    c_splats, c_opacities, c_boxes, c_start, c_entries = context
+    n_splats, n_opacities, n_boxes, n_start, n_entries = new
+    tiles, _, names, slots, starts, pixels, falloffs, before, behind = found
+    height, width, _ = behind.shape
+    tiles_x = (width + TILE - 1) // TILE
+    state = _aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
+    # What `state` was at the last fragment of each pixel, and whether anything new was before
+    known = np.empty((TILE, 4, TILE), np.float32)
+    veiled = np.empty((TILE, TILE), np.bool_)
+    last = np.empty((TILE, TILE), np.int32)
+    row_limit = np.empty(TILE, np.int32)
+    infinity, one, position = np.float32(np.inf), np.float32(1), np.int32(0)
+    for index in range(begin, end):
+        tile = tiles[index]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        rows, columns = min(TILE, height - top), min(TILE, width - left)
+        state[:] = 0
+        state[:, 0, :columns] = 1
+        state[:, 0, columns:] = -1
+        known[:] = 0
+        known[:, 0] = 1
+        veiled[:] = False
+        row_limit[:] = np.iinfo(np.int32).max
+        open_rows = rows
+
+        entry, place = room[index]
+        c_begin, c_end = c_start[tile], c_start[tile + 1]
+        n_begin, n_end = n_start[tile], n_start[tile + 1]
+        c, n = c_begin, n_begin
+        c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
+        n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+        while open_rows > 0 and (c < c_end or n < n_end):
+            frozen = c_depth <= n_depth
+            if frozen:
+                i = c_entries[c]
+                first, stop, splat = _placed(c_splats, c_opacities, c_boxes, i, left, top)
+                x_from, x_to, y_from, y_to = _within(c_boxes, i, left, top)
+                c += 1
+                c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
+                if c_opacities[i] <= SOLID:
+                    open_rows -= _draw_rows(first, stop, position, state, last, row_limit, splat)
+                    continue
+                names[entry], slots[entry] = ~i, -1
+            else:
+                i = n_entries[n]
+                _, _, splat = _placed(n_splats, n_opacities, n_boxes, i, left, top)
+                x_from, x_to, y_from, y_to = _within(n_boxes, i, left, top)
+                names[entry], slots[entry] = i, new_slots[n]
+                n += 1
+                n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+
+            begun = place
+            x, y, u, v, w, opacity, red, green, blue, _ = splat
+            for row in range(y_from, y_to):
+                if row_limit[row] < 0:
+                    continue
+                dy = np.float32(row) - y
+                t = w * dy
+                for column in range(x_from, x_to):
+                    if state[row, 0, column] < 0:
+                        continue
+                    s = u * (np.float32(column) - x) + v * dy
+                    falloff = opacity * math.exp(-(s * s + t * t))
+                    # Written so that NaN fails it.
+                    if not falloff >= MIN_ALPHA:
+                        continue
+                    alpha = min(falloff, MAX_ALPHA)
+                    own = not frozen or (alpha > SOLID and veiled[row, column])
+                    if own:
+                        veiled[row, column] = True
+                        inverse = one / known[row, 0, column]
+                        pixels[place] = np.uint8(row * TILE + column)
+                        falloffs[place] = falloff
+                        before[place, 0] = state[row, 0, column] * inverse
+                        for channel in range(1, 4):
+                            rest = state[row, channel, column] - known[row, channel, column]
+                            before[place, channel] = rest * inverse
+                        place += 1
+                    if frozen:
+                        pixel = (
+                            state[row, 0, column],
+                            state[row, 1, column],
+                            state[row, 2, column],
+                            state[row, 3, column],
+                        )
+                        pixel = _covered(pixel, alpha, red, green, blue)
+                        for channel in range(4):
+                            state[row, channel, column] = pixel[channel]
+                    if own:
+                        known[row, 0, column] = abs(state[row, 0, column])
+                        for channel in range(1, 4):
+                            known[row, channel, column] = state[row, channel, column]
+            if place > begun:
+                starts[entry] = begun
+                entry += 1
+
+        counts[index, 0], counts[index, 1] = entry - room[index, 0], place - room[index, 1]
+        for row in range(rows):
+            for column in range(columns):
+                inverse = one / known[row, 0, column]
+                for channel in range(3):
+                    rest = state[row, 1 + channel, column] - known[row, 1 + channel, column]
+                    behind[top + row, left + column, channel] = rest * inverse
+
+
+@njit(cache=True, fastmath={"contract"})
+def _looks(name, opacities, colours, frozen):
+    """Opacity and colour of an entry of `Fragments`; of a frozen one falloffs are alphas."""
+    if name >= 0:
+        return opacities[name], colours[name, 0], colours[name, 1], colours[name, 2]
+    return np.float32(1), frozen[~name, RED], frozen[~name, GREEN], frozen[~name, BLUE]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def draw_fragments(begin, end, fragments, frozen, opacities, colours, image):
+    """Draw the tiles begin..end of those that have fragments.
+
+    fragments: Fragments. frozen: splats of the context. opacities [n], colours [n, 3] float32: of
+        the new splats. image [h, w, 3] float32 is written in these tiles.
+    """
+    tiles, entry_start, names, _, starts, pixels, falloffs, before, behind = fragments
+    height, width, _ = behind.shape
+    tiles_x = (width + TILE - 1) // TILE
+    # Transmittance, 0 where nothing more passes, and colour
+    state = np.empty((TILE * TILE, 4), np.float32)
+    zero, one = np.float32(0), np.float32(1)
+    for index in range(begin, end):
+        tile = tiles[index]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        state[:] = 0
+        state[:, 0] = 1
+        for entry in range(entry_start[index], entry_start[index + 1]):
+            opacity, red, green, blue = _looks(names[entry], opacities, colours, frozen)
+            for place in range(starts[entry], starts[entry + 1]):
+                pixel = pixels[place]
+                transmittance = state[pixel, 0]
+                if transmittance <= zero:
+                    continue
+                for channel in range(1, 4):
+                    state[pixel, channel] += transmittance * before[place, channel]
+                transmittance *= before[place, 0]
+                raw = opacity * falloffs[place]
+                alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
+                after = transmittance * (one - alpha)
+                if after <= MIN_TRANSMITTANCE:
+                    state[pixel, 0] = zero
+                    continue
+                weight = transmittance * alpha
+                state[pixel, 0] = after
+                state[pixel, 1] += weight * red
+                state[pixel, 2] += weight * green
+                state[pixel, 3] += weight * blue
+        for row in range(min(TILE, height - top)):
+            for column in range(min(TILE, width - left)):
+                y, x, pixel = top + row, left + column, row * TILE + column
+                for channel in range(3):
+                    rest = state[pixel, 0] * behind[y, x, channel]
+                    image[y, x, channel] = state[pixel, 1 + channel] + rest
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def draw_fragments_backward(
+    begin, end, fragments, frozen, opacities, colours, image, d_image, gradients, written
+):
+    """Gradients of the new entries in the tiles begin..end from those of the image [h, w, 3].
+
+    It walks front to back like `draw_fragments`, whose arguments and image it takes: what is behind
+    a fragment is the image less what is before.
+
+    gradients [slots, 4] float32: of opacity, red, green and blue. written [slots] bool: set for the
+        slots, and only those, that receive a gradient.
+    """
+    tiles, entry_start, names, slots, starts, pixels, falloffs, before, behind = fragments
+    height, width, _ = behind.shape
+    tiles_x = (width + TILE - 1) // TILE
+    # Transmittance, colour times slope of what is behind, and the slopes of the three colours
+    state = np.empty((TILE * TILE, 5), np.float32)
+    zero, one = np.float32(0), np.float32(1)
+    for index in range(begin, end):
+        tile = tiles[index]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        for row in range(min(TILE, height - top)):
+            for column in range(min(TILE, width - left)):
+                y, x, pixel = top + row, left + column, row * TILE + column
+                state[pixel, 0], state[pixel, 1] = one, zero
+                for channel in range(3):
+                    state[pixel, 1] += d_image[y, x, channel] * image[y, x, channel]
+                    state[pixel, 2 + channel] = d_image[y, x, channel]
+        for entry in range(entry_start[index], entry_start[index + 1]):
+            opacity, red, green, blue = _looks(names[entry], opacities, colours, frozen)
+            d_opacity = d_red = d_green = d_blue = zero
+            for place in range(starts[entry], starts[entry + 1]):
+                pixel = pixels[place]
+                transmittance = state[pixel, 0]
+                if transmittance <= zero:
+                    continue
+                slope_red, slope_green = state[pixel, 2], state[pixel, 3]
+                slope_blue = state[pixel, 4]
+                folded = before[place, 1] * slope_red + before[place, 2] * slope_green
+                folded += before[place, 3] * slope_blue
+                rest = state[pixel, 1] - transmittance * folded
+                transmittance *= before[place, 0]
+                raw = opacity * falloffs[place]
+                alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
+                after = transmittance * (one - alpha)
+                if after <= MIN_TRANSMITTANCE:
+                    state[pixel, 0] = zero
+                    continue
+                weight = transmittance * alpha
+                value = red * slope_red + green * slope_green + blue * slope_blue
+                rest -= weight * value
+                state[pixel, 0], state[pixel, 1] = after, rest
+                d_red += weight * slope_red
+                d_green += weight * slope_green
+                d_blue += weight * slope_blue
+                if alpha == raw:
+                    d_opacity += falloffs[place] * (transmittance * value - rest / (one - alpha))
+            if slots[entry] >= 0:
+                slot = slots[entry]
+                written[slot] = True
+                gradients[slot, 0], gradients[slot, 1] = d_opacity, d_red
+                gradients[slot, 2], gradients[slot, 3] = d_green, d_blue
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def shade(begin, end, rows, center, means, sh, colours):
+    """Colours of the Gaussians rows[begin:end] as seen from `center`, from 0 up.
+
+    means [n, 3], sh [n, k, 3]. colours [n, 3] float32 is written.
+    """
+    basis = np.empty(sh.shape[1], np.float32)
+    half, zero = np.float32(0.5), np.float32(0)
+    for index in range(begin, end):
+        i = rows[index]
+        x, y, z, _ = _direction(center, means, i)
+        _evaluate_basis(x, y, z, basis)
+        for channel in range(3):
+            colour = half
+            for k in range(len(basis)):
+                colour += basis[k] * sh[i, k, channel]
+            colours[i, channel] = max(colour, zero)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def shade_backward(begin, end, rows, center, means, colours, d_colours, d_sh):
+    """Gradients of spherical harmonics from those of colours, of the Gaussians rows[begin:end].
+
+    colours [n, 3]: as `shade` left them; what is cut off at 0 has no gradient. d_sh [n, k, 3]
+    float32 is written.
+    """
+    basis = np.empty(d_sh.shape[1], np.float32)
+    for index in range(begin, end):
+        i = rows[index]
+        x, y, z, _ = _direction(center, means, i)
+        _evaluate_basis(x, y, z, basis)
+        for channel in range(3):
+            slope = d_colours[i, channel] if colours[i, channel] > 0 else np.float32(0)
+            for k in range(len(basis)):
+                d_sh[i, k, channel] = slope * basis[k]

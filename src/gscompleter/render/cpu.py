@@ -22,6 +22,7 @@ from gscompleter.kernels import rasterizer
 from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
 from gscompleter.kernels.sharing import ranges, run, share
 from gscompleter.render import ColourRender, DepthRender, OpacityRender
+from gscompleter.render.folded import Folded, folded
 from gscompleter.types import Camera, Gaussians, Render
 
 MAX_SIDE = TILE * np.iinfo(np.int16).max
@@ -76,7 +77,7 @@ class CpuView:
 
     def extended(self, new: Gaussians) -> CpuView:
         """The same as freezing context and `new` together, in that order."""
-        added = self.viewpoint.bin(arrays_of(new), self.depth_limits).layer
+        added, order = by_use(self.viewpoint.bin(arrays_of(new), self.depth_limits).layer)
         count = self.count + len(new)
         if len(added.entries) == 0:
             return replace(self, count=count)
@@ -90,7 +91,7 @@ class CpuView:
         lists = (tile_start, entries, depth_limits)
         self.viewpoint.share(rasterizer.merge_lists, len(used), *walked, *lists)
         layer, kept = joined(self.layer, added, tile_start, entries)
-        rows = np.concatenate([self.rows[kept[0]], kept[1].astype(np.int32) + np.int32(self.count)])
+        rows = np.concatenate([self.rows[kept[0]], order[kept[1]] + np.int32(self.count)])
         frame = frame._replace(used=used)
         return CpuView(self.viewpoint, layer, frame, depth_limits, rows, count)
 
@@ -130,6 +131,12 @@ class CpuView:
             return Render(*_Planned.apply(self, binned, opacities.to("cpu", torch.float32)))
 
         return render
+
+    def plan_appearance(self, new: Gaussians) -> Folded:
+        """Project, sort and bin `new` once, and fold what is frozen around it."""
+        opaque = replace(new, opacities=torch.ones_like(new.opacities))
+        arrays = arrays_of(opaque)
+        return folded(self, self.viewpoint.bin(arrays, self.depth_limits), arrays.means)
 
     def plan_colours(self, new: Gaussians) -> ColourRender:
         """Project, sort and bin `new` once."""
@@ -432,6 +439,15 @@ def pinhole_of(camera: Camera) -> Pinhole:
 def touched(layer: Layer) -> Int64[ndarray, "touched"]:
     """The tiles in which a layer has anything to draw."""
     return np.flatnonzero(np.diff(layer.tile_start))
+
+
+def by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
+    """The layer with its splats in the order in which the tiles name them, those alone, and which
+    they are: a tile then finds its splats near each other in memory, which saves it half of its
+    time where there are a million."""
+    order, entries = rasterizer.number_by_use(layer.entries, len(layer.splats))
+    splats, opacities, boxes = (array.take(order, axis=0) for array in layer[:3])
+    return Layer(splats, opacities, boxes, layer.tile_start, entries), order
 
 
 def joined(

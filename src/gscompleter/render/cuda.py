@@ -16,8 +16,8 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.geometry import at_depths
-from gscompleter.render import ColourRender, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import painted, sums_by_slopes
+from gscompleter.render import AppearanceRender, ColourRender, DepthRender, OpacityRender, Renderer
+from gscompleter.render.painting import looking, painted, sums_by_slopes
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -193,6 +193,10 @@ class CudaView:
         opaque = replace(new, opacities=torch.ones_like(new.opacities))
         render = self.drawing.plan(merge([self.seen, opaque]), self.camera)
         return lambda opacities: render(torch.cat([self.seen.opacities, opacities]))
+
+    def plan_appearance(self, new: Gaussians) -> AppearanceRender:
+        """Context and `new` with other looks, all of it drawn anew."""
+        return lambda opacities, sh: self.composite(looking(new, opacities, sh)).image
 
     def plan_colours(self, new: Gaussians) -> ColourRender:
         """Context and `new` in other colours, all of it drawn anew."""

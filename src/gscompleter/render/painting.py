@@ -17,6 +17,13 @@ def painted(gaussians: Gaussians, colours: Float[Tensor, "n 3"]) -> Gaussians:
     return replace(gaussians, sh=sh_from_rgb(colours), encoded=None)
 
 
+def looking(
+    gaussians: Gaussians, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
+) -> Gaussians:
+    """The Gaussians where they are, with other opacities and spherical harmonics."""
+    return replace(gaussians, opacities=opacities, sh=sh, encoded=None)
+
+
 def sums_by_slopes(
     draw: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]],
     gaussians: Gaussians,

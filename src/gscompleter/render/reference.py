@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from gscompleter.geometry import at_depths, rotations_from
-from gscompleter.render import ColourRender, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import painted, sums_by_slopes
+from gscompleter.render import AppearanceRender, ColourRender, DepthRender, OpacityRender, Renderer
+from gscompleter.render.painting import looking, painted, sums_by_slopes
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -94,6 +94,9 @@ class ReferenceView:
             sh=new.sh.detach(),
         )
         return lambda opacities: self.composite(replace(fixed, opacities=opacities))
+
+    def plan_appearance(self, new: Gaussians) -> AppearanceRender:
+        return lambda opacities, sh: self.composite(looking(new, opacities, sh)).image
 
     def plan_colours(self, new: Gaussians) -> ColourRender:
         return lambda colours: self.composite(painted(new, colours))

@@ -19,8 +19,8 @@ from torch.nn.functional import pad
 from gscompleter.config import ReconcileConfig
 from gscompleter.descent import Adam
 from gscompleter.progress import track
-from gscompleter.render import FrozenView
-from gscompleter.types import SH_C0, Gaussians, Render, View
+from gscompleter.render import AppearanceRender, FrozenView
+from gscompleter.types import SH_C0, Gaussians, View
 
 FAINT = 0.2
 """Share of its opacity with which something new begins. It grows where it is welcome, which harms
@@ -60,14 +60,16 @@ def reconcile(
     if config.iterations == 0 or len(added) == 0:
         return added, ()
     fit = Fit(added, config)
-    before = hole_error(frozen_target.context, reference, holes).clamp_min(1e-12)
-    asked = [Asked(*each) for each in zip(frozen_views, views, allowed_errors, strict=True)]
+    at_target = frozen_target.plan_appearance(added)
+    before = hole_error(frozen_target.context.image, reference, holes).clamp_min(1e-12)
+    plans = [frozen.plan_appearance(added) for frozen in frozen_views]
+    asked = [Asked(*each) for each in zip(plans, views, allowed_errors, strict=True)]
     with torch.no_grad():
         turns = Turns([fit.excess(photograph).item() for photograph in asked])
     weight = config.photograph_weight / config.views_per_step
     losses = []
     for _ in track(range(config.iterations), "Reconciling"):
-        loss = hole_error(fit.drawn(frozen_target), reference, holes) / before
+        loss = hole_error(fit.drawn(at_target), reference, holes) / before
         for over in objections(fit, asked, turns, config.views_per_step):
             loss = loss + weight * over
         fit.step(loss)
@@ -90,8 +92,8 @@ def objections(
 class Asked:
     """A photograph that is asked whether it agrees."""
 
-    frozen: FrozenView
-    """The scene frozen at its camera."""
+    plan: AppearanceRender
+    """What its camera sees of the scene with what is added."""
     view: View
     """The photograph."""
     allowed: float
@@ -109,17 +111,13 @@ class Fit:
             [(self._logits, config.opacity_step), (self._sh, config.colour_step)]
         )
 
-    def gaussians(self) -> Gaussians:
-        """What is added, as it is now; differentiable."""
-        return replace(self._added, opacities=self._logits.sigmoid(), sh=self._sh, encoded=None)
-
-    def drawn(self, frozen: FrozenView) -> Render:
-        """The scene with it."""
-        return frozen.composite(self.gaussians())
+    def drawn(self, plan: AppearanceRender) -> Float[Tensor, "h w 3"]:
+        """The scene with it; differentiable."""
+        return plan(self._logits.sigmoid(), self._sh)
 
     def excess(self, photograph: Asked) -> Float[Tensor, ""]:
         """By how much the error of a photograph is above its goal, relative to what is allowed."""
-        image = photograph.view.compared(self.drawn(photograph.frozen).image)
+        image = photograph.view.compared(self.drawn(photograph.plan))
         error = (image - photograph.view.image).square().mean()
         return (error / max(photograph.allowed, 1e-12) - GOAL).clamp_min(0.0)
 
@@ -130,8 +128,8 @@ class Fit:
 
     def fitted(self) -> Gaussians:
         """What is added, as it was fitted."""
-        now = self.gaussians()
-        return replace(now, opacities=now.opacities.detach(), sh=now.sh.detach())
+        opacities, sh = self._logits.detach().sigmoid(), self._sh.detach()
+        return replace(self._added, opacities=opacities, sh=sh, encoded=None)
 
 
 def widened(sh: Float[Tensor, "n k 3"], count: int) -> Float[Tensor, "n l 3"]:
@@ -166,6 +164,8 @@ def keep_colours(sh: Float[Tensor, "n k 3"]) -> None:
     sh[:, 1:].clamp_(-MAX_BAND, MAX_BAND)
 
 
-def hole_error(drawn: Render, reference: View, holes: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
+def hole_error(
+    image: Float[Tensor, "h w 3"], reference: View, holes: Bool[Tensor, "h w"]
+) -> Float[Tensor, ""]:
     """Mean squared difference from the synthesized image within the holes."""
-    return ((drawn.image - reference.image).square().mean(dim=-1) * holes).mean()
+    return ((image - reference.image).square().mean(dim=-1) * holes).mean()

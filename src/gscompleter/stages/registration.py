@@ -14,7 +14,7 @@ from torch import Tensor
 from gscompleter.config import RegistrationConfig
 from gscompleter.coverage import COVERED
 from gscompleter.descent import Adam
-from gscompleter.geometry import slide, z_depths
+from gscompleter.geometry import reaching, slide, z_depths
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.progress import track
 from gscompleter.render import FrozenView, Renderer
@@ -135,22 +135,30 @@ def register_along_rays(
     renderer: Renderer,
     config: RegistrationConfig,
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """Minimise Eq. 11 over one distance per Gaussian; also returns the loss of each iteration."""
+    """Minimise Eq. 11 over one distance per Gaussian; also returns the loss of each iteration.
+
+    Only what reaches a pixel that the objective looks at is drawn: all else has no slope, so that
+    it never moves, and never gets there.
+    """
     objective = Objective.of(frozen_target.context, at_anchor, reference, anchor, config)
-    alone = drawn_alone(coarse, reference.camera, objective.target_depth.valid, renderer, config)
+    rows = objective.reached_by(coarse, reference.camera, anchor).nonzero()[:, 0]
+    seen = coarse[rows]
+    alone = drawn_alone(seen, reference.camera, objective.target_depth.valid, renderer, config)
     parameters = torch.zeros(
-        (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
+        (len(seen), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )
     optimizer = Adam([(parameters, config.learning_rate)], (config.beta1, config.beta2))
     losses = []
     for iteration in track(range(config.iterations), "Registering"):
         left = 1 - iteration / config.iterations if config.schedule == "falling" else 1.0
-        moved = displace(coarse, parameters, reference.camera, config)
+        moved = displace(seen, parameters, reference.camera, config)
         loss = objective(moved, frozen_target, alone, renderer.render(moved, anchor))
         optimizer.step(loss, left)
         losses.append(loss.item())
     with torch.no_grad():
-        return displace(coarse, parameters.detach(), reference.camera, config), tuple(losses)
+        found = parameters.new_zeros((len(coarse), config.degrees_of_freedom))
+        found[rows] = parameters.detach()
+        return displace(coarse, found, reference.camera, config), tuple(losses)
 
 
 def displace(
@@ -213,6 +221,14 @@ class Objective:
         unit = seen.median().item() if relative else 1.0
         target_depth = surfaces_in(at_target, reference.camera)
         return Objective(target_depth, anchor_depth, reference.image, unit, config)
+
+    def reached_by(self, candidates: Gaussians, target: Camera, anchor: Camera) -> Tensor:
+        """Which candidates the cameras may see at pixels that count in the loss [n]."""
+        counted = self.target_depth.valid
+        if self.config.rgb_weight > 0:
+            counted = torch.ones_like(counted)
+        at_target = reaching(candidates, target, counted)
+        return at_target | reaching(candidates, anchor, self.anchor_depth.valid)
 
     def __call__(
         self,
