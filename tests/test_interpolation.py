@@ -2,7 +2,7 @@
 
 import torch
 
-from gscompleter.interpolation import fill_smoothly
+from gscompleter.interpolation import fill_smoothly, smoothed
 
 
 def test_known_values_stay_and_a_constant_is_continued():
@@ -23,3 +23,18 @@ def test_between_two_known_sides_the_values_lie_between():
 
 def test_nothing_known_is_zero():
     assert (fill_smoothly(torch.ones(5, 7), torch.zeros(5, 7, dtype=torch.bool)) == 0).all()
+
+
+def test_means_are_those_of_the_pixels_of_the_mask_around():
+    values = torch.rand(9, 13, 3, generator=torch.Generator().manual_seed(0))
+    mask = torch.rand(9, 13, generator=torch.Generator().manual_seed(1)) < 0.4
+    found = smoothed(values, mask, 2)
+    compared = 0
+    for y in range(9):
+        for x in range(13):
+            around = slice(max(y - 2, 0), y + 3), slice(max(x - 2, 0), x + 3)
+            if mask[around].any():
+                expected = values[around][mask[around]].mean(dim=0)
+                assert (found[y, x] - expected).abs().max() < 1e-6
+                compared += 1
+    assert compared > 100

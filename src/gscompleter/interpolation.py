@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -65,6 +66,10 @@ def smoothed(
 ) -> Float[Tensor, "h w c"]:
     """Means of `values` over the pixels of `mask` within a square of 2 radius + 1."""
     weight = mask.to(values.dtype)[..., None]
-    layers = torch.cat([values * weight, weight], dim=-1).permute(2, 0, 1)[None]
-    means = avg_pool2d(layers, 2 * radius + 1, 1, radius, count_include_pad=False)[0]
-    return (means[:-1] / means[-1:].clamp_min(1e-8)).permute(1, 2, 0)
+    layers = torch.cat([values * weight, weight], dim=-1)
+    side = 2 * radius + 1
+    sums = cv2.boxFilter(
+        layers.cpu().numpy(), -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    totals = torch.from_numpy(sums).to(values)
+    return totals[..., :-1] / totals[..., -1:].clamp_min(1e-8)

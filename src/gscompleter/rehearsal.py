@@ -57,14 +57,20 @@ def render_with(renderer: str) -> None:
     moved = observed(means, gaussians.quats, gaussians.scales, opacities, gaussians.sh)
     frozen.composite(moved).image.sum().backward()
     frozen.plan(gaussians)(opacities).image.sum().backward()
-    sh = gaussians.sh.clone().requires_grad_()
-    frozen.plan_appearance(gaussians)(opacities, sh).sum().backward()
     colours = torch.rand(len(gaussians), 3, requires_grad=True)
     frozen.plan_colours(gaussians)(colours).image.sum().backward()
     depths = torch.full((len(gaussians),), DEPTH, requires_grad=True)
     everywhere = torch.ones(SIDE, SIDE, dtype=torch.bool)
     frozen.plan_depths(gaussians, everywhere)(depths).depth.sum().backward()
     frozen.extended(gaussians)
+
+
+def fold_brought(_: str) -> None:
+    """Fit the looks of Gaussians to a scene that was brought."""
+    gaussians = some_gaussians()
+    looks = gaussians.opacities.clone().requires_grad_(), gaussians.sh.clone().requires_grad_()
+    frozen = load_renderer("cpu").freeze(gaussians, camera_at(0))
+    frozen.plan_appearance(gaussians)(*looks).sum().backward()
 
 
 def some_gaussians() -> Gaussians:
@@ -90,10 +96,13 @@ def synthesize_with(generator: str) -> None:
     load_generator(generator).synthesize([Request(views[1], camera_at(2), context)])
 
 
+BROUGHT = "brought"
+"""The part that only scenes need that are brought."""
 PARTS: dict[str, Callable[[str], None]] = {
     "cpu": render_with,
     "plane-sweep": reconstruct_with,
     "warp-inpaint": synthesize_with,
+    BROUGHT: fold_brought,
 }
 """The parts that have kernels, and how each is rehearsed. Of two processes the one that has the
 second to do takes about as long as the other with the first and the third."""

@@ -49,7 +49,7 @@ from gscompleter.io.video import check_writer
 from gscompleter.metrics.coverage import coverage_of
 from gscompleter.progress import expecting, preparing, shown_on, stage
 from gscompleter.reconstructors import load_reconstructor
-from gscompleter.rehearsal import compile_kernels
+from gscompleter.rehearsal import BROUGHT, compile_kernels
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.completion import Around, Target, write_report
 from gscompleter.reports.completion_page import completion_page
@@ -173,7 +173,8 @@ def prepared(
         task = read_task(options, opened, device)
         if options.scene is not None:
             task = with_witnesses(task, opened.photographs)
-    compile_kernels((device, options.reconstructor, options.synthesis.name))
+    brought = [BROUGHT] if options.scene is not None and device == "cpu" else []
+    compile_kernels((device, options.reconstructor, options.synthesis.name, *brought))
     if options.scene is not None:
         with preparing("placing the scene"):
             task = in_frame_of_splat(task, options.scene, options, opened)

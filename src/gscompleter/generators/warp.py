@@ -97,7 +97,7 @@ def with_unexplained(warped: Warped, target: Camera, context: SceneContext) -> W
     Only photographs whose own view of the scene is empty in that direction take part: elsewhere
     they show what stands before the hole. Something must be known.
     """
-    guess = background_first(warped)[1].exp().to(warped.depth.device)
+    guess = depth_continued(warped).exp().to(warped.depth.device)
     points = unproject(guess, target)
     colour = torch.zeros_like(warped.image)
     total = torch.zeros_like(guess)
@@ -125,13 +125,25 @@ def background_first(warped: Warped) -> tuple[Float[Tensor, "h w 3"], Float[Tens
     A hole beside an object is where the object hid what stands behind it, so the farther side of
     its border counts more: with the square of its depth.
     """
-    warped = warped.to("cpu")
-    middle = warped.depth[warped.known].median()
-    relative = (warped.depth / middle).clamp(0.1, 10.0)
-    weight = relative**2 * warped.known
-    log_depth = relative.log()[..., None]
-    layers = continued(torch.cat([warped.image, log_depth], dim=-1), weight)
-    return layers[..., :3], layers[..., 3] + middle.log()
+    log_depth, weight, middle = _relative_depth(warped)
+    layers = continued(torch.cat([warped.image.cpu(), log_depth], dim=-1), weight)
+    return layers[..., :3], layers[..., 3] + middle
+
+
+def depth_continued(warped: Warped) -> Float[Tensor, "h w"]:
+    """The log-depth that `background_first` tells, alone."""
+    log_depth, weight, middle = _relative_depth(warped)
+    return continued(log_depth, weight)[..., 0] + middle
+
+
+def _relative_depth(
+    warped: Warped,
+) -> tuple[Float[Tensor, "h w 1"], Float[Tensor, "h w"], Float[Tensor, ""]]:
+    """Log-depth relative to the middle one, how much it counts, and the middle one's logarithm."""
+    known, depth = warped.known.cpu(), warped.depth.cpu()
+    middle = depth[known].median()
+    relative = (depth / middle).clamp(0.1, 10.0)
+    return relative.log()[..., None], relative**2 * known, middle.log()
 
 
 def _visibility(

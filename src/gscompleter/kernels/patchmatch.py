@@ -11,14 +11,25 @@ from numba import njit
 
 from gscompleter.kernels.sharing import share
 
+RADIUS = 3
+"""Patches are squares of 2 * radius + 1 pixels. Known when kernels are compiled, so that the rows
+of a patch are compared side by side."""
+SIDE = 2 * RADIUS + 1
+"""Pixels of a side of a patch."""
+LANES = 24
+"""Numbers that a row of a patch is read as: three colours for each of its pixels and of the one
+beside them, which does not count, for whole registers are faster."""
+
 
 class Matched(NamedTuple):
     """What is matched with what."""
 
     image: np.ndarray
-    """float32 [h, w, 3]: what is being completed."""
+    """float32 [h + 2 RADIUS, w + 2 RADIUS + 1, 3]: what is being completed, `framed`."""
     weight: np.ndarray
-    """float32 [h, w]: how much each of its pixels counts."""
+    """float32, of the same shape: how much each of its numbers counts."""
+    total: np.ndarray
+    """float32 [q]: sum of the weights of the pixels of each query's patch."""
     queries: np.ndarray
     """Pixels (y, x) whose patches are matched [q, 2]."""
     query_at: np.ndarray
@@ -26,7 +37,7 @@ class Matched(NamedTuple):
     expected: np.ndarray
     """float32 [q]: logarithm of the depth that each query should have."""
     sources: np.ndarray
-    """float32 [s, H, W, 3]: images that patches are taken from."""
+    """float32 [s, H, W + 1, 3]: images that patches are taken from, `with_column_beside`."""
     usable: np.ndarray
     """bool [s, H, W]: the centres that a patch may have there."""
     log_depth: np.ndarray
@@ -36,8 +47,6 @@ class Matched(NamedTuple):
 class Costs(NamedTuple):
     """What a match costs, besides its difference."""
 
-    radius: int
-    """Of a patch, in pixels."""
     max_bias: np.float32
     """Largest shift of a colour channel between two patches."""
     bias_penalty: np.float32
@@ -58,28 +67,54 @@ def _hash(value):
     return value ^ (value >> np.uint64(31))
 
 
-@njit(cache=True, fastmath={"contract"})
-def _patch_cost(matched, costs, y, x, s, sy, sx, bias):
-    """Mean squared difference of two patches after the best small shift of each colour channel.
+def framed(image):
+    """`image` [h, w, 3] with a border of zeros, wide enough for the patches around its corners."""
+    return np.pad(image, ((RADIUS, RADIUS), (RADIUS, RADIUS + 1), (0, 0)))
 
-    The shift is written to `bias`. Pixels of the patch outside of the image do not count.
+
+def with_column_beside(images):
+    """Images [s, H, W, 3] and a column of zeros to the right of each, as kernels read them."""
+    return np.pad(images, ((0, 0), (0, 0), (0, 1), (0, 0)))
+
+
+@njit(cache=True, inline="always")
+def _copy(image, y, x, patch):
+    """Copy the rows of the patch around pixel (y, x) of a framed image."""
+    numbers = image.reshape(-1)
+    stride = np.uintp(3 * image.shape[1])
+    start = np.uintp(y) * stride + np.uintp(3 * x)
+    for lane in range(LANES):
+        for row in range(SIDE):
+            patch[row, lane] = numbers[start + np.uintp(row) * stride + np.uintp(lane)]
+
+
+@njit(cache=True, inline="always")
+def _patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, bias):
+    """Mean squared difference of `patch` and the one around (s, sy, sx), after the best small shift
+    of each colour channel.
+
+    The shift is written to `bias`; `sums` [2, LANES] is room for sums down the columns.
     """
-    image, weight, sources = matched.image, matched.weight, matched.sources
-    radius, max_bias, bias_penalty = costs.radius, costs.max_bias, costs.bias_penalty
-    h, w = weight.shape
-    total = square = np.float32(0)
-    d0 = d1 = d2 = np.float32(0)
-    for dy in range(max(-radius, -y), min(radius, h - 1 - y) + 1):
-        for dx in range(max(-radius, -x), min(radius, w - 1 - x) + 1):
-            a = weight[y + dy, x + dx]
-            e0 = image[y + dy, x + dx, 0] - sources[s, sy + dy, sx + dx, 0]
-            e1 = image[y + dy, x + dx, 1] - sources[s, sy + dy, sx + dx, 1]
-            e2 = image[y + dy, x + dx, 2] - sources[s, sy + dy, sx + dx, 2]
-            total += a
-            square += a * (e0 * e0 + e1 * e1 + e2 * e2)
-            d0 += a * e0
-            d1 += a * e1
-            d2 += a * e2
+    max_bias, bias_penalty = costs.max_bias, costs.bias_penalty
+    numbers = sources.reshape(-1)
+    H, W = sources.shape[1:3]
+    # Unsigned, so that no index is looked at for whether it counts from the end.
+    stride = np.uintp(3 * W)
+    start = np.uintp(3 * ((s * H + sy - RADIUS) * W + sx - RADIUS))
+    for lane in range(LANES):
+        square = difference = np.float32(0)
+        for row in range(SIDE):
+            e = patch[row, lane] - numbers[start + np.uintp(row) * stride + np.uintp(lane)]
+            weighted = weight[row, lane] * e
+            difference += weighted
+            square += weighted * e
+        sums[0, lane], sums[1, lane] = square, difference
+    square = d0 = d1 = d2 = np.float32(0)
+    for column in range(SIDE):
+        square += sums[0, 3 * column] + sums[0, 3 * column + 1] + sums[0, 3 * column + 2]
+        d0 += sums[1, 3 * column]
+        d1 += sums[1, 3 * column + 1]
+        d2 += sums[1, 3 * column + 2]
     inverse = np.float32(1) / max(total, np.float32(1e-12))
     cost = square * inverse
     d0 *= inverse
@@ -118,26 +153,11 @@ def search(matched, costs, field, rounds, max_reach, seed):
         The cost of every match [q] and its shift of colour [q, 3].
     """
     count = len(matched.queries)
-    cost, shift = np.empty(count, np.float32), np.empty((count, 3), np.float32)
-    share(_rate, count, matched, costs, field, cost, shift)
+    cost, shift = np.full(count, np.inf, np.float32), np.zeros((count, 3), np.float32)
     for number in range(rounds):
         chance = (number, max_reach, seed)
         share(_improve, count, matched, costs, *chance, field.copy(), field, cost, shift)
     return cost, shift
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _rate(begin, end, matched, costs, field, cost, shift):
-    """Fill in what the matches of the queries from `begin` to `end` cost."""
-    bias = np.empty(3, np.float32)
-    for i in range(begin, end):
-        y, x = matched.queries[i, 0], matched.queries[i, 1]
-        s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
-        difference = _patch_cost(matched, costs, y, x, s, sy, sx, bias)
-        nearer = matched.expected[i] - matched.log_depth[s, sy, sx]
-        cost[i] = difference + _prior(costs, nearer, sy - y, sx - x)
-        for c in range(3):
-            shift[i, c] = bias[c]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -147,9 +167,12 @@ def _improve(begin, end, matched, costs, number, max_reach, seed, before, field,
     usable, query_at = matched.usable, matched.query_at
     num_sources, H, W = usable.shape
     h, w = query_at.shape
-    bias = np.empty(3, np.float32)
+    patch, weight = np.empty((SIDE, LANES), np.float32), np.empty((SIDE, LANES), np.float32)
+    sums, bias = np.empty((2, LANES), np.float32), np.empty(3, np.float32)
     for i in range(begin, end):
         y, x = matched.queries[i, 0], matched.queries[i, 1]
+        _copy(matched.image, y, x, patch)
+        _copy(matched.weight, y, x, weight)
         best = cost[i]
         state = _hash(
             np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15)
@@ -157,8 +180,11 @@ def _improve(begin, end, matched, costs, number, max_reach, seed, before, field,
             + np.uint64(y * 65537 + x)
         )
         reach = max_reach
-        for trial in range(24):
-            if trial < 8:
+        for trial in range(-1 if number == 0 else 0, 24):
+            if trial < 0:
+                # Nothing has told yet what the match costs that it begins with.
+                s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
+            elif trial < 8:
                 # Neighbours one and four pixels away propose their own offset.
                 step = 1 if trial < 4 else 4
                 side = trial % 4
@@ -188,13 +214,15 @@ def _improve(begin, end, matched, costs, number, max_reach, seed, before, field,
                 reach = reach * 6 // 10
             if sy < 0 or sy >= H or sx < 0 or sx >= W or not usable[s, sy, sx]:
                 continue
-            if s == field[i, 0] and sy == field[i, 1] and sx == field[i, 2]:
+            if trial >= 0 and s == field[i, 0] and sy == field[i, 1] and sx == field[i, 2]:
                 continue
             nearer = matched.expected[i] - matched.log_depth[s, sy, sx]
             prior = _prior(costs, nearer, sy - y, sx - x)
             if prior >= best:
                 continue
-            proposed = prior + _patch_cost(matched, costs, y, x, s, sy, sx, bias)
+            proposed = prior + _patch_cost(
+                costs, patch, weight, matched.total[i], matched.sources, s, sy, sx, sums, bias
+            )
             if proposed < best:
                 best = proposed
                 field[i, 0], field[i, 1], field[i, 2] = s, sy, sx
@@ -203,39 +231,42 @@ def _improve(begin, end, matched, costs, number, max_reach, seed, before, field,
                     shift[i, c] = bias[c]
 
 
-def vote(pixels, query_at, vote_weight, sources, field, shift, radius):
-    """Weighted mean of what all patches over a pixel say about it, for `pixels` [p, 2].
+def vote(query_at, vote_weight, sources, field, shift):
+    """Weighted mean of what all patches over a pixel say about it.
+
+    Args:
+        query_at: For each pixel the index of its query, or -1 [h, w].
+        vote_weight: float32 [q]: how much the patch of each query counts.
+        sources: float32 [s, H, W + 1, 3], as of `Matched`.
+        field, shift: The match of each query, and what is added to its colours.
 
     Returns:
-        Colours [p, 3] and the sum of their weights [p].
+        Colours [h, w, 3] and the sum of their weights [h, w]; 0 where no patch says anything.
     """
-    colours = np.zeros((len(pixels), 3), np.float32)
-    totals = np.zeros(len(pixels), np.float32)
-    given = (pixels, query_at, vote_weight, sources, field, shift, radius)
-    share(_vote, len(pixels), *given, colours, totals)
-    return colours, totals
+    h, w = query_at.shape
+    # Wider than the image, so that patches over its sides need not be cut.
+    colours = np.zeros((h, w + 2 * RADIUS, 3), np.float32)
+    totals = np.zeros((h, w + 2 * RADIUS), np.float32)
+    share(_vote, h, query_at, vote_weight, sources, field, shift, colours, totals)
+    inner = np.s_[:, RADIUS:-RADIUS]
+    return colours[inner] / np.maximum(totals[inner], 1e-12)[..., None], totals[inner]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _vote(
-    begin, end, pixels, query_at, vote_weight, sources, field, shift, radius, colours, totals
-):
-    """Fill in the pixels from `begin` to `end`."""
+def _vote(begin, end, query_at, vote_weight, sources, field, shift, colours, totals):
+    """Sum up what is said of the rows from `begin` to `end`, one query after the other."""
     h, w = query_at.shape
-    for p in range(begin, end):
-        y, x = pixels[p, 0], pixels[p, 1]
-        total = r = g = b = np.float32(0)
-        for dy in range(max(-radius, -y), min(radius, h - 1 - y) + 1):
-            for dx in range(max(-radius, -x), min(radius, w - 1 - x) + 1):
-                q = query_at[y + dy, x + dx]
-                if q < 0:
-                    continue
-                a = vote_weight[q]
-                s, sy, sx = field[q, 0], field[q, 1] - dy, field[q, 2] - dx
-                r += a * (sources[s, sy, sx, 0] + shift[q, 0])
-                g += a * (sources[s, sy, sx, 1] + shift[q, 1])
-                b += a * (sources[s, sy, sx, 2] + shift[q, 2])
-                total += a
-        if total > 0:
-            colours[p, 0], colours[p, 1], colours[p, 2] = r / total, g / total, b / total
-        totals[p] = total
+    for y in range(max(begin - RADIUS, 0), min(end + RADIUS, h)):
+        for x in range(w):
+            q = query_at[y, x]
+            if q < 0:
+                continue
+            a = vote_weight[q]
+            s, sy, sx = field[q, 0], field[q, 1], field[q, 2]
+            for dy in range(max(-RADIUS, begin - y), min(RADIUS, end - 1 - y) + 1):
+                said, sums = sources[s, sy + dy], colours[y + dy]
+                for column in range(SIDE):
+                    for c in range(3):
+                        colour = said[sx - RADIUS + column, c] + shift[q, c]
+                        sums[x + column, c] += a * colour
+                    totals[y + dy, x + column] += a

@@ -70,9 +70,11 @@ def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
     targets = sum(camera.kind == "target" for camera in cameras)
     told = f"{len(cameras)} cameras, {targets} of them targets, among {len(places)} points."
     svg = figure("Cameras in space", told, SIZE, SIZE, "space")
-    for point, (_, added) in zip(frame(means), places, strict=True):
+    drawn = frame(means)
+    for point, (x, y), (_, added) in zip(drawn, projected(drawn), places, strict=True):
         if np.abs(point).max() <= EDGE:
-            draw_point(svg, point, "added" if added else "seen")
+            kind, told = "added" if added else "seen", text_of(point[None])
+            put(svg, "circle", class_=kind, r=1.6, cx=x, cy=y, data_points=told)
     for camera, pose in zip(cameras, poses, strict=True):
         draw_camera(svg, camera, frame(frustum(pose, camera.pose.opening, DEPTH * frame.radius)))
     return markup(svg)
@@ -81,12 +83,6 @@ def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
 def finite(numbers: Sequence[float]) -> bool:
     """Whether all of them can be drawn."""
     return all(map(math.isfinite, numbers))
-
-
-def draw_point(svg: Element, point: Float[np.ndarray, "3"], kind: str) -> None:
-    """Draw a place on a surface, told in the frame of the drawing."""
-    (x, y), told = projected(point[None])[0], text_of(point[None])
-    put(svg, "circle", class_=kind, r=1.6, cx=x, cy=y, data_points=told)
 
 
 def draw_camera(svg: Element, camera: Placed, corners: Float[np.ndarray, "11 3"]) -> None:

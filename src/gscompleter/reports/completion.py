@@ -16,6 +16,7 @@ from gscompleter import __version__
 from gscompleter.io.files import COMPLETED, CONTEXT
 from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
+from gscompleter.kernels.sharing import side_by_side
 from gscompleter.metrics.coverage import Look
 from gscompleter.metrics.image import psnr, ssim
 from gscompleter.render import Renderer
@@ -25,6 +26,9 @@ from gscompleter.splats.layout import save_like
 from gscompleter.splats.removed import NAME as REMOVED
 from gscompleter.splats.removed import save_removed
 from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion
+
+GENERATED = "generated.ply"
+"""The file with what was added, alone."""
 
 
 @dataclass(frozen=True)
@@ -178,13 +182,13 @@ def write_report(
         for target, result in zip(targets, completion.targets, strict=True)
     ]
     summary = summarize(completion, targets, context_images, target_images, said)
-    save_ply(folder / CONTEXT, completion.context)
     if brought is None:
-        save_ply(folder / COMPLETED, completion.scene, provenance=True)
+        save_own(folder, completion)
     else:
         context, scene = completion.context, completion.scene
+        save_ply(folder / CONTEXT, context)
         save_brought(folder, context, scene, completion.set_aside, brought)
-    save_ply(folder / "generated.ply", completion.added, provenance=True)
+        save_ply(folder / GENERATED, completion.added, provenance=True)
     shown, pictured = most_changed(around.looks), folder / "images"
     pictured.mkdir()
     results = zip(completion.targets, target_images, strict=True)
@@ -203,8 +207,8 @@ def write_pictures(
     Raises:
         InputError: where a file cannot be written.
     """
-    for name, image in pictures(result, images).items():
-        write_image(folder / f"target{number}_{name}.png", image)
+    named = pictures(result, images)
+    write_images({folder / f"target{number}_{name}.png": named[name] for name in named})
     depths = {"before": images.before.depth_map(), "after": images.after.depth_map()}
     limits = limits_of(list(depths.values()))
     if limits is not None:
@@ -219,9 +223,32 @@ def write_looks(folder: Path, looks: Sequence[Look]) -> None:
     Raises:
         InputError: where a file cannot be written.
     """
+    seen = {}
     for number, look in enumerate(looks, start=1):
-        write_image(folder / f"around{number}_before.png", look.before.image)
-        write_image(folder / f"around{number}_after.png", look.after.image)
+        seen[folder / f"around{number}_before.png"] = look.before.image
+        seen[folder / f"around{number}_after.png"] = look.after.image
+    write_images(seen)
+
+
+def write_images(images: Mapping[Path, Tensor]) -> None:
+    """Write images, several at a time: colour [h, w, 3], grey or masks [h, w].
+
+    Raises:
+        InputError: where a file cannot be written.
+    """
+    side_by_side(write_image, images.keys(), images.values())
+
+
+def save_own(folder: Path, completion: Completion) -> None:
+    """Write the three scenes of a context that Ψ made side by side: their rows fit into memory
+    together, which those of a splat that is brought may not.
+
+    Raises:
+        InputError: where a file cannot be written.
+    """
+    paths = [folder / name for name in (CONTEXT, COMPLETED, GENERATED)]
+    scenes = completion.context, completion.scene, completion.added
+    side_by_side(save_ply, paths, scenes, (None, True, True))
 
 
 def save_brought(

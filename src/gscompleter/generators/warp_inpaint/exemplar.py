@@ -17,10 +17,9 @@ from torch.nn.functional import avg_pool2d, pad
 
 from gscompleter.generators.smooth import distance_to_known
 from gscompleter.kernels import patchmatch
+from gscompleter.kernels.patchmatch import RADIUS, SIDE
 from gscompleter.masks import dilate
 
-RADIUS = 3
-"""Patches are squares of 2 * radius + 1 pixels."""
 MAX_BIAS = 0.1
 """Largest shift of a patch's colour channel, in units of the colour."""
 BIAS_PENALTY = 0.3
@@ -133,19 +132,21 @@ def solve(
     if not usable.any() or known.all():
         return level.image, None
 
-    queries, hole = np.argwhere(near_hole), np.argwhere(~known)
+    queries = np.argwhere(near_hole)
     query_at = np.full((h, w), -1, np.int64)
     query_at[near_hole] = np.arange(len(queries))
     weight = trust(level.known)
     votes, shift = weight[near_hole], np.zeros((len(queries), 3), np.float32)
     matches = initial_matches(queries, coarse_field, usable, seed)
-    images = np.ascontiguousarray(level.sources.images.numpy())
+    images = patchmatch.with_column_beside(level.sources.images.numpy())
     log_depth = np.ascontiguousarray(level.sources.log_depth.numpy())
-    asked = (queries, query_at, level.expected.numpy()[near_hole])
+    frame = patchmatch.framed(np.repeat(weight[..., None], 3, axis=-1))
+    total = cv2.boxFilter(weight, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    asked = (total[near_hole], queries, query_at, level.expected.numpy()[near_hole])
     costs = costs_in(usable.shape[1:])
 
     def voted() -> Float32[ndarray, "p 3"]:
-        return patchmatch.vote(hole, query_at, votes, images, matches, shift, RADIUS)[0]
+        return patchmatch.vote(query_at, votes, images, matches, shift)[0][~known]
 
     current = level.image.numpy().copy()
     if coarse_field is not None:
@@ -154,7 +155,9 @@ def solve(
     if coarse_field is not None:
         reach, passes = FINE_REACH, FINER_PASSES
     for number in range(rounds):
-        matched = patchmatch.Matched(current, weight, *asked, images, usable, log_depth)
+        matched = patchmatch.Matched(
+            patchmatch.framed(current), frame, *asked, images, usable, log_depth
+        )
         cost, shift = patchmatch.search(matched, costs, matches, passes, reach, seed + 31 * number)
         likely = np.exp(-cost / (2 * max(float(np.percentile(cost, 75)), 1e-6)))
         votes = (weight[near_hole] * likely).astype(np.float32)
@@ -173,7 +176,7 @@ def trust(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]:
 def costs_in(size: Sequence[int]) -> patchmatch.Costs:
     """What matches cost in images of a size (height, width)."""
     weights = MAX_BIAS, BIAS_PENALTY, DEPTH_PENALTY, DISTANCE_PENALTY, math.hypot(*size)
-    return patchmatch.Costs(RADIUS, *map(np.float32, weights))
+    return patchmatch.Costs(*map(np.float32, weights))
 
 
 def usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
