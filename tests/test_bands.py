@@ -9,7 +9,7 @@ import torch
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS
 from gscompleter.metrics.image import gradient_energy_ratio
-from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, measuring
 from gscompleter.reconstructors.plane_sweep.bands import around, bands_of, every_plane, tiles_of
 from gscompleter.reconstructors.plane_sweep.matching import inverse_depth_planes, matched_costs
 from gscompleter.reconstructors.plane_sweep.measuring import fractions, swept
@@ -126,9 +126,7 @@ def test_bands_around_a_guess_hold_the_truth_at_a_fraction_of_the_planes(rig):
 def test_two_large_photographs_are_measured_as_well_as_at_all_planes(rig, monkeypatch):
     views, truth = rig[1], rig[1][0].depth
     guided = PlaneSweep().depths(views)[0]
-    monkeypatch.setattr(
-        "gscompleter.reconstructors.plane_sweep.reconstructor.HALVED_FROM", SIZE + 1
-    )
+    monkeypatch.setattr("gscompleter.reconstructors.plane_sweep.measuring.GUIDED_FROM", SIZE + 1)
     plain = PlaneSweep().depths(views)[0]
 
     def off(found):
@@ -136,6 +134,30 @@ def test_two_large_photographs_are_measured_as_well_as_at_all_planes(rig, monkey
 
     assert off(guided) < 1.1 * off(plain)
     assert guided.valid.float().mean() > 0.95 * plain.valid.float().mean()
+
+
+def test_coarse_images_say_first_where_to_look_down_to_the_smallest(rig, monkeypatch):
+    stereo_rig, views = rig
+    depths, seen = (NEAR / stereo_rig.unit, FAR / stereo_rig.unit), []
+
+    def counted(reference, sources, planes, bands):
+        seen.append((reference.size, bands.start[-1]))
+        return matched_costs(reference, sources, planes, bands)
+
+    monkeypatch.setattr(measuring, "matched_costs", counted)
+    monkeypatch.setattr(measuring, "GUIDED_FROM", SIZE // 2)
+    guided = measuring.sweeps_of(stereo_rig, *depths)
+    assert [size for size, _ in seen] == [
+        (s, s) for s in (SIZE // 4, SIZE // 2, SIZE) for _ in "ab"
+    ]
+    work = sum(cells for _, cells in seen)
+    seen.clear()
+    monkeypatch.setattr(measuring, "GUIDED_FROM", SIZE + 1)
+    plain = measuring.sweeps_of(stereo_rig, *depths)
+    assert work < 0.6 * sum(cells for _, cells in seen)
+    truth = stereo_rig.unit / views[0].depth.numpy()
+    errors = [np.abs(sweeps[0].inverse - truth) / truth for sweeps in (guided, plain)]
+    assert np.median(errors[0]) < 1.1 * np.median(errors[1])
 
 
 def test_of_a_synthesized_image_only_what_is_wanted_is_lifted(rig):

@@ -17,12 +17,17 @@ from gscompleter.matching.stereo_image import (
 )
 from gscompleter.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.appearance import fit_colours, fit_opacities
+from gscompleter.reconstructors.plane_sweep.appearance import (
+    OPACITY_STEPS,
+    fit_colours,
+    fit_opacities,
+)
 from gscompleter.reconstructors.plane_sweep.confidence import confidence_of, without_speckles
 from gscompleter.reconstructors.plane_sweep.epipolar import distances, rotated_to_matches
 from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.render import load_renderer
+from gscompleter.render.cpu import CpuView
 from gscompleter.types import View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -230,6 +235,21 @@ def test_what_photographs_object_to_fades_and_the_rest_stays():
         assert psnr(renderer.render(fitted, view.camera).image, view.image) > 24
     for name in ("means", "scales", "quats", "sh"):
         assert torch.equal(getattr(fitted, name), getattr(scene, name))
+
+
+def test_a_step_on_the_opacities_draws_one_photograph(monkeypatch):
+    views, drawn = pair(), []
+    plan = CpuView.plan
+
+    def counted(view, new):
+        render = plan(view, new)
+        return lambda opacities: drawn.append(view.viewpoint.pinhole.center[0]) or render(opacities)
+
+    monkeypatch.setattr(CpuView, "plan", counted)
+    fit_opacities(merge([gaussians_of(view) for view in views]), views, load_renderer("cpu"))
+    assert len(drawn) == OPACITY_STEPS
+    assert drawn[::2] == [views[0].camera.center[0]] * (OPACITY_STEPS // 2)
+    assert drawn[1::2] == [views[1].camera.center[0]] * (OPACITY_STEPS // 2)
 
 
 def test_colours_get_back_what_drawing_blurs():

@@ -34,6 +34,9 @@ TILE = 16
 TILE_SHIFT = 4
 """Its logarithm: pixels shifted right by so many bits are tiles."""
 
+FIRST_ROWS = 1 << 14
+"""Rows of weights that there is room for at first, as many as a tile full of small splats has."""
+
 BLUR = np.float32(0.3)
 TANGENT_MARGIN = np.float32(0.15)
 MIN_ALPHA = np.float32(1 / 255)
@@ -279,6 +282,36 @@ def _for_each_row(builder, rows, position, row_limit, body):
             body(loop.index)
 
 
+def _blend(splat, state, row):
+    """Composite a splat over a row: its weights, where it is visible, and what still lets pass.
+
+    state: `_Rows` of the transmittance and the sums of as many of red, green, blue and depth as
+        it holds.
+    """
+    builder = splat.builder
+    _, _, alpha, visible = splat.falloff(row)
+    alpha = alpha.where(visible, 0.0)
+    before = _Lanes(builder, state.load(row, 0))
+    after = alpha.times(0.0 - before, plus=before)
+    passing = after.compare(">", MIN_TRANSMITTANCE)
+    weight = (alpha * before).where(passing, 0.0)
+    closed = before.where(before.compare("<", 0.0), 0.0 - before)
+    state.store(row, 0, after.where(passing, closed).value)
+    for index, channel in enumerate(splat.channels[: state.stride // TILE - 1], start=1):
+        total = weight.times(channel, plus=_Lanes(builder, state.load(row, index)))
+        state.store(row, index, total.value)
+    return weight, visible, passing
+
+
+def _close_if_full(builder, passing, limits, row, filled):
+    """Set the limit of a row to -1 where nothing passes it any more, and count it."""
+    any_passing = builder.bitcast(passing, ir.IntType(TILE))
+    none = builder.icmp_unsigned("==", any_passing, ir.Constant(ir.IntType(TILE), 0))
+    with builder.if_then(none, likely=False):
+        builder.store(ir.Constant(_INT, -1), builder.gep(limits, [row]))
+        builder.store(builder.add(builder.load(filled), ir.Constant(_LONG, 1)), filled)
+
+
 @intrinsic
 def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
     """Composite a splat over the rows begin..end of a tile; returns how many of them it filled.
@@ -302,28 +335,80 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
         filled = cgutils.alloca_once_value(builder, ir.Constant(_LONG, 0))
 
         def draw(row):
-            _, _, alpha, visible = splat.falloff(row)
-            alpha = alpha.where(visible, 0.0)
-            before = _Lanes(builder, state.load(row, 0))
-            after = alpha.times(0.0 - before, plus=before)
-            passing = after.compare(">", MIN_TRANSMITTANCE)
-            weight = (alpha * before).where(passing, 0.0)
-            closed = before.where(before.compare("<", 0.0), 0.0 - before)
-            state.store(row, 0, after.where(passing, closed).value)
-            for index, channel in enumerate(splat.channels, start=1):
-                total = weight.times(channel, plus=_Lanes(builder, state.load(row, index)))
-                state.store(row, index, total.value)
+            _, visible, passing = _blend(splat, state, row)
             contributes = builder.and_(visible, passing)
             last.store(row, 0, builder.select(contributes, positions, last.load(row, 0)))
-
-            any_passing = builder.bitcast(passing, ir.IntType(TILE))
-            none = builder.icmp_unsigned("==", any_passing, ir.Constant(ir.IntType(TILE), 0))
-            with builder.if_then(none, likely=False):
-                builder.store(ir.Constant(_INT, -1), builder.gep(limits, [row]))
-                builder.store(builder.add(builder.load(filled), ir.Constant(_LONG, 1)), filled)
+            _close_if_full(builder, passing, limits, row, filled)
 
         _for_each_row(builder, (begin, end), position, limits, draw)
         return builder.load(filled)
+
+    return signature, generate
+
+
+@intrinsic
+def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
+    """Composite a splat over the rows begin..end of a tile, and keep its weights.
+
+    state: [16, 4, 16] float32, without the depth.
+    kept: [rows, 16] float32; the weights of row `begin` go to its row `place`, and so on.
+    """
+    signature = types.int64(types.int64, types.int64, types.int64, state, row_limit, kept, splat)
+
+    def generate(context, builder, signature, arguments):
+        begin, end, place, state, row_limit, kept, splat = arguments
+        splat = _Splat(builder, *cgutils.unpack_tuple(builder, splat))
+        state = _Rows(context, builder, signature.args[3], state, _FLOATS, 4)
+        limits = context.make_array(signature.args[4])(context, builder, row_limit).data
+        kept = _Rows(context, builder, signature.args[5], kept, _FLOATS, 1)
+        filled = cgutils.alloca_once_value(builder, ir.Constant(_LONG, 0))
+        with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
+            row, at = loop.index, builder.add(place, builder.sub(loop.index, begin))
+            limit = builder.load(builder.gep(limits, [row]))
+            is_open = builder.icmp_signed(">=", limit, ir.Constant(_INT, 0))
+            with builder.if_else(is_open) as (drawn, left_out):
+                with drawn:
+                    weight, _, passing = _blend(splat, state, row)
+                    kept.store(at, 0, weight.value)
+                    _close_if_full(builder, passing, limits, row, filled)
+                with left_out:
+                    kept.store(at, 0, _constant(0.0))
+        return builder.load(filled)
+
+    return signature, generate
+
+
+@intrinsic
+def _spread_rows(typing, begin, end, place, state, kept, sums):
+    """Sum the weights that were kept of a splat, times what lies in the image, over its rows.
+
+    state: [16, 4, 16] float32, whose rows hold red, green and blue from the second vector on.
+    kept, place: as `_weigh_rows` left them.
+    sums: [16] float32, the first four of which receive the sums of weight times red, green and
+        blue, and of the weight.
+    """
+    signature = types.void(types.int64, types.int64, types.int64, state, kept, sums)
+
+    def generate(context, builder, signature, arguments):
+        begin, end, place, state, kept, sums = arguments
+        state = _Rows(context, builder, signature.args[3], state, _FLOATS, 4)
+        kept = _Rows(context, builder, signature.args[4], kept, _FLOATS, 1)
+        zeros = ir.Constant(_FLOATS, [0.0] * TILE)
+        totals = [cgutils.alloca_once_value(builder, zeros) for _ in range(4)]
+        with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
+            at = builder.add(place, builder.sub(loop.index, begin))
+            weight = _Lanes(builder, kept.load(at, 0))
+            for index, total in enumerate(totals, start=1):
+                value = _Lanes(builder, builder.load(total))
+                if index < 4:
+                    value = weight.times(_Lanes(builder, state.load(loop.index, index)), plus=value)
+                else:
+                    value = value + weight
+                builder.store(value.value, total)
+        out = _Rows(context, builder, signature.args[5], sums, _FLOATS, 1)
+        columns = [_Lanes(builder, builder.load(total)) for total in totals]
+        out.store(ir.Constant(_LONG, 0), 0, _sums_of_lanes(builder, columns))
+        return context.get_dummy_value()
 
     return signature, generate
 
@@ -966,6 +1051,90 @@ def composite(begin, end, tiles, context, new, frame):
                 alphas[y, x] = alpha
                 transmittances[y, x] = transmittance
                 lasts[y, x] = last[row, column]
+
+
+@njit(cache=True, nogil=True)
+def _with_room(kept, used):
+    """`kept`, or what is `used` of it with twice as many rows where a tile's more do not fit."""
+    if used + TILE <= len(kept):
+        return kept
+    wider = _aligned(2 * kept.size).reshape((2 * len(kept), TILE))
+    wider[:used] = kept[:used]
+    return wider
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, written):
+    """Draw tiles[begin:end] and give what the image lacks back to the new layer's entries.
+
+    The weights of a splat in the pixels of a tile stay in the cache until the image of the tile is
+    finished: nothing is computed twice.
+
+    context, new: Layer.
+    photograph: [h, w, 3] float32, that the image should be.
+    slots [e] int32: slot of each entry of `new`.
+    sums [slots, 4] float32: over the pixels of the tile, of the entry's weight times what the
+        photograph has more than the image in red, green and blue, and of the weight.
+    written [slots] bool: set for the slots, and only those, that are drawn.
+    """
+    c_splats, c_opacities, c_boxes, c_start, c_entries = context
+    n_splats, n_opacities, n_boxes, n_start, n_entries = new
+    height, width = photograph.shape[:2]
+    tiles_x = (width + TILE - 1) // TILE
+    state = _aligned(TILE * 4 * TILE).reshape((TILE, 4, TILE))
+    kept = _aligned(FIRST_ROWS * TILE).reshape((FIRST_ROWS, TILE))
+    row_limit = np.empty(TILE, np.int32)
+    totals = np.zeros(TILE, np.float32)
+    infinity = np.float32(np.inf)
+    for index in range(begin, end):
+        tile = tiles[index]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        rows, columns = min(TILE, height - top), min(TILE, width - left)
+        state[:] = 0
+        state[:, 0, :columns] = 1
+        # Pixels beyond the border of the image are full from the start.
+        state[:, 0, columns:] = -1
+        row_limit[:] = 0
+        open_rows = rows
+
+        c, c_begin, c_end = c_start[tile], c_start[tile], c_start[tile + 1]
+        n, n_begin, n_end = n_start[tile], n_start[tile], n_start[tile + 1]
+        c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
+        n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+        place = 0
+        while open_rows > 0 and (c < c_end or n < n_end):
+            kept = _with_room(kept, place)
+            if c_depth <= n_depth:
+                first, stop, splat = _placed(
+                    c_splats, c_opacities, c_boxes, c_entries[c], left, top
+                )
+                c += 1
+                c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
+                # The next one overwrites what is kept of it.
+                open_rows -= _weigh_rows(first, stop, place, state, row_limit, kept, splat)
+                continue
+            first, stop, splat = _placed(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+            n += 1
+            n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+            open_rows -= _weigh_rows(first, stop, place, state, row_limit, kept, splat)
+            place += max(stop - first, 0)
+
+        for row in range(rows):
+            for channel in range(3):
+                for column in range(columns):
+                    wanted = photograph[top + row, left + column, channel]
+                    state[row, 1 + channel, column] = wanted - state[row, 1 + channel, column]
+
+        place = 0
+        for entry in range(n_begin, n):
+            i, slot = n_entries[entry], slots[entry]
+            first = max(np.int64(n_boxes[i, 2]) - top, 0)
+            stop = min(np.int64(n_boxes[i, 3]) - top, TILE)
+            _spread_rows(first, stop, place, state, kept, totals)
+            place += max(stop - first, 0)
+            written[slot] = True
+            for column in range(4):
+                sums[slot, column] = totals[column]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

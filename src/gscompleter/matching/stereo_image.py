@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from gscompleter.errors import InputError
 from gscompleter.types import View
@@ -70,6 +71,19 @@ def _stereo_image(view: View, center: Float[np.ndarray, "3"]) -> StereoImage:
         camera.c2w[:3, :3].detach().cpu().double().numpy(),
         center,
     )
+
+
+def contrast(
+    a: Float32[np.ndarray, "h w 3"], b: Float32[np.ndarray, "h w 3"]
+) -> Float32[np.ndarray, "h w"]:
+    """How different each pixel of two images is, in the colour that differs most."""
+    return largest(cv2.absdiff(a, b))
+
+
+def largest(values: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+    """Of each pixel the largest of its three values."""
+    red, green, blue = cv2.split(values)
+    return cv2.max(cv2.max(red, green), blue)
 
 
 def source_from_reference(reference: StereoImage, source: StereoImage) -> Float[np.ndarray, "3 4"]:

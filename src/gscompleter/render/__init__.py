@@ -31,8 +31,14 @@ AppearanceRender = Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[
 harmonics [n, k, 3] may change."""
 
 
-ColourRender = Callable[[Float[Tensor, "n 3"]], Render]
-"""Renders a frozen scene plus Gaussians of which only the colours [n, 3] may change."""
+ColourSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
+"""Of each Gaussian, the sums over an image of its compositing weight times three layers, and of the
+weight itself."""
+
+
+ColourErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColourSums]
+"""Draws a frozen scene plus Gaussians of which only the colours [n, 3] may change, and sums what a
+photograph [h, w, 3] has more than the image."""
 
 
 @runtime_checkable
@@ -67,9 +73,8 @@ class FrozenView(Protocol):
         """Fix all of `new` but the opacities and spherical harmonics; the function it returns is
         differentiable in both. It takes longer to make than `plan`, and then draws faster."""
 
-    def plan_colours(self, new: Gaussians) -> ColourRender:
-        """Fix all of `new` but its colours, which the camera sees as they are given, from 0 up; the
-        function it returns is differentiable."""
+    def plan_colours(self, new: Gaussians) -> ColourErrors:
+        """Fix all of `new` but its colours, which the camera sees as they are given, from 0 up."""
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Fix all of `new` but how far along the rays of the camera it stands, and draw it at least

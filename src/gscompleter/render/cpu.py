@@ -21,7 +21,7 @@ from gscompleter.errors import InputError
 from gscompleter.kernels import rasterizer
 from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
 from gscompleter.kernels.sharing import ranges, run, share
-from gscompleter.render import ColourRender, DepthRender, OpacityRender
+from gscompleter.render import ColourErrors, ColourSums, DepthRender, OpacityRender
 from gscompleter.render.folded import Folded, folded
 from gscompleter.types import Camera, Gaussians, Render
 
@@ -138,14 +138,16 @@ class CpuView:
         arrays = arrays_of(opaque)
         return folded(self, self.viewpoint.bin(arrays, self.depth_limits), arrays.means)
 
-    def plan_colours(self, new: Gaussians) -> ColourRender:
+    def plan_colours(self, new: Gaussians) -> ColourErrors:
         """Project, sort and bin `new` once."""
         binned = self.viewpoint.bin(arrays_of(new), self.depth_limits)
 
-        def render(colours: Float[Tensor, "n 3"]) -> Render:
-            return Render(*_Painted.apply(self, binned, colours.to("cpu", torch.float32)))
+        def errors(colours: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColourSums:
+            binned.layer.splats[:, rasterizer.RED :] = np.maximum(float32(colours), 0)
+            sums = self.viewpoint.missed_colours(self.layer, binned, float32(photograph))
+            return torch.from_numpy(sums[:, :3]), torch.from_numpy(sums[:, 3])
 
-        return render
+        return errors
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Project `new` once, as far as it touches a tile that is asked for."""
@@ -296,6 +298,18 @@ class Viewpoint:
         self.share(rasterizer.composite_backward, len(tiles), *drawn, *received)
         return values, written
 
+    def missed_colours(
+        self, context: Layer, new: Binned, photograph: Float32[ndarray, "h w 3"]
+    ) -> Float32[ndarray, "n 4"]:
+        """For each Gaussian of the new layer, the sums over the image of its compositing weight
+        times what the photograph has more in each colour, and of its weight."""
+        values = np.empty((len(new.slots), 4), np.float32)
+        written = np.zeros(len(new.slots), np.bool_)
+        tiles = touched(new.layer)
+        drawn = (tiles, context, new.layer, photograph, new.slots, values, written)
+        self.share(rasterizer.missed_colours, len(tiles), *drawn)
+        return self.sums(new, (values, written))
+
     def sums(self, new: Binned, gradients: EntryGradients) -> Float32[ndarray, "n columns"]:
         """For each Gaussian, the sums of the gradients of its entries."""
         totals = np.empty((len(new.slot_start) - 1, gradients[0].shape[1]), np.float32)
@@ -361,31 +375,6 @@ class _Planned(torch.autograd.Function):
         sums = view.viewpoint.sums(binned, gradients)[:, 0]
         result = np.divide(sums, opacities, out=np.zeros_like(sums), where=sums != 0)
         return None, None, torch.from_numpy(result)
-
-
-class _Painted(torch.autograd.Function):
-    """The same where only colours change."""
-
-    @staticmethod
-    def forward(ctx: Any, view: CpuView, binned: Binned, colours: Tensor) -> tuple[Tensor, ...]:
-        splats = binned.layer.splats.copy()
-        splats[:, rasterizer.RED :] = np.maximum(float32(colours), 0)
-        painted = replace(binned, layer=binned.layer._replace(splats=splats))
-        frame = view.viewpoint.composite(view, painted.layer)
-        render = render_of(frame)
-        ctx.scene = (view, painted, frame)
-        ctx.save_for_backward(colours, render.depth, render.alpha)
-        ctx.mark_non_differentiable(render.depth, render.alpha)
-        return render.image, render.depth, render.alpha
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        view, painted, frame = ctx.scene
-        drawn = (view.layer, painted, frame, slopes)
-        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_COLOUR)
-        sums = torch.from_numpy(view.viewpoint.sums(painted, gradients))
-        return None, None, torch.where(ctx.saved_tensors[0] > 0, sums, 0.0)
 
 
 class _Slid(torch.autograd.Function):

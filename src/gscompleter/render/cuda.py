@@ -16,8 +16,8 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.geometry import at_depths
-from gscompleter.render import AppearanceRender, ColourRender, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import looking, painted, sums_by_slopes
+from gscompleter.render import AppearanceRender, ColourErrors, DepthRender, OpacityRender, Renderer
+from gscompleter.render.painting import errors_by_slopes, looking, painted, sums_by_slopes
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -198,9 +198,13 @@ class CudaView:
         """Context and `new` with other looks, all of it drawn anew."""
         return lambda opacities, sh: self.composite(looking(new, opacities, sh)).image
 
-    def plan_colours(self, new: Gaussians) -> ColourRender:
+    def plan_colours(self, new: Gaussians) -> ColourErrors:
         """Context and `new` in other colours, all of it drawn anew."""
-        return lambda colours: self.composite(painted(new, colours))
+
+        def draw(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+            return self.composite(painted(new, colours)).image
+
+        return lambda colours, photograph: errors_by_slopes(draw, new, colours, photograph)
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Context and `new` at other depths, all of it drawn anew."""

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.render import ColourSums
 from gscompleter.types import Gaussians, sh_from_rgb
 
 
@@ -41,3 +42,15 @@ def sums_by_slopes(
         colours = gaussians.means.new_full((len(gaussians), 3), 0.5).requires_grad_()
         (slope,) = torch.autograd.grad((layers * draw(colours)).sum(), colours)
     return slope
+
+
+def errors_by_slopes(
+    draw: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]],
+    gaussians: Gaussians,
+    colours: Float[Tensor, "n 3"],
+    photograph: Float[Tensor, "h w 3"],
+) -> ColourSums:
+    """`ColourErrors` by autograd; arguments as those of `sums_by_slopes`."""
+    missing = photograph - draw(colours).detach()
+    weights = sums_by_slopes(draw, gaussians, torch.ones_like(missing))[:, 0]
+    return sums_by_slopes(draw, gaussians, missing), weights

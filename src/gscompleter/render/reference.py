@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from gscompleter.geometry import at_depths, rotations_from
-from gscompleter.render import AppearanceRender, ColourRender, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import looking, painted, sums_by_slopes
+from gscompleter.render import AppearanceRender, ColourErrors, DepthRender, OpacityRender, Renderer
+from gscompleter.render.painting import errors_by_slopes, looking, painted, sums_by_slopes
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -98,8 +98,12 @@ class ReferenceView:
     def plan_appearance(self, new: Gaussians) -> AppearanceRender:
         return lambda opacities, sh: self.composite(looking(new, opacities, sh)).image
 
-    def plan_colours(self, new: Gaussians) -> ColourRender:
-        return lambda colours: self.composite(painted(new, colours))
+    def plan_colours(self, new: Gaussians) -> ColourErrors:
+
+        def draw(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+            return self.composite(painted(new, colours)).image
+
+        return lambda colours, photograph: errors_by_slopes(draw, new, colours, photograph)
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         return lambda depths: self.composite(at_depths(new, self.camera, depths))

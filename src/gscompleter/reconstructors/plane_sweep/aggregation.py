@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import Bands
-from gscompleter.matching.stereo_image import StereoImage
+from gscompleter.matching.stereo_image import StereoImage, contrast
 
 SMALL_PENALTY = 25.0
 """Cost of a change by one plane between neighbours."""
@@ -23,9 +23,8 @@ def aggregate(
     """Costs summed along eight paths through the image; jumps are cheap at its edges."""
     image = reference.image
 
-    def jump(a: Float[np.ndarray, "r c 3"], b: Float[np.ndarray, "r c 3"]) -> np.ndarray:
-        contrast = np.abs(a - b).max(axis=-1)
-        penalty = LARGE_PENALTY / (1 + contrast / np.float32(EDGE_CONTRAST))
+    def jump(a: Float32[np.ndarray, "r c 3"], b: Float32[np.ndarray, "r c 3"]) -> np.ndarray:
+        penalty = LARGE_PENALTY / (1 + contrast(a, b) / np.float32(EDGE_CONTRAST))
         return np.maximum(penalty, 1.5 * SMALL_PENALTY).astype(np.float32)
 
     return stereo.semi_global(

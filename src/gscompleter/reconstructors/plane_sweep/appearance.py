@@ -11,17 +11,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from gscompleter.descent import Adam
 from gscompleter.render import Renderer
 from gscompleter.types import SH_C0, Gaussians, View, sh_from_rgb
 
 OPACITY_STEPS = 6
-"""Steps of Adam on the opacities."""
+"""Steps of Adam on the opacities, each by one of the photographs in turn."""
 LEARNING_RATE = 1.0
 """Step of Adam, on the logit."""
+BETAS = 0.7, 0.99
+"""Decay of Adam's means: shorter than usual, as the steps are few."""
 REMOVAL_PENALTY = 0.01
 """Cost of an opacity taken away, so that what no photograph objects to stays."""
 COLOUR_STEPS = 4
@@ -40,13 +40,14 @@ def fit_opacities(gaussians: Gaussians, views: Sequence[View], renderer: Rendere
     nothing = gaussians[:0]
     plans = [(renderer.freeze(nothing, v.camera).plan(gaussians), v.image) for v in views]
     logits = gaussians.opacities.logit(eps=1e-4).requires_grad_()
-    optimizer = Adam([(logits, LEARNING_RATE)])
+    optimizer = Adam([(logits, LEARNING_RATE)], BETAS)
     weight = REMOVAL_PENALTY * len(views) / len(gaussians)
-    for _ in range(OPACITY_STEPS):
+    for step in range(OPACITY_STEPS):
+        plan, image = plans[step % len(plans)]
         opacities = logits.sigmoid()
         removed = (gaussians.opacities - opacities).clamp_min(0).sum()
-        terms = [(plan(opacities).image - image).abs().mean() for plan, image in plans]
-        optimizer.step(torch.stack([*terms, weight * removed]).sum())
+        difference = (plan(opacities).image - image).abs().mean()
+        optimizer.step(len(views) * difference + weight * removed)
     return replace(gaussians, opacities=logits.detach().sigmoid())
 
 
@@ -58,22 +59,9 @@ def fit_colours(gaussians: Gaussians, views: Sequence[View], renderer: Renderer)
     """
     nothing, colours = gaussians[:0], gaussians.sh[:, 0] * SH_C0 + 0.5
     plans = [(renderer.freeze(nothing, v.camera).plan_colours(gaussians), v.image) for v in views]
-    drawn = torch.zeros_like(gaussians.opacities)
-    for step in range(COLOUR_STEPS):
-        moved = torch.zeros_like(colours)
-        for plan, photograph in plans:
-            variable = colours.clone().requires_grad_()
-            image = plan(variable).image
-            moved += backprojected(image, photograph - image.detach(), variable)
-            if step == 0:
-                drawn += backprojected(image, torch.ones_like(image), variable).mean(dim=-1)
+    for _ in range(COLOUR_STEPS):
+        sums, weights = zip(*(errors(colours, image) for errors, image in plans), strict=True)
         # What is hardly drawn is hardly known.
-        colours = colours + RELAXATION * moved / drawn.clamp_min(0.05)[:, None]
+        drawn = torch.stack(weights).sum(0).clamp_min(0.05)
+        colours = colours + RELAXATION * torch.stack(sums).sum(0) / drawn[:, None]
     return replace(gaussians, sh=sh_from_rgb(colours))
-
-
-def backprojected(
-    image: Float[Tensor, "h w 3"], values: Float[Tensor, "h w 3"], colours: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3"]:
-    """The sum of `values` over the pixels each Gaussian is drawn on, by its share of them."""
-    return torch.autograd.grad((image * values).sum(), colours, retain_graph=True)[0]

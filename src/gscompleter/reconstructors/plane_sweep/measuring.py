@@ -27,6 +27,8 @@ from gscompleter.reconstructors.plane_sweep.rig import Rig
 Map = Float32[np.ndarray, "_ _"]
 Planes = Float32[np.ndarray, "d"]
 """Inverse depths from far to near, evenly spaced."""
+GUIDED_FROM = 192
+"""Pixels of the shortest side from which images of half the size say first where to look."""
 BACKGROUND_WEIGHT = np.float32(0.3)
 """How much the background's depth counts where an object hides it from the other views."""
 
@@ -69,21 +71,9 @@ class Measured:
         return replace(self, index=index, weight=weight, confidence=confidence)
 
 
-def measured(rig: Rig, near: float, far: float, guesses: bool = False) -> list[Measured]:
-    """What matching says of each view.
-
-    Args:
-        rig: The views.
-        near, far: z-depths in scene units.
-        guesses: Whether images of half the size say first where to look.
-    """
-    depths, numbers = (near / rig.unit, far / rig.unit), range(len(rig.images))
-    sweeps: list[Sweep]
-    if guesses:
-        small = rig.halved()
-        sweeps = [swept(i, rig, *depths, swept(i, small, *depths)) for i in numbers]
-    else:
-        sweeps = [swept(i, rig, *depths) for i in numbers]
+def measured(rig: Rig, near: float, far: float) -> list[Measured]:
+    """What matching says of each view, between z-depths in scene units."""
+    sweeps = sweeps_of(rig, near / rig.unit, far / rig.unit)
     confidences = confidences_of(sweeps, rig)
     sure = [
         np.where(confidence > 0, sweep.inverse, UNKNOWN)
@@ -93,6 +83,18 @@ def measured(rig: Rig, near: float, far: float, guesses: bool = False) -> list[M
         with_background(i, sweep, confidence, sure, rig)
         for i, (sweep, confidence) in enumerate(zip(sweeps, confidences, strict=True))
     ]
+
+
+def sweeps_of(rig: Rig, near: float, far: float) -> list[Sweep]:
+    """The planes that match best in each view, between depths in widest baselines.
+
+    A pyramid: what images of half the size say leaves a band of planes to each tile.
+    """
+    numbers = range(len(rig.images))
+    if min(min(image.size) for image in rig.images) < GUIDED_FROM:
+        return [swept(i, rig, near, far) for i in numbers]
+    guesses = sweeps_of(rig.halved(), near, far)
+    return [swept(i, rig, near, far, guesses[i]) for i in numbers]
 
 
 def swept(number: int, rig: Rig, near: float, far: float, guess: Sweep | None = None) -> Sweep:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from gscompleter.matching.stereo_image import StereoImage
+from gscompleter.matching.stereo_image import StereoImage, contrast, largest
 from gscompleter.reconstructors.plane_sweep.measuring import Measured
 from gscompleter.reconstructors.plane_sweep.rig import Rig
 
@@ -110,7 +110,7 @@ def slope_of(image: StereoImage) -> Map:
     across, down = (
         cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1))
     )
-    return np.hypot(across, down).max(axis=-1)
+    return largest(cv2.magnitude(across, down))
 
 
 def difference_from(core: Mask, image: StereoImage) -> Map:
@@ -119,7 +119,7 @@ def difference_from(core: Mask, image: StereoImage) -> Map:
     size = (4 * EDGE + 1, 4 * EDGE + 1)
     total = cv2.boxFilter(weight, -1, size)
     mean = cv2.boxFilter(colour * weight[..., None], -1, size) / np.maximum(total, 1e-6)[..., None]
-    return np.abs(colour - mean).max(axis=-1)
+    return contrast(colour, mean)
 
 
 def reaches_far(outline: Float32[np.ndarray, "n"], measured: Float32[np.ndarray, "m"]) -> bool:

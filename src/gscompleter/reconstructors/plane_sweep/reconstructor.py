@@ -92,12 +92,9 @@ def ranged(views: Sequence[View]) -> list[View]:
 
 
 def matched(rig: Rig, views: Sequence[View], halves: bool) -> list[Measured]:
-    """What stereo measures in each of `views`. Large ones are matched at half their size first, and
-    with `halves` no further."""
-    near, far = depth_range_of(views)
-    if min(min(image.size) for image in rig.images) < HALVED_FROM:
-        return measured(rig, near, far)
-    return measured(rig.halved(), near, far) if halves else measured(rig, near, far, True)
+    """What stereo measures in each of `views`; with `halves` large ones only at half their size."""
+    large = min(min(image.size) for image in rig.images) >= HALVED_FROM
+    return measured(rig.halved() if large and halves else rig, *depth_range_of(views))
 
 
 def surfaces_of(image: StereoImage, found: Measured) -> Layer:

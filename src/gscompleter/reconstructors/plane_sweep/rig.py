@@ -54,7 +54,8 @@ def halved(image: StereoImage) -> StereoImage:
     """An image of half the size; the last row or column of an odd one is doubled before."""
     h, w = image.size
     even = np.pad(image.image, ((0, h % 2), (0, w % 2), (0, 0)), mode="edge")
-    pixels = even.reshape((h + 1) // 2, 2, (w + 1) // 2, 2, 3).mean(axis=(1, 3))
+    rows = even[::2] + even[1::2]
+    pixels = (rows[:, ::2] + rows[:, 1::2]) / 4
     K = image.K * np.array([[0.5], [0.5], [1.0]])
     return replace(image, image=pixels.astype(np.float32), K=K)
 

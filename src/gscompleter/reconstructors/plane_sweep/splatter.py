@@ -63,17 +63,17 @@ class Splatter:
         parts = [self.splat(view, depth) for view, depth in zip(even, depths, strict=True)]
         every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
         chosen = self.chosen(every, on_cpu, layers, transforms)
-        behind = [self.sky_behind(view, depth) for view, depth in zip(even, depths, strict=True)]
-        made = merge([every[chosen], *(gaussians.to("cpu") for gaussians, _ in behind)])
+        behind = self.skies_behind(even, depths)
+        made = merge([every[chosen], *(gaussians.to("cpu") for _, gaussians, _ in behind)])
         fitted = with_sky_of(made, self.fitted(made, on_cpu, gains), on_cpu[0].camera)
         rows = torch.cat([torch.arange(len(part)) for part in parts])[chosen]
         numbers = torch.cat([torch.full((len(part),), i) for i, part in enumerate(parts)])[chosen]
-        more = [torch.full((len(pixels),), i) for i, (_, pixels) in enumerate(behind)]
+        more = [torch.full((len(pixels),), i) for i, _, pixels in behind]
         return Reconstruction(
             fitted.to(device),
             tuple(depths),
             torch.cat([numbers, *more]).to(device),
-            torch.cat([rows, *(pixels.cpu() for _, pixels in behind)]).to(device),
+            torch.cat([rows, *(pixels.cpu() for _, _, pixels in behind)]).to(device),
             None if (gains == 1).all() else gains.to(device),
         )
 
@@ -120,9 +120,17 @@ class Splatter:
         """A disc for every pixel of `view`."""
         return discs(view, depth.depth, normals_of(depth.depth, view), self.disc_sigma)
 
-    def sky_behind(self, view: View, depth: DepthMap) -> tuple[Gaussians, Int[Tensor, "n"]]:
-        """The sky behind what stands before it in `view`, and the pixels it lies at."""
-        return sky_behind(view, is_sky(depth.depth, view.camera), self.disc_sigma)
+    def skies_behind(
+        self, views: Sequence[View], depths: Sequence[DepthMap]
+    ) -> list[tuple[int, Gaussians, Int[Tensor, "n"]]]:
+        """Of each view that shows the sky its number, the sky behind what stands before it, and the
+        pixels that lies at."""
+        shown = [is_sky(d.depth, v.camera) for v, d in zip(views, depths, strict=True)]
+        return [
+            (i, *sky_behind(view, sky, self.disc_sigma))
+            for i, (view, sky) in enumerate(zip(views, shown, strict=True))
+            if sky.any()
+        ]
 
 
 def gains_among(layers: Sequence[Layer], transforms: Transforms) -> Float[Tensor, "views 3"]:

@@ -15,6 +15,7 @@ from jaxtyping import Float32
 
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.kernels import variation
+from gscompleter.matching.stereo_image import contrast
 
 Image = Float32[np.ndarray, "h w 3"]
 Map = Float32[np.ndarray, "h w"]
@@ -73,13 +74,12 @@ def beginning(data: AnyMap, weight: AnyMap) -> AnyMap:
 def step_costs(image: Image) -> tuple[Map, Map]:
     """What a step to the right neighbour costs, and to the one below: less at an edge."""
 
-    def cost(contrast: Map) -> Map:
-        share = np.maximum(np.exp(-contrast / EDGE_CONTRAST), LEAST_PENALTY)
+    def cost(beside: Image) -> Map:
+        share = np.maximum(np.exp(-contrast(image, beside) / EDGE_CONTRAST), LEAST_PENALTY)
         return (STEP_PENALTY * share).astype(np.float32)
 
-    across = np.abs(np.diff(image, axis=1, append=image[:, -1:])).max(axis=-1)
-    down = np.abs(np.diff(image, axis=0, append=image[-1:])).max(axis=-1)
-    return cost(across), cost(down)
+    right, below = np.append(image[:, 1:], image[:, -1:], 1), np.append(image[1:], image[-1:], 0)
+    return cost(right), cost(below)
 
 
 def halved(data: Map, weight: Map, image: Image) -> Level:
