@@ -100,12 +100,14 @@ BROUGHT = "brought"
 """The part that only scenes need that are brought."""
 PARTS: dict[str, Callable[[str], None]] = {
     "cpu": render_with,
-    "plane-sweep": reconstruct_with,
-    "warp-inpaint": synthesize_with,
     BROUGHT: fold_brought,
+    "warp-inpaint": synthesize_with,
+    "plane-sweep": reconstruct_with,
 }
-"""The parts that have kernels, and how each is rehearsed. Of two processes the one that has the
-second to do takes about as long as the other with the first and the third."""
+"""The parts that have kernels, and how each is rehearsed. The last draws, too, and finds what the
+first compiled."""
+DRAWING = "cpu", BROUGHT
+"""Parts that one process rehearses while another has the rest, which takes about as long."""
 
 COMPILING = "compiling kernels for this machine, once"
 """What it is called while it goes on."""
@@ -125,14 +127,20 @@ def compile_kernels(names: Sequence[str]) -> float | None:
     missing = [name for name in PARTS if name in names and not is_compiled(name)]
     if not missing:
         return None
-    count = min(len(missing), threads())
-    expected = SECONDS * len(missing) / len(PARTS) / count
+    own, *others = shares_of(missing, threads())
+    expected = SECONDS * len(missing) / len(PARTS) / (1 + len(others))
     start = time.perf_counter()
-    own, *others = (missing[i::count] for i in range(count))
     with expecting([(COMPILING, expected)]), stage(COMPILING), rehearsed_apart(others):
         for name in own:
             rehearse(name)
     return time.perf_counter() - start
+
+
+def shares_of(names: Sequence[str], count: int) -> list[list[str]]:
+    """What each of at most two, and at most `count`, processes rehearses."""
+    drawing = [name for name in names if name in DRAWING]
+    rest = [name for name in names if name not in DRAWING]
+    return [share for share in (drawing, rest) if share] if count > 1 else [list(names)]
 
 
 @contextmanager

@@ -68,7 +68,8 @@ def _mean(pyramid, y, x, number, sums, mean):
             for c in range(count):
                 mean[c] = sums[c] / sums[count]
             return
-    mean[:] = pyramid.everywhere
+    for c in range(count):
+        mean[c] = pyramid.everywhere[c]
 
 
 @njit(cache=True, fastmath={"contract"})

@@ -1059,7 +1059,10 @@ def _with_room(kept, used):
     if used + TILE <= len(kept):
         return kept
     wider = _aligned(2 * kept.size).reshape((2 * len(kept), TILE))
-    wider[:used] = kept[:used]
+    # Slices assigned to slices take seconds to compile.
+    for row in range(used):
+        for column in range(TILE):
+            wider[row, column] = kept[row, column]
     return wider
 
 
