@@ -159,7 +159,6 @@ def test_the_command_says_what_it_did(scene, tmp_path, monkeypatch, capsys):
         (("--context", 9), "frame"),
         (("--config.tolerance", -1), "tolerance"),
         (("--resolution", 8), "at least 16"),
-        (("--scene", "missing.ply"), "missing.ply"),
         (("--near", 5, "--far", 2), "not before"),
     ],
 )
@@ -171,6 +170,11 @@ def test_wrong_input_gets_a_sentence(scene, tmp_path, monkeypatch, capsys, more,
     assert sentence in said
     assert said.count("\n") == 1
     assert not out.exists()
+
+
+def test_a_splat_that_is_not_there_is_refused(scene, tmp_path, monkeypatch, capsys):
+    assert run(monkeypatch, *clean(scene, tmp_path / "missing.ply", tmp_path / "out")) == 2
+    assert "missing.ply" in capsys.readouterr().err
 
 
 def test_a_folder_with_something_in_it_is_kept(scene, tmp_path, monkeypatch):
