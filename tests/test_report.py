@@ -24,7 +24,7 @@ from gscompleter.reports.evaluation_page import evaluation_page
 from gscompleter.reports.figures import affine_scatter, colour_scale, loss_curve, ticks, time_bars
 from gscompleter.reports.finished import Affine, TargetRow
 from gscompleter.reports.page import data_uri, gallery_of
-from gscompleter.reports.plain_words import about_target, gain, percent, shown
+from gscompleter.reports.plain_words import about_target, gain, moved, percent, shown
 from gscompleter.reports.record import MAX_LOOKS, most_changed
 from gscompleter.types import DepthMap, Render
 
@@ -426,3 +426,9 @@ def test_damaged_tables_are_refused(evaluated, name):
     (evaluated / name).write_text('{"methods": 5}')
     with pytest.raises(InputError, match="does not hold what a report needs"):
         evaluation_page(evaluated)
+
+
+def test_that_something_moved_is_told_with_where():
+    assert moved({7: 0.0, 15: 0.0}) is None
+    said = moved({7: 0.0155, 15: 0.0, 23: 0.006})
+    assert "1.6 % of frame 7, 0.6 % of frame 23" in said

@@ -57,7 +57,7 @@ from gscompleter.reports.film import NAME as FILM
 from gscompleter.reports.film import write_film
 from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
-from gscompleter.reports.plain_words import NO_TARGET
+from gscompleter.reports.plain_words import NO_TARGET, moved
 from gscompleter.types import Camera, Completion, View
 
 
@@ -264,6 +264,9 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
             "compared here. Those of targets are compared as they were taken.",
             soft_wrap=True,
         )
+    said = moved({row["frame"]: row["contradicted"] for row in summary["context"]})
+    if said is not None:
+        console.print(said, soft_wrap=True)
     origin = summary["frame"]["origin"]
     if any(origin):
         console.print(

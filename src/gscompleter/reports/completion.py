@@ -25,7 +25,7 @@ from gscompleter.reports.record import Limits, most_changed, record_of, write_re
 from gscompleter.splats.layout import save_like
 from gscompleter.splats.removed import NAME as REMOVED
 from gscompleter.splats.removed import save_removed
-from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion
+from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion, View
 
 GENERATED = "generated.ply"
 """The file with what was added, alone."""
@@ -106,7 +106,12 @@ def summarize(
         "version": __version__,
         **said,
         "context": [
-            {"frame": view.frame, **images.scores(), "gain": gain}
+            {
+                "frame": view.frame,
+                **images.scores(),
+                "gain": gain,
+                "contradicted": contradicted_share(view),
+            }
             for view, images, gain in zip(
                 completion.views, context_images, gains_of(completion), strict=True
             )
@@ -143,6 +148,11 @@ def gains_of(completion: Completion) -> list[list[float] | None]:
     if completion.gains is None:
         return [None] * len(completion.views)
     return completion.gains.tolist()
+
+
+def contradicted_share(view: View) -> float:
+    """Share of a photograph that the others contradict."""
+    return 0.0 if view.contradicted is None else view.contradicted.float().mean().item()
 
 
 def counts(completion: Completion) -> dict[str, int]:

@@ -49,6 +49,8 @@ class ContextRow(Scores):
 
     gain: tuple[float, ...] | None = None
     """By how much it is brighter than it is compared, by channel; None where it is not."""
+    contradicted: float = 0.0
+    """Share of it that the others contradict, because something moved."""
 
 
 @dataclass(frozen=True)

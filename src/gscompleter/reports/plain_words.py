@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from gscompleter.reports.finished import Summary, TargetRow
 
@@ -17,6 +17,17 @@ PLACED = {
 """By how the frame of a splat was found, what is said of it."""
 NO_TARGET = "No camera was found that has much to gain; nothing was completed."
 """What is said of a completion without any target."""
+
+
+def moved(shares: Mapping[int | None, float]) -> str | None:
+    """What is said where photographs, by their frames, are contradicted in a share of them."""
+    told = [f"{percent(share)} of frame {frame}" for frame, share in shares.items() if share > 0]
+    if not told:
+        return None
+    return (
+        f"Something moved between the photographs, for they contradict each other in "
+        f"{', '.join(told)}: what is completed takes nothing from there."
+    )
 
 
 def about_target(row: TargetRow) -> list[str]:
@@ -47,6 +58,9 @@ def opened(summary: Summary) -> Iterator[str]:
             "The coordinates are large against the distances between the cameras, so the result is "
             "relative to a local origin; summary.json has it."
         )
+    seen_to_move = moved({row.frame: row.contradicted for row in summary.context})
+    if seen_to_move is not None:
+        yield seen_to_move
     if summary.settings.get("context") is None:
         yield (
             f"Nobody named the photographs to work with: {summary.scene.used} of "
