@@ -25,8 +25,8 @@ def moved(shares: Mapping[int | None, float]) -> str | None:
     if not told:
         return None
     return (
-        f"Photographs contradict each other in {', '.join(told)}, as where something moves: what is "
-        "completed takes nothing from there."
+        f"Photographs contradict each other in {', '.join(told)}, as where something moves: what "
+        "is completed takes nothing from there."
     )
 
 
