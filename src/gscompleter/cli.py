@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from types import ModuleType
 from typing import Annotated, Any, Union
 
 import tyro
@@ -35,6 +38,7 @@ from gscompleter.commands.warmup import WarmupOptions
 from gscompleter.commands.words import read_words, sentence_of
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
+from gscompleter.garbage import staying
 from gscompleter.interrupts import treat_stops_alike
 from gscompleter.threads import bound_threads
 
@@ -74,6 +78,8 @@ def main() -> None:
         print(__version__)
         return
     treat_stops_alike()
+    # Python ends a second earlier where it need not search torch for garbage once more.
+    atexit.register(gc.freeze)
     # Pillow warns of damage in a photograph that is read all the same, or refused in a sentence.
     warnings.filterwarnings("ignore", module="PIL")
     try:
@@ -81,7 +87,7 @@ def main() -> None:
         if isinstance(options, ComputeOptions):
             bound_threads(options.threads)
         _, module, function = COMMANDS[words[0]]
-        getattr(import_module(module), function)(options)
+        getattr(imported(module), function)(options)
     except InputError as error:
         print(f"gscompleter: {sentence_of(error)}", file=sys.stderr)
         sys.exit(2)
@@ -90,6 +96,12 @@ def main() -> None:
         state = "the same command goes on from here" if goes_on else "nothing was written"
         print(f"gscompleter: interrupted; {str(stop) or state}.", file=sys.stderr)
         sys.exit(130)
+
+
+def imported(module: str) -> ModuleType:
+    """The module of that name and all that it needs, which stays to the end."""
+    with staying():
+        return import_module(module)
 
 
 def parsed(words: Sequence[str]) -> Any:

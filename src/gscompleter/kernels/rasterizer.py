@@ -1104,7 +1104,7 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
         n, n_begin, n_end = n_start[tile], n_start[tile], n_start[tile + 1]
         c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
         n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
-        place = 0
+        place = np.int64(0)  # with a plain 0, what takes it is compiled once more
         while open_rows > 0 and (c < c_end or n < n_end):
             kept = _with_room(kept, place)
             if c_depth <= n_depth:
