@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gscompleter.generators.warp_inpaint.exemplar import likelihood
 from gscompleter.kernels import patchmatch
 from gscompleter.kernels.patchmatch import RADIUS, SIDE
 
@@ -111,3 +112,17 @@ def test_a_pixel_is_the_mean_of_what_all_patches_over_it_say():
     where = totals > 0
     assert np.abs(voted[0][where] - colours[where] / totals[where][:, None]).max() < 1e-5
     assert not voted[0][~where].any()
+
+
+def test_what_only_costly_patches_tell_of_is_still_their_mean():
+    _, found = matched()
+    field, shift = at_random(found), np.zeros((len(found.queries), 3), np.float32)
+    middle = int(np.quantile(found.queries[:, 1], 0.8))
+    cheap = found.queries[:, 1] < middle
+    votes = likelihood(np.where(cheap, np.float32(1e-4), np.float32(1)))
+    colours = patchmatch.vote(found.query_at, votes, found.sources, field, shift)[0]
+    alike = patchmatch.vote(found.query_at, np.ones_like(votes), found.sources, field, shift)[0]
+    costly = np.s_[:, middle + RADIUS :]
+    assert alike[costly].any()
+    assert np.abs(colours[costly] - alike[costly]).max() < 1e-4
+    assert votes[cheap].min() > 1e3 * votes[~cheap].max()

