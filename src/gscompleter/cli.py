@@ -9,7 +9,6 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from types import ModuleType
 from typing import Annotated, Any, Union
 
 import tyro
@@ -83,11 +82,13 @@ def main() -> None:
     # Pillow warns of damage in a photograph that is read all the same, or refused in a sentence.
     warnings.filterwarnings("ignore", module="PIL")
     try:
-        options = checked(parsed(words))
-        if isinstance(options, ComputeOptions):
-            bound_threads(options.threads)
-        _, module, function = COMMANDS[words[0]]
-        getattr(imported(module), function)(options)
+        with staying():
+            options = checked(parsed(words))
+            if isinstance(options, ComputeOptions):
+                bound_threads(options.threads)
+            _, module, function = COMMANDS[words[0]]
+            command = getattr(import_module(module), function)
+        command(options)
     except InputError as error:
         print(f"gscompleter: {sentence_of(error)}", file=sys.stderr)
         sys.exit(2)
@@ -96,12 +97,6 @@ def main() -> None:
         state = "the same command goes on from here" if goes_on else "nothing was written"
         print(f"gscompleter: interrupted; {str(stop) or state}.", file=sys.stderr)
         sys.exit(130)
-
-
-def imported(module: str) -> ModuleType:
-    """The module of that name and all that it needs, which stays to the end."""
-    with staying():
-        return import_module(module)
 
 
 def parsed(words: Sequence[str]) -> Any:

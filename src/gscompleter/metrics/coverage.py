@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import torch
 
 from gscompleter.coverage import COVERED
+from gscompleter.frames.thinning import thinned
 from gscompleter.geometry import baseline_between, rotation_about, share_of_turn
 from gscompleter.render import Renderer
 from gscompleter.stages.candidates import moved, shrunk, spacing
 from gscompleter.stages.exploration import MAX_GAUSSIANS
-from gscompleter.stages.kept_views import KeptViews
-from gscompleter.types import Camera, Completion, Render
+from gscompleter.types import Camera, Completion, Render, merge
 
 NUM_CAMERAS = 32
 SIDE = 96
@@ -52,14 +52,17 @@ class Look:
 
 def looks_of(completion: Completion, cameras: Sequence[Camera], renderer: Renderer) -> list[Look]:
     """What `cameras` see of the scene in small images, about."""
-    kept, small = KeptViews(renderer, MAX_GAUSSIANS), [shrunk(c, SIDE) for c in cameras]
-    context = completion.context
-    begun = replace(completion, scene=context, set_aside=None, targets=())
-    first = [view.context for view in kept.of(begun, small)]
-    if completion.set_aside is None:
-        kept.grown(context, completion.scene)
-    last = [view.context for view in kept.of(completion, small)]
-    return [Look(before, after) for before, after in zip(first, last, strict=True)]
+    begun, aside = thinned(completion.context, MAX_GAUSSIANS), completion.set_aside is not None
+    kept = thinned(completion.scene[: completion.num_kept], MAX_GAUSSIANS) if aside else begun
+    added = [thinned(result.added, MAX_GAUSSIANS) for result in completion.targets]
+    new = merge([begun[:0], *added])
+
+    def look(camera: Camera) -> Look:
+        first = renderer.freeze(begun, camera)
+        last = renderer.freeze(kept, camera) if aside else first
+        return Look(first.context, last.composite(new))
+
+    return [look(shrunk(camera, SIDE)) for camera in cameras]
 
 
 def coverage_of(looks: Sequence[Look]) -> Coverage:
