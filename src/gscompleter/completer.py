@@ -96,7 +96,8 @@ class Sight:
     """Alpha at the wider camera as far as photographs support it; None where nothing is
     doubted."""
     stereo: Stereo | None = None
-    """What stereo among the photographs shows there; None where nothing is doubted."""
+    """What stereo among the photographs shows there; None where nothing is doubted or that was not
+    asked."""
 
     @property
     def alpha(self) -> Float[Tensor, "h w"]:
@@ -446,15 +447,17 @@ class GSCompleter:
 
     def sight(self, completion: Completion, target: Camera) -> Sight:
         """The scene as it stands, frozen at the target's wider camera, and the target's anchor."""
+        sight = self.without_stereo(completion, target)
+        found = self.stereo(completion, sight.frozen.context, sight.window)
+        return replace(sight, stereo=found)
+
+    def without_stereo(self, completion: Completion, target: Camera) -> Sight:
+        """The same without what stereo among the photographs shows there."""
         window = self.window(completion, target)
         frozen = self.renderer.freeze(completion.scene, window.wide)
+        anchor = self.anchor(completion, window.target)
         return Sight(
-            completion,
-            window,
-            frozen,
-            self.anchor(completion, window.target),
-            self.believed(completion, frozen, window.wide),
-            self.stereo(completion, frozen.context, window),
+            completion, window, frozen, anchor, self.believed(completion, frozen, window.wide)
         )
 
     def anchor(self, completion: Completion, target: Camera) -> AnchorChoice:
@@ -533,7 +536,9 @@ class GSCompleter:
         taken = not_needed(completion.scene, doubtful, views, self.renderer)
         if not taken.any():
             return sight
-        return self.sight(without(completion, taken), sight.window.target)
+        again = self.without_stereo(without(completion, taken), sight.window.target)
+        # Photographs, and what stereo makes of them, stay as they are.
+        return replace(again, stereo=sight.stereo)
 
     def unseen_in_holes(self, sight: Sight, evidence: Evidence) -> Bool[Tensor, "n"]:
         """Which Gaussians of the scene as it stands cover holes and are shown by no photograph."""
