@@ -57,7 +57,7 @@ from gscompleter.reports.film import NAME as FILM
 from gscompleter.reports.film import write_film
 from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
-from gscompleter.reports.plain_words import NO_TARGET, moved
+from gscompleter.reports.plain_words import NO_TARGET, exposures, moved
 from gscompleter.types import Camera, Completion, View
 
 
@@ -256,17 +256,10 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
     console.print(table)
     for note in notes:
         console.print(note)
-    if completion.gains is not None:
-        darkest, brightest = completion.gains.aminmax()
-        console.print(
-            "The photographs of the context differ in exposure, by a factor of up to "
-            f"{(brightest / darkest).item():.2f}; the scene has their mean, in which they are "
-            "compared here. Those of targets are compared as they were taken.",
-            soft_wrap=True,
-        )
-    said = moved({row["frame"]: row["contradicted"] for row in summary["context"]})
-    if said is not None:
-        console.print(said, soft_wrap=True)
+    gains = [row["gain"] for row in summary["context"]]
+    contradicted = {row["frame"]: row["contradicted"] for row in summary["context"]}
+    for sentence in filter(None, (exposures(gains), moved(contradicted))):
+        console.print(sentence, soft_wrap=True)
     origin = summary["frame"]["origin"]
     if any(origin):
         console.print(

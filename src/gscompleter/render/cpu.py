@@ -22,7 +22,7 @@ from gscompleter.kernels import rasterizer
 from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
 from gscompleter.kernels.sharing import ranges, run, share
 from gscompleter.render import ColourErrors, ColourSums, DepthRender, OpacityRender
-from gscompleter.render.folded import Folded, folded
+from gscompleter.render.folded import Folded, float32, folded
 from gscompleter.types import Camera, Gaussians, Render
 
 MAX_SIDE = TILE * np.iinfo(np.int16).max
@@ -488,8 +488,3 @@ def arrays_of(gaussians: Gaussians) -> GaussianArrays:
 def render_of(frame: Frame) -> Render:
     """The frame as tensors, which share its memory."""
     return Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))
-
-
-def float32(values: Tensor) -> Float32[ndarray, "..."]:
-    """The values of a tensor as a contiguous array, not copied where they are one already."""
-    return values.detach().to("cpu", torch.float32).contiguous().numpy()

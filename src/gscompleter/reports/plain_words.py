@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from gscompleter.reports.finished import Summary, TargetRow
 
@@ -27,6 +27,18 @@ def moved(shares: Mapping[int | None, float]) -> str | None:
     return (
         f"Photographs contradict each other in {', '.join(told)}, as where something moves: what "
         "is completed takes nothing from there."
+    )
+
+
+def exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
+    """What is said where Ψ evened out the exposures of photographs by these gains."""
+    factors = [factor for gain in gains for factor in gain or ()]
+    if not factors or min(factors) <= 0:
+        return None
+    return (
+        "The photographs of the context differ in exposure, by a factor of up to "
+        f"{max(factors) / min(factors):.2f}; the scene has their mean, in which they are compared. "
+        "Those of targets are compared as they were taken."
     )
 
 
@@ -70,13 +82,9 @@ def opened(summary: Summary) -> Iterator[str]:
 
 def compared(summary: Summary) -> Iterator[str]:
     """Of what the scores mean."""
-    gains = [gain for row in summary.context for gain in row.gain or ()]
-    if gains and min(gains) > 0:
-        yield (
-            "The photographs of the context differ in exposure, by a factor of up to "
-            f"{max(gains) / min(gains):.2f}; the scene has their mean, in which they are compared. "
-            "Those of targets are compared as they were taken."
-        )
+    evened = exposures([row.gain for row in summary.context])
+    if evened is not None:
+        yield evened
     if summary.settings.get("uses_target_photographs"):
         yield (
             "The generator was shown the photographs of the targets, so the scores measure where "
