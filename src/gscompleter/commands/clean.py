@@ -38,6 +38,7 @@ from gscompleter.progress import preparing, shown_on, stage, track
 from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import Renderer, choose_device, load_renderer
 from gscompleter.reports.completion import save_brought
+from gscompleter.splats.formats import load_splat
 from gscompleter.stages.cleaning import superfluous
 from gscompleter.types import Gaussians
 
@@ -66,9 +67,11 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
         opened = open_scene(options, console)
         with preparing("reading photographs"):
             task = read_photographs(options, opened, device)
+        with preparing("reading the scene"):
+            given = load_splat(options.scene, options.drop_nonfinite)
         compile_kernels([device])
         with preparing("placing the scene"):
-            task = in_frame_of_splat(task, options.scene, options, opened)
+            task = in_frame_of_splat(task, given, options.scene, options, opened)
         task = with_working_range(task, renderer)
         plan = f"judged by {len(task.views)} photographs on {device}"
         plan += f", written to {quoted(options.out)}"

@@ -42,13 +42,14 @@ from gscompleter.commands.output import (
 from gscompleter.commands.understood import understood
 from gscompleter.completer import Clock, GSCompleter, total
 from gscompleter.config import CompleterConfig
+from gscompleter.config.generators import settings_class
 from gscompleter.explorer import Explorer
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.video import check_writer
 from gscompleter.metrics.coverage import coverage_of
 from gscompleter.progress import expecting, preparing, shown_on, stage
-from gscompleter.reconstructors import load_reconstructor
+from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.rehearsal import BROUGHT, compile_kernels
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.completion import Around, Target, write_report
@@ -58,6 +59,7 @@ from gscompleter.reports.film import write_film
 from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
 from gscompleter.reports.plain_words import NO_TARGET, exposures, moved
+from gscompleter.splats.formats import load_splat
 from gscompleter.types import Camera, Completion, View
 
 
@@ -167,23 +169,35 @@ def prepared(
     check_output(options.out, replaceable(options))
     check_context(options)
     check_targets(options)
+    check_reconstructor(options.reconstructor)
+    settings_class(options.synthesis.name)
     device = choose_device(options.device)
     opened = open_scene(options, console)
     with preparing("reading photographs"):
         task = read_task(options, opened, device)
-        if options.scene is not None:
-            task = with_witnesses(task, opened.photographs)
-    brought = [BROUGHT] if options.scene is not None and device == "cpu" else []
-    compile_kernels((device, options.reconstructor, options.synthesis.name, *brought))
-    if options.scene is not None:
-        with preparing("placing the scene"):
-            task = in_frame_of_splat(task, options.scene, options, opened)
+    parts = device, options.reconstructor, options.synthesis.name
+    if options.scene is None:
+        compile_kernels(parts)
+    else:
+        task = with_splat(task, options.scene, options, opened, parts)
     with preparing("loading models"):
         completer = completer_for(options, task.targets, device)
     clock = Clock()
     with preparing("depth range"), clock("context"):
         task = with_working_range(task, completer.renderer)
     return opened, task, Explorer(completer), clock.seconds
+
+
+def with_splat(
+    task: Task, path: Path, options: CompleteOptions, opened: Opened, parts: Sequence[str]
+) -> Task:
+    """`task` with the splat that was brought, once the kernels of these parts are compiled."""
+    with preparing("reading the scene"):
+        task = with_witnesses(task, opened.photographs)
+        given = load_splat(path, options.drop_nonfinite)
+    compile_kernels([*parts, *([BROUGHT] if "cpu" in parts else [])])
+    with preparing("placing the scene"):
+        return in_frame_of_splat(task, given, path, options, opened)
 
 
 def said_in_advance(

@@ -35,7 +35,7 @@ from gscompleter.matching.depth_range import estimate_depth_range
 from gscompleter.memory import check_memory, images_that_fit
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.reports.completion import Brought, Target
-from gscompleter.splats.formats import format_of, load_splat
+from gscompleter.splats.formats import format_of
 from gscompleter.stages.context import working_range
 from gscompleter.stages.overview import overview, select_overview
 from gscompleter.stages.selection import points_before, select_context
@@ -189,15 +189,16 @@ def task_of(
     return Task(views, targets, frame_from_photographs(given.origin), given.origin, depths)
 
 
-def in_frame_of_splat(task: Task, path: Path, options: SceneOptions, opened: Opened) -> Task:
+def in_frame_of_splat(
+    task: Task, scene: Gaussians, path: Path, options: SceneOptions, opened: Opened
+) -> Task:
     """`task` with the splat of a file, its cameras brought to where the photographs show it.
 
     Raises:
-        InputError: where the file is damaged, or the photographs show something else.
+        InputError: where the photographs show something else.
     """
     given, device = opened.photographs, task.views[0].image.device
     cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
-    scene = load_splat(path, drop_nonfinite=options.drop_nonfinite)
     origin = origin_of(scene, given.origin)
     scene = told_from(origin, scene, cameras).to(device)
     splat = GivenSplat(path, scene, origin, options.folder)

@@ -103,6 +103,15 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
 the device that it runs on."""
 
 
+def check_reconstructor(name: str) -> None:
+    """Raise InputError where there is no reconstructor of that name."""
+    if name not in RECONSTRUCTORS:
+        raise InputError(
+            f"There is no reconstructor '{quoted(name)}'; choose one of "
+            f"{', '.join(RECONSTRUCTORS)}."
+        )
+
+
 def load_reconstructor(
     name: str, weights: Path | str | None = None, device: str = "cpu"
 ) -> Reconstructor:
@@ -118,9 +127,5 @@ def load_reconstructor(
         InputError: where there is none of that name, it takes no weights and some are given, or
             they cannot be had or do not fit.
     """
-    if name not in RECONSTRUCTORS:
-        raise InputError(
-            f"There is no reconstructor '{quoted(name)}'; choose one of "
-            f"{', '.join(RECONSTRUCTORS)}."
-        )
+    check_reconstructor(name)
     return RECONSTRUCTORS[name](None if weights is None else Path(weights), device)
