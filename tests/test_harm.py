@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gscompleter.config import HarmConfig
-from gscompleter.render import load_renderer
+from gscompleter.render import in_colours, load_renderer
 from gscompleter.stages import harm
 from gscompleter.stages.harm import do_no_harm, error_with_loss, fewest, squared_error
 from gscompleter.types import merge
@@ -38,6 +38,26 @@ def test_no_photograph_is_matched_worse_than_allowed(halvings, removals, monkeyp
     monkeypatch.setattr(harm, "REMOVALS", removals)
     mended = do_no_harm(harmful, [frozen], [view], [allowed])
     assert squared_error(frozen.composite(mended).image, view.image).item() <= allowed
+
+
+def test_drawings_that_are_known_already_are_asked_instead():
+    view = view_of(ROOM, CAMERA)
+    context = gaussians_of(view)
+    harmful = replace(gaussians_of(view, torch.full((SIZE, SIZE), 1.0)), sh=-context.sh)
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    allowed = error_with_loss(squared_error(frozen.context.image, view.image).item(), 0.05)
+    asked: list[torch.Tensor] = []
+    folded = in_colours(frozen.plan_appearance(harmful), harmful.sh)
+
+    def draw(opacities: torch.Tensor) -> torch.Tensor:
+        asked.append(opacities)
+        return folded(opacities)
+
+    mended = do_no_harm(harmful, [frozen], [view], [allowed], drawings=[draw])
+    assert len(asked) > 2
+    assert squared_error(folded(mended.opacities), view.image).item() <= allowed
+    expected = do_no_harm(harmful, [frozen], [view], [allowed])
+    assert (mended.opacities - expected.opacities).abs().mean() < 1e-3
 
 
 def test_where_halving_does_not_help_only_the_worst_pixels_are_given_up(monkeypatch):

@@ -162,12 +162,13 @@ def test_what_is_added_is_fitted_to_all_photographs_at_once():
     allowed = [error_of(SURFACES, v) for v in VIEWS]
     target = RENDERER.freeze(SURFACES, TARGET)
     holes = target.context.alpha < 0.5
+    new = merge([hidden[~seen], black])
     added, losses = reconcile(
-        merge([hidden[~seen], black]),
+        new,
         target,
         view,
         holes,
-        [RENDERER.freeze(SURFACES, v.camera) for v in VIEWS],
+        [RENDERER.freeze(SURFACES, v.camera).plan_appearance(new) for v in VIEWS],
         VIEWS,
         allowed,
     )

@@ -20,7 +20,7 @@ from gscompleter.geometry import project, same_camera, sample, slide, widened
 from gscompleter.masks import dilate
 from gscompleter.progress import stage, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.render import FrozenView, Renderer, load_renderer
+from gscompleter.render import FrozenView, Renderer, in_colours, load_renderer
 from gscompleter.stages.anchor import (
     AnchorChoice,
     Synthesized,
@@ -436,13 +436,16 @@ class GSCompleter:
             refined, losses = refine_opacities(
                 kept, sight.frozen, reference, near_frozen, near_views, config.refine
             )
+            drawings = None
         else:
             holes, degree = self.holes(sight), completion.context.sh_degree
             settings = config.reconcile.at_most(degree)
+            plans = [view.plan_appearance(kept) for view in frozen]
             refined, losses = reconcile(
-                kept, sight.frozen, reference, holes, frozen, watching, allowed, settings
+                kept, sight.frozen, reference, holes, plans, watching, allowed, settings
             )
-        harmless = do_no_harm(refined, frozen, watching, allowed, config.harm)
+            drawings = [in_colours(plan, refined.sh) for plan in plans]
+        harmless = do_no_harm(refined, frozen, watching, allowed, config.harm, drawings)
         return (refined[:0] if is_undone(refined, harmless, config.harm) else harmless), losses
 
     def sight(self, completion: Completion, target: Camera) -> Sight:

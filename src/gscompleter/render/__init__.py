@@ -21,6 +21,14 @@ from gscompleter.types import Camera, Gaussians, Render
 OpacityRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene plus Gaussians of which only the opacities [n] may change."""
 
+OpacityImage = Callable[[Float[Tensor, "n"]], Float[Tensor, "h w 3"]]
+"""The image of it."""
+
+
+def image_of(plan: OpacityRender) -> OpacityImage:
+    """The image of what a plan renders."""
+    return lambda opacities: plan(opacities).image
+
 
 DepthRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene plus Gaussians of which only the z-depths [n] may change."""
@@ -29,6 +37,11 @@ DepthRender = Callable[[Float[Tensor, "n"]], Render]
 AppearanceRender = Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, "h w 3"]]
 """The image of a frozen scene plus Gaussians of which only the opacities [n] and the spherical
 harmonics [n, k, 3] may change."""
+
+
+def in_colours(plan: AppearanceRender, sh: Float[Tensor, "n k 3"]) -> OpacityImage:
+    """The image that a plan draws in these colours."""
+    return lambda opacities: plan(opacities, sh)
 
 
 ColourSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]

@@ -21,7 +21,7 @@ from torch.nn.functional import avg_pool2d
 
 from gscompleter.config.cleaning import CleaningConfig
 from gscompleter.progress import track
-from gscompleter.render import OpacityRender, Renderer
+from gscompleter.render import OpacityRender, Renderer, image_of
 from gscompleter.stages.harm import error_slope, error_with_loss
 from gscompleter.stages.setting_aside import error_of, without_needed
 from gscompleter.stages.support import weight_sums
@@ -95,7 +95,7 @@ def change_without(
     plan = renderer.freeze(scene[:0], view.camera).plan(scene)
     full = scene.opacities
     left = torch.where(faded, full.clamp_max(FADED), full)
-    error, slope = error_slope(plan, view, left)
+    error, slope = error_slope(image_of(plan), view, left)
     square = mean_squares(plan, left, probes, generator)
     # The parabola about `left`, at no opacity less at full opacity.
     return (square * (left**2 - (full - left) ** 2) - slope * full) / max(error, LEAST)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gscompleter.config import HarmConfig
 from gscompleter.masks import dilate
-from gscompleter.render import FrozenView, OpacityRender
+from gscompleter.render import FrozenView, OpacityImage, image_of
 from gscompleter.stages.integration import falling_on
 from gscompleter.types import Gaussians, View
 
@@ -30,6 +30,7 @@ def do_no_harm(
     views: Sequence[View],
     allowed_errors: Sequence[float],
     config: HarmConfig = HarmConfig(),
+    drawings: Sequence[OpacityImage] | None = None,
 ) -> Gaussians:
     """`added` with opacities lowered until no photograph is matched worse than allowed.
 
@@ -44,16 +45,18 @@ def do_no_harm(
         views: The photographs.
         allowed_errors: Largest mean squared error allowed in each view.
         config: How it is checked.
+        drawings: What draws each of the views with other opacities of `added`, where that is known
+            already.
     """
     if config.tolerance is None or len(added) == 0:
         return added
-    checks = [
-        Check(view, frozen.context.image, frozen.plan(added), allowed)
-        for frozen, view, allowed in zip(frozen_views, views, allowed_errors, strict=True)
-    ]
+    if drawings is None:
+        drawings = [image_of(frozen.plan(added)) for frozen in frozen_views]
+    before = [frozen.context.image for frozen in frozen_views]
+    checks = [Check(*each) for each in zip(views, before, drawings, allowed_errors, strict=True)]
     opacities = added.opacities
     for trial in range(HALVINGS + REMOVALS + 1):
-        drawn = [(check, check.plan(opacities).image) for check in checks]
+        drawn = [(check, check.draw(opacities)) for check in checks]
         worse = [(check, image) for check, image in drawn if check.excess(image) > 0]
         if not worse:
             break
@@ -70,7 +73,7 @@ class Check:
     view: View
     before: Float[Tensor, "h w 3"]
     """What it sees of the scene without what is added."""
-    plan: OpacityRender
+    draw: OpacityImage
     """What it sees with it."""
     allowed: float
     """Largest mean squared error."""
@@ -89,7 +92,7 @@ class Check:
         """Which of `added`, of the opacities that gave `image`, are to give way."""
         if HALVINGS <= trial < HALVINGS + REMOVALS:
             return self.at_worst(image, added)
-        _, slope = error_slope(self.plan, self.view, opacities)
+        _, slope = error_slope(self.draw, self.view, opacities)
         if trial < HALVINGS:
             return fewest(slope * opacities / 2, self.excess(image))
         return slope != 0
@@ -127,12 +130,12 @@ def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
 
 
 def error_slope(
-    plan: OpacityRender, view: View, opacities: Float[Tensor, "n"]
+    draw: OpacityImage, view: View, opacities: Float[Tensor, "n"]
 ) -> tuple[float, Float[Tensor, "n"]]:
     """Error against the photograph, and how it grows with each opacity."""
     with torch.enable_grad():
         variable = opacities.detach().clone().requires_grad_()
-        image = view.compared(plan(variable).image)
+        image = view.compared(draw(variable))
         (slope,) = torch.autograd.grad((image - view.image).square().mean(), variable)
     return squared_error(image.detach(), view.image).item(), slope
 

@@ -36,7 +36,7 @@ def reconcile(
     frozen_target: FrozenView,
     reference: View,
     holes: Bool[Tensor, "h w"],
-    frozen_views: Sequence[FrozenView],
+    plans: Sequence[AppearanceRender],
     views: Sequence[View],
     allowed_errors: Sequence[float],
     config: ReconcileConfig = ReconcileConfig(),
@@ -48,7 +48,7 @@ def reconcile(
         frozen_target: The scene frozen at the target.
         reference: The synthesized image there.
         holes: Where the scene is to look like it.
-        frozen_views: The scene frozen at the camera of each of `views`.
+        plans: What draws each of `views` with other looks of `added`.
         views: The photographs.
         allowed_errors: Largest mean squared error allowed in each of them.
         config: How long, and how freely.
@@ -62,7 +62,6 @@ def reconcile(
     fit = Fit(added, config)
     at_target = frozen_target.plan_appearance(added)
     before = hole_error(frozen_target.context.image, reference, holes).clamp_min(1e-12)
-    plans = [frozen.plan_appearance(added) for frozen in frozen_views]
     asked = [Asked(*each) for each in zip(plans, views, allowed_errors, strict=True)]
     with torch.no_grad():
         turns = Turns([fit.excess(photograph).item() for photograph in asked])

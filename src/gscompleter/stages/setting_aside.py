@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.render import OpacityRender, Renderer
+from gscompleter.render import OpacityRender, Renderer, image_of
 from gscompleter.stages.harm import error_slope, fewest, squared_error
 from gscompleter.types import Gaussians, View
 
@@ -54,11 +54,11 @@ def without_needed(
     """
     candidates, rest = scene[doubtful], scene[~doubtful]
     missing = torch.ones(len(candidates), dtype=torch.bool, device=doubtful.device)
+    plans = [renderer.freeze(rest, view.camera).plan(candidates) for view in views]
     before = None
     while before is None or not torch.equal(missing, before):
         before = missing
-        for view, error in zip(views, allowed, strict=True):
-            plan = renderer.freeze(rest, view.camera).plan(candidates)
+        for plan, view, error in zip(plans, views, allowed, strict=True):
             missing = missing & ~needed(plan, candidates.opacities, missing, view, error)
     return doubtful.masked_scatter(doubtful, missing)
 
@@ -71,7 +71,7 @@ def wanted(
     missed = torch.zeros(len(candidates), dtype=torch.bool, device=doubtful.device)
     for view in views:
         plan = renderer.freeze(rest, view.camera).plan(candidates)
-        error, slope = error_slope(plan, view, candidates.opacities)
+        error, slope = error_slope(image_of(plan), view, candidates.opacities)
         missed |= -slope * candidates.opacities > LITTLE * error
     result = doubtful.clone()
     result[doubtful] = missed
@@ -94,7 +94,7 @@ def needed(
         error = squared_error(image, view.image).item()
         if error <= allowed or not out.any():
             return back
-        _, slope = error_slope(plan, view, torch.where(out, FADED, 1.0) * opacities)
+        _, slope = error_slope(image_of(plan), view, torch.where(out, FADED, 1.0) * opacities)
         back = back | fewest(torch.where(out, -slope * opacities, 0.0), error - allowed)
     return back | (missing & (slope != 0))
 
