@@ -54,11 +54,12 @@ def without_needed(
     """
     candidates, rest = scene[doubtful], scene[~doubtful]
     missing = torch.ones(len(candidates), dtype=torch.bool, device=doubtful.device)
-    plans = [renderer.freeze(rest, view.camera).plan(candidates) for view in views]
     before = None
     while before is None or not torch.equal(missing, before):
         before = missing
-        for plan, view, error in zip(plans, views, allowed, strict=True):
+        for view, error in zip(views, allowed, strict=True):
+            # One at a time: all of many photographs would not fit into memory.
+            plan = renderer.freeze(rest, view.camera).plan(candidates)
             missing = missing & ~needed(plan, candidates.opacities, missing, view, error)
     return doubtful.masked_scatter(doubtful, missing)
 
