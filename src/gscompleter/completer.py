@@ -16,8 +16,8 @@ from gscompleter.config import CompleterConfig, RegistrationConfig
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
-from gscompleter.geometry import project, same_camera, sample, slide, widened
-from gscompleter.masks import dilate
+from gscompleter.geometry import between, bordered, project, same_camera, sample, slide, widened
+from gscompleter.masks import dilate, is_enclosed
 from gscompleter.progress import stage, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, in_colours, load_renderer
@@ -232,7 +232,8 @@ class GSCompleter:
         check_numbers(completion.context, len(completion.targets) + 1)
         clock = Clock()
         with clock("context"):
-            sight = self.sight(completion, target)
+            wide = None if reference is None else reference.camera
+            sight = self.sight(completion, target, wide)
         result = nothing_added(sight, sight.window.crop(self.holes(sight)))
         reason = nothing_to_do(result, completion.views)
         if reason is not None:
@@ -448,15 +449,23 @@ class GSCompleter:
         harmless = do_no_harm(refined, frozen, watching, allowed, config.harm, drawings)
         return (refined[:0] if is_undone(refined, harmless, config.harm) else harmless), losses
 
-    def sight(self, completion: Completion, target: Camera) -> Sight:
-        """The scene as it stands, frozen at the target's wider camera, and the target's anchor."""
-        sight = self.without_stereo(completion, target)
+    def sight(self, completion: Completion, target: Camera, wide: Camera | None = None) -> Sight:
+        """The scene as it stands, frozen at the target's wider camera, and the target's anchor.
+
+        Without `wide` the target is widened where a hole reaches its edge; what its frame holds
+        whole needs no more.
+        """
+        window = self.window(completion, target)
+        if wide is not None:
+            window = between(window.target, wide)
+        sight = self.without_stereo(completion, window)
+        if wide is None and is_enclosed(window.crop(self.holes(sight))):
+            sight = self.without_stereo(completion, bordered(window.target, 0, 0))
         found = self.stereo(completion, sight.frozen.context, sight.window)
         return replace(sight, stereo=found)
 
-    def without_stereo(self, completion: Completion, target: Camera) -> Sight:
-        """The same without what stereo among the photographs shows there."""
-        window = self.window(completion, target)
+    def without_stereo(self, completion: Completion, window: Window) -> Sight:
+        """The same through a window, without what stereo among the photographs shows there."""
         frozen = self.renderer.freeze(completion.scene, window.wide)
         anchor = self.anchor(completion, window.target)
         return Sight(
@@ -539,7 +548,7 @@ class GSCompleter:
         taken = not_needed(completion.scene, doubtful, views, self.renderer)
         if not taken.any():
             return sight
-        again = self.without_stereo(without(completion, taken), sight.window.target)
+        again = self.without_stereo(without(completion, taken), sight.window)
         # Photographs, and what stereo makes of them, stay as they are.
         return replace(again, stereo=sight.stereo)
 

@@ -128,12 +128,22 @@ def baseline_between(a: Camera, b: Camera) -> float:
 
 def widened(camera: Camera, margin: float) -> Window:
     """`camera` and the one whose image extends it on every side by `margin` of its size."""
-    left, top = round(margin * camera.width), round(margin * camera.height)
+    return bordered(camera, round(margin * camera.width), round(margin * camera.height))
+
+
+def bordered(camera: Camera, left: int, top: int) -> Window:
+    """`camera` and the one whose image has `left` pixels more on both sides, `top` above and
+    below."""
     K = camera.K.clone()
     K[0, 2] += left
     K[1, 2] += top
     wide = replace(camera, K=K, width=camera.width + 2 * left, height=camera.height + 2 * top)
     return Window(camera, wide, left, top)
+
+
+def between(camera: Camera, wide: Camera) -> Window:
+    """`camera` and the one that sees as much more on both sides, above and below as `wide` does."""
+    return bordered(camera, (wide.width - camera.width) // 2, (wide.height - camera.height) // 2)
 
 
 def same_camera(a: Camera, b: Camera) -> bool:

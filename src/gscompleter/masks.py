@@ -14,3 +14,8 @@ def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
     for size, padding in (((1, side), (0, radius)), ((side, 1), (radius, 0))):
         grown = max_pool2d(grown, size, stride=1, padding=padding)
     return grown[0, 0] > 0
+
+
+def is_enclosed(mask: Bool[Tensor, "h w"]) -> bool:
+    """Whether the image holds `mask` whole: there is some of it, and none at the edge."""
+    return bool(mask.any()) and int(mask.sum()) == int(mask[1:-1, 1:-1].sum())
