@@ -184,6 +184,21 @@ def test_several_targets_are_completed_one_after_the_other_into_one_scene():
     assert len(completion.scene) == len(completion.context) + len(completion.added)
 
 
+def test_a_target_is_widened_only_where_a_hole_reaches_its_edge():
+    """What its frame holds whole needs no more than its frame."""
+    completer, (_, target) = knowing(), cameras()
+    wide = completer.window(completer.begin(photographs()), target).wide
+    whole = gaussians_of(view_of(Room(), wide))
+    x, y = project(whole.means, target)[0].unbind(-1)
+    nothing_there = {"middle": ((x - 32).abs() < 8) & ((y - 32).abs() < 8), "edge": x < 8}
+    for where, side in {"middle": SIZE, "edge": wide.width}.items():
+        completion = completer.begin(photographs(), whole[~nothing_there[where]])
+        assert completer.sight(completion, target).window.wide.width == side
+        given = completer.sight(completion, target, wide)  # as an image was made for it
+        assert given.window.wide.width == wide.width
+        assert completer.advance(completion, target).targets[0].after.image.shape[0] == SIZE
+
+
 def test_targets_are_synthesized_together_where_the_generator_can():
     views, (_, target) = photographs(), cameras()
     others = [camera_at(x, yaw=12, size=SIZE) for x in (0.9, 1.1, 1.3)]
@@ -191,13 +206,13 @@ def test_targets_are_synthesized_together_where_the_generator_can():
     generator = KnowingTogether()
     together = GSCompleter(KnowingReconstructor(), generator)(views, targets)
     assert [len(calls) for calls in generator.calls] == [1, 2, 1]
+    assert generator.calls[0][0].target.width > SIZE  # with its margin
     renderer, added_to = load_renderer("cpu"), [together.context]
     added_to.append(merge([together.context, together.targets[0].added]))
     added_to.append(merge([added_to[1], *(t.added for t in together.targets[2:4])]))
     for calls, scene in zip(generator.calls, added_to, strict=True):
         for request in calls:
             nearest, wide, context = request.nearest, request.target, request.context
-            assert wide.width > SIZE  # with its margin
             assert nearest is context.views[1]
             assert_close(context.at_target.alpha, renderer.render(scene, wide).alpha, "alpha")
             for view, seen in zip(context.views, context.at_views, strict=True):

@@ -84,6 +84,18 @@ def test_a_floater_before_a_photograph_loses_opacity():
     assert refined.opacities.mean() < 0.8
 
 
+def test_refinement_ends_where_nothing_is_to_be_gained():
+    """The image at the target is the scene's own, and no photograph sees what is new."""
+    _, context, added = half_a_room()
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    shown = View(frozen.composite(added).image, CAMERA)
+    config = RefineConfig()
+    _, losses = refine_opacities(added, frozen, shown, [], [], config)
+    assert len(losses) == 2
+    _, losses = refine_opacities(added, frozen, shown, [], [], replace(config, min_fall=None))
+    assert len(losses) == config.iterations
+
+
 def test_without_iterations_opacities_stay_as_they_were_lifted():
     view, context, added = half_a_room()
     frozen = load_renderer("cpu").freeze(context, CAMERA)

@@ -45,9 +45,9 @@ class AffineConfig(Settings):
 class RegistrationConfig(Settings):
     affine: AffineConfig = AffineConfig()
     """Settings of the coarse fit."""
-    iterations: Count = 20
+    iterations: Count = 12
     """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
-    learning_rate: Step = 0.008
+    learning_rate: Step = 0.013
     """Step of Adam, in the unit that `step` names."""
     schedule: Literal["falling", "constant"] = "falling"
     """Whether the step falls linearly to nothing, so that few iterations reach far and still end
@@ -134,7 +134,11 @@ class SupportConfig(Settings):
 @dataclass(frozen=True)
 class RefineConfig(Settings):
     iterations: Count = 10
-    """Steps of Adam; 0 leaves the opacities as they were lifted (the paper's ablation w/o MV)."""
+    """Steps of Adam at most; 0 leaves the opacities as they were lifted (the paper's ablation w/o
+    MV)."""
+    min_fall: Share | None = 3e-4
+    """Share of the loss of which a step has to take more away for another to follow: where nothing
+    that was added stands before a photograph, hardly anything goes. None takes all steps."""
     learning_rate: Step = 0.24
     """Step of Adam, on what `parametrization` names."""
     parametrization: Literal["logit", "linear"] = "logit"
@@ -259,7 +263,7 @@ class CompleterConfig(Settings):
                 affine=AffineConfig(min_agreement=None, min_merged=None),
             ),
             free_space=FreeSpaceConfig(num_steps=0),
-            refine=RefineConfig(iterations=30, learning_rate=0.08),
+            refine=RefineConfig(iterations=30, min_fall=None, learning_rate=0.08),
             holes=HoleConfig(neighbourhood=None),
             harm=HarmConfig(tolerance=None, max_loss=None),
             support=SupportConfig(doubts=False),

@@ -47,6 +47,11 @@ def falling_on(
     return seen & mask[y, x]
 
 
+def has_settled(losses: Sequence[float], min_fall: float) -> bool:
+    """Whether the last step took no more than a share `min_fall` of the loss away."""
+    return len(losses) > 1 and losses[-2] - losses[-1] <= min_fall * losses[-2]
+
+
 def refine_opacities(
     added: Gaussians,
     frozen_target: FrozenView,
@@ -82,6 +87,8 @@ def refine_opacities(
             for plan, view, weight in plans
         ]
         loss = torch.stack(terms).sum()
-        optimizer.step(loss)
         losses.append(loss.item())
+        if config.min_fall is not None and has_settled(losses, config.min_fall):
+            break
+        optimizer.step(loss)
     return replace(added, opacities=opacities().detach(), encoded=None), tuple(losses)
