@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 
 from command import run
+from gscompleter.config import RegistrationConfig
 from gscompleter.errors import InputError
 from gscompleter.io.image import read_pixels, write_image
 from gscompleter.metrics.coverage import Look
@@ -351,7 +352,7 @@ def test_the_record_keeps_what_the_affine_was_fitted_to(completed_room):
     assert (residual[agrees] < 0.0501 * y[agrees]).all()
     assert (residual[~agrees] > 0.0499 * y[~agrees]).all()
     assert agrees.mean() == pytest.approx(affine["inliers"], abs=0.05)
-    assert len(kept["targets"][0]["losses"]["register"]) == 20
+    assert len(kept["targets"][0]["losses"]["register"]) == RegistrationConfig().iterations
     assert len(kept["photographs"]) == kept["num_photographs"] == 3
 
 
