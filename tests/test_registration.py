@@ -115,7 +115,7 @@ class Plain(CpuRenderer):
 @pytest.mark.parametrize(
     ("config", "bound"),
     [
-        (RegistrationConfig(stereo_weight=0.0), 1e-4),
+        (RegistrationConfig(stereo_weight=0.0, iterations=20, learning_rate=0.008), 1e-5),
         (RegistrationConfig(depth_weight=0.0), 1e-5),
         (RegistrationConfig(), 1e-3),
         (PAPER, 1e-5),

@@ -218,8 +218,8 @@ class CompleterConfig(Settings):
 
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Share of its size by which the target image is extended on every side while it is completed,
-    so that a camera that moves on from the target does not meet the next hole at its border. The
-    paper completes what the target itself sees."""
+    where a hole reaches its border, so that a camera that moves on from the target does not meet
+    the next hole there. The paper completes what the target itself sees."""
     anchor: AnchorConfig = AnchorConfig()
     """Which photograph forms the stereo pair with the synthesized image."""
     registration: RegistrationConfig = RegistrationConfig()
