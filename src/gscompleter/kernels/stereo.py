@@ -16,8 +16,10 @@ UNSEEN = 255
 """Cost of a plane at which the pixel falls outside of the other image."""
 TILE_ROWS, TILE_COLUMNS = 16, 64
 """Pixels that are matched together: so few that what is known of them stays in the cache."""
-FAR = np.float32(1e9)
-"""Cost of what cannot be."""
+FAR = np.int16(16000)
+"""Cost of what cannot be, half of what 16 bits hold."""
+PATHS = 8
+"""Of semi-global aggregation."""
 
 
 class Bands(NamedTuple):
@@ -64,11 +66,12 @@ def _box_sums(values, sums, column, rows, width, radius):
     for y in range(rows):
         for x in range(width + 2 * radius):
             column[x] += values[y + 2 * radius, x]
+        # One pass over the row for each column of the window: a pass becomes vectors.
         for x in range(width):
-            total = np.float32(0)
-            for dx in range(2 * radius + 1):
-                total += column[x + dx]
-            sums[y, x] = total
+            sums[y, x] = column[x]
+        for dx in range(1, 2 * radius + 1):
+            for x in range(width):
+                sums[y, x] += column[x + dx]
         for x in range(width + 2 * radius):
             column[x] -= values[y, x]
 
@@ -99,7 +102,31 @@ def matching_costs(reference, source, transform, inverse_depths, bands, radius, 
     return costs
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, fastmath={"contract"}, error_model="numpy", inline="always")
+def _compare(y, own, own_mean, own_square, other, other_mean, other_square, cross, line):
+    """Of row y, from sums over windows: sums of squared deviations and their products, in place,
+    and in line[0] how much the pixels' own deviations differ.
+
+    A pass for each of them: several at once have too many arrays for LLVM to tell apart.
+    """
+    cols = cross.shape[1]
+    radius = (own.shape[2] - cols) // 2
+    area = np.float32((2 * radius + 1) ** 2)
+    for x in range(cols):
+        line[0, x] = np.float32(0)
+    for c in range(3):
+        for x in range(cols):
+            other_mean[c, y, x] /= area
+        for x in range(cols):
+            theirs = other[c, y + radius, x + radius] - other_mean[c, y, x]
+            line[0, x] += abs(theirs - (own[c, y + radius, x + radius] - own_mean[c, y, x]))
+        for x in range(cols):
+            other_square[y, x] -= area * other_mean[c, y, x] * other_mean[c, y, x]
+        for x in range(cols):
+            cross[y, x] -= area * other_mean[c, y, x] * own_mean[c, y, x]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _match_tiles(
     begin, end, reference, source, transform, inverse_depths, bands, radius, noise, detail, costs
 ):
@@ -170,8 +197,8 @@ def _match_tiles(
                 for x in range(wide):
                     sx, sy = line[0, x], line[1, x]
                     # `_clip` has made numbers from 0 to W - 1 and H - 1 of them, whatever came in.
-                    ix = min(np.int32(sx), W - 2)
-                    iy = min(np.int32(sy), H - 2)
+                    ix = np.uint32(min(np.int32(sx), W - 2))
+                    iy = np.uint32(min(np.int32(sy), H - 2))
                     ax, ay = sx - np.float32(ix), sy - np.float32(iy)
                     w11 = ax * ay
                     w01 = ax - w11
@@ -200,38 +227,33 @@ def _match_tiles(
                     )
             _box_sums(product, cross, column, rows, cols, radius)
             for y in range(rows):
+                place = first + y * cols * count + plane
+                _compare(y, own, own_mean, own_square, other, other_mean, other_square, cross, line)
                 for x in range(cols):
-                    square = other_square[y, x]
-                    covariance = cross[y, x]
-                    difference = np.float32(0)
-                    for c in range(3):
-                        mean = other_mean[c, y, x] / area
-                        square -= area * mean * mean
-                        covariance -= area * mean * own_mean[c, y, x]
-                        difference += abs(
-                            (other[c, y + radius, x + radius] - mean)
-                            - (own[c, y + radius, x + radius] - own_mean[c, y, x])
-                        )
-                    square = max(square, np.float32(0))
-                    energy = max(own_square[y, x], np.float32(0))
-                    correlation = covariance / np.sqrt((square + floor) * (energy + floor))
-                    cost = (np.float32(1) - detail) * (np.float32(1) - correlation) + detail * min(
-                        difference * np.float32(5), np.float32(1)
+                    correlation = cross[y, x] / np.sqrt(
+                        (max(other_square[y, x], np.float32(0)) + floor)
+                        * (max(own_square[y, x], np.float32(0)) + floor)
                     )
-                    value = np.uint8(min(cost * np.float32(254), np.float32(254)))
+                    cost = (np.float32(1) - detail) * (np.float32(1) - correlation)
+                    cost += detail * min(line[0, x] * np.float32(5), np.float32(1))
+                    line[0, x] = min(cost * np.float32(254), np.float32(254))
+                for x in range(cols):
+                    value = np.uint8(line[0, x])
                     if not seen[y + radius, x + radius]:
                         value = np.uint8(UNSEEN)
-                    costs[first + (y * cols + x) * count + plane] = value
+                    costs[place + x * count] = value
 
 
 def best_mean(costs, fraction, unseen_cost):
-    """The mean of the best `fraction` of the sources' costs [n, cells], for each cell.
+    """The mean of the best `fraction` of the sources' costs, each [cells], for each cell.
 
     A surface that is hidden from some of the views costs there whatever hides it; the views that
     see it decide. Where no source sees the plane, it costs `unseen_cost`.
     """
-    merged = np.empty(costs.shape[1], np.uint8)
-    share(_merge_cells, len(merged), costs, fraction, unseen_cost, merged)
+    if len(costs) == 1:
+        return np.where(costs[0] == UNSEEN, unseen_cost, costs[0])
+    merged = np.empty(len(costs[0]), np.uint8)
+    share(_merge_cells, len(merged), np.stack(costs), fraction, unseen_cost, merged)
     return merged
 
 
@@ -266,14 +288,15 @@ def _merge_cells(begin, end, costs, fraction, unseen_cost, merged):
 def _step(cost, before, lowest, after, total, small, large):
     """One step of a path: returns the lowest cost at the new pixel."""
     planes = cost.shape[0]
-    ceiling = lowest + large
+    ceiling = np.int16(lowest + large)
     best = FAR
     for k in range(planes):
         # `before` has a border of one plane on either side.
-        reached = min(min(before[k], before[k + 2]) + small, min(before[k + 1], ceiling))
-        value = np.float32(cost[k]) + reached - lowest
+        beside = np.int16(min(before[k], before[k + 2]) + small)
+        reached = min(beside, min(before[k + 1], ceiling))
+        value = np.int16(np.int16(cost[k]) + np.int16(reached - lowest))
         after[k + 1] = value
-        total[k] += value
+        total[k] = np.int16(total[k] + value)
         best = min(best, value)
     after[0] = FAR
     after[planes + 1] = FAR
@@ -298,10 +321,10 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
     widest = 2
     for width in (bands.high - bands.low).flat:
         widest = max(widest, width + 2)
-    rows = np.zeros((2, 3, w, widest), np.float32)
-    lows = np.zeros((2, 3, w), np.float32)
-    along = np.zeros((2, widest), np.float32)
-    nothing, scratch = np.zeros(widest, np.float32), np.empty(widest, np.float32)
+    rows = np.zeros((2, 3, w, widest), np.int16)
+    lows = np.zeros((2, 3, w), np.int16)
+    along = np.zeros((2, widest), np.int16)
+    nothing, scratch = np.zeros(widest, np.int16), np.empty(widest, np.int16)
     for step in range(h):
         y = step if down else h - 1 - step
         now, then = step % 2, 1 - step % 2
@@ -309,7 +332,7 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
         # The row before lies at y - 1 on the way down and at y + 1 on the way up.
         upper = max(y - 1, 0) if down else min(y, h - 2)
         of_left, of_right = (large_d, large_u) if down else (large_u, large_d)
-        low_along = np.float32(0)
+        low_along = np.int16(0)
         for s in range(w):
             x = s if down else w - 1 - s
             column = x // TILE_COLUMNS
@@ -329,7 +352,7 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
             from_left, from_right = of_left[upper, max(x - 1, 0)], of_right[upper, min(x, w - 2)]
             larges = (from_left, large_y[upper, x], from_right)
             for path in range(3):
-                before, lowest, other = nothing, np.float32(0), x + path - 1
+                before, lowest, other = nothing, np.int16(0), x + path - 1
                 if step > 0 and 0 <= other < w:
                     tile = other // TILE_COLUMNS
                     band = bands.low[row_before, tile], bands.high[row_before, tile]
@@ -352,16 +375,17 @@ def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
             [h - 1, w - 1], and between (y, x + 1) and (y + 1, x) [h - 1, w - 1].
         small: Penalty of a step by one plane.
 
+    Penalties are whole numbers in int16, and none is above 3000: so many paths still add up.
+
     Returns:
-        The sum over the paths, as a mean per path, in the order of `bands`.
+        The sum over the `PATHS` paths, int16, in the order of `bands`.
     """
     # Each half has its own sum, so that two threads can work and order does not matter.
-    totals = np.zeros((2, len(costs)), np.float32)
+    totals = np.zeros((2, len(costs)), np.int16)
     jumps = (large_x, large_y, large_d, large_u)
     halves = [(costs, bands, *jumps, small, half == 0, totals[half]) for half in range(2)]
     run(_sweep_half, halves)
     totals[0] += totals[1]
-    totals[0] *= np.float32(0.125)
     return totals[0]
 
 
@@ -371,12 +395,12 @@ def winners(totals, bands, h, w):
     The second best is the cheapest plane that is no neighbour of the best.
 
     Args:
-        totals: In the order of `bands`.
+        totals: Sums over the paths, in the order of `bands`.
         bands: The planes of each tile.
         h, w: Size of the image.
 
     Returns:
-        Plane indices [h, w] and margins [h, w] in the unit of the costs.
+        Plane indices [h, w] and margins [h, w] as a mean per path, in the unit of the costs.
     """
     index = np.empty((h, w), np.float32)
     margin = np.empty((h, w), np.float32)
@@ -402,7 +426,7 @@ def _choose(begin, end, totals, bands, index, margin):
             for k in range(planes):
                 if abs(k - best) > 2:
                     second = min(second, total[k])
-            margin[y, x] = second - total[best]
+            margin[y, x] = np.float32(second - total[best]) / np.float32(PATHS)
             at = np.float32(bands.low[row, column] + best)
             if 0 < best < planes - 1:
                 # Two lines of equal and opposite slope: less drawn to whole planes than a parabola.
@@ -410,7 +434,7 @@ def _choose(begin, end, totals, bands, index, margin):
                 after = total[best + 1] - total[best]
                 steeper = max(before, after)
                 if steeper > 0:
-                    at += np.float32(0.5) * (before - after) / steeper
+                    at += np.float32(0.5) * np.float32(before - after) / np.float32(steeper)
             index[y, x] = at
 
 

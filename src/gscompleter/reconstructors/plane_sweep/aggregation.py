@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int16, UInt8
 
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import Bands
 from gscompleter.matching.stereo_image import StereoImage, contrast
 
-SMALL_PENALTY = 25.0
+SMALL_PENALTY = 25
 """Cost of a change by one plane between neighbours."""
-LARGE_PENALTY = 300.0
+LARGE_PENALTY = 300
 """Cost of a jump between neighbours of the same colour."""
 EDGE_CONTRAST = 0.06
 """Difference of colour at which the penalty of a jump has halved."""
@@ -19,13 +19,15 @@ EDGE_CONTRAST = 0.06
 
 def aggregate(
     costs: UInt8[np.ndarray, "cells"], bands: Bands, reference: StereoImage
-) -> Float32[np.ndarray, "cells"]:
+) -> Int16[np.ndarray, "cells"]:
     """Costs summed along eight paths through the image; jumps are cheap at its edges."""
     image = reference.image
 
-    def jump(a: Float32[np.ndarray, "r c 3"], b: Float32[np.ndarray, "r c 3"]) -> np.ndarray:
+    def jump(
+        a: Float32[np.ndarray, "r c 3"], b: Float32[np.ndarray, "r c 3"]
+    ) -> Int16[np.ndarray, "r c"]:
         penalty = LARGE_PENALTY / (1 + contrast(a, b) / np.float32(EDGE_CONTRAST))
-        return np.maximum(penalty, 1.5 * SMALL_PENALTY).astype(np.float32)
+        return np.rint(np.maximum(penalty, 1.5 * SMALL_PENALTY)).astype(np.int16)
 
     return stereo.semi_global(
         costs,
@@ -34,5 +36,5 @@ def aggregate(
         jump(image[1:], image[:-1]),
         jump(image[1:, 1:], image[:-1, :-1]),
         jump(image[:-1, 1:], image[1:, :-1]),
-        np.float32(SMALL_PENALTY),
+        np.int16(SMALL_PENALTY),
     )

@@ -86,4 +86,4 @@ def matched_costs(
         stereo.matching_costs(reference.image, source.image, transform, *planes, *settings)
         for source, transform in sources
     ]
-    return stereo.best_mean(np.stack(costs), BEST_SHARE, np.uint8(UNSEEN_COST))
+    return stereo.best_mean(costs, BEST_SHARE, np.uint8(UNSEEN_COST))
