@@ -12,7 +12,7 @@ from numba.core.registry import CPUDispatcher
 from rich.console import Console
 
 from command import run
-from gscompleter import GSCompleter, kernels, rehearsal
+from gscompleter import GSCompleter, compilation, kernels, rehearsal
 from gscompleter.kernels import compiled
 from gscompleter.progress import shown_on
 from scenes import Room, camera_at, view_of
@@ -53,8 +53,9 @@ def marked(monkeypatch, tmp_path) -> list[str]:
     """Marks stand in an empty folder, and parts are rehearsed by writing their names down."""
     done: list[str] = []
     monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(rehearsal, "PARTS", dict.fromkeys(("cpu", "plane-sweep"), done.append))
-    monkeypatch.setattr(rehearsal, "threads", lambda: 1)
+    monkeypatch.setattr(compilation, "PARTS", ("cpu", "plane-sweep"))
+    monkeypatch.setattr(rehearsal, "PARTS", dict.fromkeys(compilation.PARTS, done.append))
+    monkeypatch.setattr(compilation, "threads", lambda: 1)
     return done
 
 
@@ -78,25 +79,25 @@ print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
 
 
 def test_what_is_compiled_is_compiled_once(marked):
-    assert rehearsal.compile_kernels(["cpu", "mvsplat"]) > 0
+    assert compilation.compile_kernels(["cpu", "mvsplat"]) > 0
     assert marked == ["cpu"]
-    assert rehearsal.compile_kernels(["cpu"]) is None
-    assert rehearsal.compile_kernels(["plane-sweep", "cpu"]) > 0
+    assert compilation.compile_kernels(["cpu"]) is None
+    assert compilation.compile_kernels(["plane-sweep", "cpu"]) > 0
     assert marked == ["cpu", "plane-sweep"]
 
 
 def test_kernels_are_compiled_anew_for_another_processor(marked, monkeypatch):
-    rehearsal.compile_kernels(["cpu"])
+    compilation.compile_kernels(["cpu"])
     monkeypatch.setattr(compiled, "get_host_cpu_name", lambda: "another")
-    rehearsal.compile_kernels(["cpu"])
+    compilation.compile_kernels(["cpu"])
     assert marked == ["cpu", "cpu"]
 
 
 def test_one_line_says_so_before_it_happens(marked):
     console = Console(record=True, file=io.StringIO(), width=200)
     with shown_on(console):
-        rehearsal.compile_kernels(["cpu"])
-        rehearsal.compile_kernels(["cpu"])
+        compilation.compile_kernels(["cpu"])
+        compilation.compile_kernels(["cpu"])
     said = console.export_text()
     assert said.startswith("compiling kernels for this machine, once: 0%, about ")
     assert said.count("\n") == 1
@@ -112,10 +113,35 @@ def test_warmup_says_what_it_did(marked, monkeypatch, capsys):
     assert marked == ["cpu", "plane-sweep"]
 
 
+def test_a_model_that_is_asked_for_is_begun_before_anything_is_known(tmp_path):
+    """In a process of its own, which stops what it began."""
+    begun = """
+from gscompleter import compilation
+from gscompleter.compilation import begin
+begin(["mvsplat"])
+begin(["plane-sweep", "another"])
+(process,) = compilation._begun.values()
+print(process.args[-1:], process.poll(), process.pid)
+"""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "2"}
+    command = [sys.executable, "-c", begun]
+    environment["OMP_NUM_THREADS"] = "2"
+    life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    name, state, pid = life.stdout.split()
+    assert (name, state, life.stderr) == ("['plane-sweep']", "None", "")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid), 0)
+
+
+def test_one_process_alone_begins_nothing(monkeypatch, marked):
+    compilation.begin(["cpu", "plane-sweep"])
+    assert compilation._begun == {}
+
+
 def test_a_part_that_fails_in_its_process_is_no_success(monkeypatch):
     with (
         pytest.raises(subprocess.CalledProcessError),
-        rehearsal.rehearsed_apart([["no such part"]]),
+        compilation.rehearsed_apart(["no such part"]),
     ):
         pass
 

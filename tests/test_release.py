@@ -18,8 +18,8 @@ import gscompleter
 from command import run
 from gscompleter import __version__
 from gscompleter.commands.doctor import PURPOSES, installed, is_for
+from gscompleter.compilation import PARTS, compile_kernels
 from gscompleter.kernels.compiled import cache_folder
-from gscompleter.rehearsal import PARTS, compile_kernels
 from release_check import (
     ROOT,
     built,

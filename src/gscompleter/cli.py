@@ -27,6 +27,7 @@ from gscompleter.commands.options import (
     IndexOptions,
     LiveOptions,
     ModelsOptions,
+    RunOptions,
     TablesOptions,
 )
 from gscompleter.commands.poses import PosesOptions
@@ -35,6 +36,7 @@ from gscompleter.commands.strip import StripOptions
 from gscompleter.commands.view import ViewOptions
 from gscompleter.commands.warmup import WarmupOptions
 from gscompleter.commands.words import read_words, sentence_of
+from gscompleter.compilation import begin
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.garbage import staying
@@ -86,6 +88,8 @@ def main() -> None:
             options = checked(parsed(words))
             if isinstance(options, ComputeOptions):
                 bound_threads(options.threads)
+            if isinstance(options, RunOptions):
+                begin(options.models)
             _, module, function = COMMANDS[words[0]]
             command = getattr(import_module(module), function)
         command(options)

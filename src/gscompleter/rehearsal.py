@@ -1,28 +1,21 @@
-"""The kernels compiled before they are needed: each part that has some works once on a tiny scene.
+"""Each part that has kernels at work once, on a tiny scene, so that they are compiled.
 
-numba compiles one kernel at a time in a process, and a completion would meet them one after the
-other. Parts are rehearsed in several processes, and find in the cache what another compiled.
 The scene is a textured wall, parallel to the images of cameras that stand side by side.
 """
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 
+import numpy as np
 import torch
 
-from gscompleter.garbage import staying
 from gscompleter.generators import Request, load_generator
 from gscompleter.interpolation import smoothed
-from gscompleter.kernels.compiled import is_compiled, note_compiled
-from gscompleter.progress import expecting, stage
+from gscompleter.kernels.compiled import note_compiled
+from gscompleter.kernels.stereo import best_mean
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.threads import threads
 from gscompleter.types import Camera, Gaussians, Render, SceneContext, View, observed, sh_from_rgb
 
 SIDE = 64
@@ -82,8 +75,9 @@ def some_gaussians() -> Gaussians:
 
 
 def reconstruct_with(reconstructor: str) -> None:
-    """Make Gaussians of the two photographs."""
+    """Make Gaussians of the two photographs, and weigh what three would cost."""
     load_reconstructor(reconstructor)(photographs())
+    best_mean([np.zeros(1, np.uint8)] * 2, 0.5, np.uint8(0))
 
 
 def synthesize_with(generator: str) -> None:
@@ -97,77 +91,13 @@ def synthesize_with(generator: str) -> None:
     load_generator(generator).synthesize([Request(views[1], camera_at(2), context)])
 
 
-BROUGHT = "brought"
-"""The part that only scenes need that are brought."""
 PARTS: dict[str, Callable[[str], None]] = {
     "cpu": render_with,
-    BROUGHT: fold_brought,
+    "brought": fold_brought,
     "warp-inpaint": synthesize_with,
     "plane-sweep": reconstruct_with,
 }
-"""The parts that have kernels, and how each is rehearsed. The last draws, too, and finds what the
-first compiled."""
-DRAWING = "cpu", BROUGHT
-"""Parts that one process rehearses while another has the rest, which takes about as long."""
-
-APART = f"""
-import sys
-from gscompleter.garbage import staying
-with staying():
-    from {__name__} import rehearse
-    for part in sys.argv[1:]:
-        rehearse(part)
-"""
-"""What a process runs that rehearses parts; numba compiles a tenth faster in it."""
-
-COMPILING = "compiling kernels for this machine, once"
-"""What it is called while it goes on."""
-SECONDS = 30
-"""About what all of them take together on one core."""
-
-
-def compile_kernels(names: Sequence[str]) -> float | None:
-    """Compile what the parts of these names need, where it is not there yet.
-
-    Returns:
-        The seconds that it took, or None where nothing was to be done.
-
-    Raises:
-        subprocess.CalledProcessError: where a process fails; it has said why.
-    """
-    missing = [name for name in PARTS if name in names and not is_compiled(name)]
-    if not missing:
-        return None
-    own, *others = shares_of(missing, threads())
-    expected = SECONDS * len(missing) / len(PARTS) / (1 + len(others))
-    start = time.perf_counter()
-    with expecting([(COMPILING, expected)]), stage(COMPILING), rehearsed_apart(others), staying():
-        for name in own:
-            rehearse(name)
-    return time.perf_counter() - start
-
-
-def shares_of(names: Sequence[str], count: int) -> list[list[str]]:
-    """What each of at most two, and at most `count`, processes rehearses."""
-    drawing = [name for name in names if name in DRAWING]
-    rest = [name for name in names if name not in DRAWING]
-    return [share for share in (drawing, rest) if share] if count > 1 else [list(names)]
-
-
-@contextmanager
-def rehearsed_apart(shares: Sequence[Sequence[str]]) -> Iterator[None]:
-    """Rehearse each share of parts in a process of its own, meanwhile."""
-    commands = [[sys.executable, "-c", APART, *share] for share in shares]
-    with ExitStack() as stack:
-        processes = []
-        for command in commands:
-            processes.append(subprocess.Popen(command, stdin=subprocess.DEVNULL))
-            stack.callback(processes[-1].wait)
-            stack.callback(processes[-1].kill)
-        yield
-        for process in processes:
-            if process.wait() != 0:
-                raise subprocess.CalledProcessError(process.returncode, process.args)
+"""How each part is rehearsed."""
 
 
 def rehearse(name: str) -> None:

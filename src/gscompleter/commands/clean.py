@@ -30,12 +30,12 @@ from gscompleter.commands.output import (
     settings_of,
 )
 from gscompleter.commands.understood import found_out
+from gscompleter.compilation import compile_kernels
 from gscompleter.completer import Clock
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import SUMMARY, check_output, output_folder
 from gscompleter.metrics.image import psnr
 from gscompleter.progress import preparing, shown_on, stage, track
-from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import Renderer, choose_device, load_renderer
 from gscompleter.reports.completion import save_brought
 from gscompleter.splats.formats import load_splat

@@ -40,6 +40,7 @@ from gscompleter.commands.output import (
     settings_of,
 )
 from gscompleter.commands.understood import understood
+from gscompleter.compilation import BROUGHT, compile_kernels
 from gscompleter.completer import Clock, GSCompleter, total
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import settings_class
@@ -50,7 +51,6 @@ from gscompleter.io.video import check_writer
 from gscompleter.metrics.coverage import coverage_of
 from gscompleter.progress import expecting, preparing, shown_on, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
-from gscompleter.rehearsal import BROUGHT, compile_kernels
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.completion import Around, Target, write_report
 from gscompleter.reports.completion_page import completion_page

@@ -157,8 +157,8 @@ def installed(requirement: Requirement) -> str | None:
 
 def renderers() -> Iterator[Found]:
     """Which renderers can draw here, and whether the kernels are compiled."""
+    from gscompleter.compilation import PARTS
     from gscompleter.kernels.compiled import is_compiled
-    from gscompleter.rehearsal import PARTS
     from gscompleter.render import load_renderer
 
     for name in ("cpu", "cuda", "reference"):

@@ -22,13 +22,13 @@ from gscompleter.commands.options import (
     TablesOptions,
     working_size,
 )
+from gscompleter.compilation import compile_kernels
 from gscompleter.data.cases import Case, read_cases
 from gscompleter.data.datasets import Skipped, open_clips, usable
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.framing import check_resolution
 from gscompleter.errors import InputError, quoted
 from gscompleter.progress import preparing, shown_on
-from gscompleter.rehearsal import compile_kernels
 from gscompleter.render import choose_device
 from gscompleter.reports.evaluation_page import evaluation_page
 from gscompleter.reports.page import write_page

@@ -56,6 +56,11 @@ class RunOptions(ComputeOptions):
     seed: Seed = 0
     """Of everything random. The same seed gives the same bytes on a CPU."""
 
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Names of the models that are asked for, whatever the photographs are."""
+        return ()
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions(RunOptions):
@@ -68,6 +73,10 @@ class ModelOptions(RunOptions):
     """The file of its weights, where they are not to be downloaded."""
     synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
     """How the image at a target comes about."""
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        return self.reconstructor, self.synthesis.name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,6 +210,10 @@ class DemoOptions(RunOptions):
     """Folder for the scene, its completion and before_after.png."""
     overwrite: bool = False
     """Replace what an earlier run left in the output folder."""
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        return ModelOptions().models
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,9 +22,9 @@ def run_warmup(options: WarmupOptions) -> None:
     # Here, so that `--help` does not wait for torch.
     from rich.console import Console
 
+    from gscompleter.compilation import PARTS, compile_kernels
     from gscompleter.kernels.compiled import cache_folder
     from gscompleter.progress import shown_on
-    from gscompleter.rehearsal import PARTS, compile_kernels
 
     with shown_on(None if options.quiet else Console(stderr=True)):
         seconds = compile_kernels(list(PARTS))
