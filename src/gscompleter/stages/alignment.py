@@ -12,7 +12,9 @@ from gscompleter.config import AffineConfig
 from gscompleter.types import DepthAffine, DepthMap, Lift, Render
 
 MAX_TRIALS = 512
-"""Two-point hypotheses, all scored at once."""
+"""Two-point hypotheses."""
+AT_ONCE = 32
+"""Of them that are scored at once: so few that their residuals stay in the cache."""
 MAX_PIXELS = 8192
 """Pixels the hypotheses are scored on, drawn at random where there are more."""
 RESIDUAL_THRESHOLD = 0.05
@@ -84,8 +86,13 @@ def ransac_line(
     i, j = torch.randint(len(x), (2, MAX_TRIALS), generator=rng).to(x.device)
     scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
     shifts = y[i] - scales * x[i]
-    residuals = (scales[:, None] * x + shifts[:, None] - y).abs()
-    counts = (residuals < RESIDUAL_THRESHOLD * y).sum(dim=1)
+    points = torch.stack([x / y, 1 / y])
+    counts = torch.cat(
+        [
+            ((some @ points).sub_(1).abs_() < RESIDUAL_THRESHOLD).sum(dim=1)
+            for some in torch.stack([scales, shifts], dim=1).split(AT_ONCE)
+        ]
+    )
     best = counts.where(scales > 0, -1).argmax()
     if scales[best] <= 0:
         return 0.0, 0.0
