@@ -7,6 +7,8 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
+import numba
+import numpy as np
 import pytest
 from numba.core.registry import CPUDispatcher
 
@@ -40,6 +42,11 @@ def test_no_kernel_may_reorder_its_sums():
 
 
 @pytest.mark.slow
+def test_kernels_of_others_find_blas_all_the_same():
+    squared = numba.njit(lambda matrix: np.dot(matrix, matrix))
+    assert (squared(2 * np.eye(2)) == 4 * np.eye(2)).all()
+
+
 def test_a_process_that_compiles_and_one_that_finds_it_done_give_the_same_bytes(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", COMPLETE, str(Path(__file__).parent)]

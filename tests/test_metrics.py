@@ -65,6 +65,26 @@ def test_ssim_of_an_image_with_itself_is_one_and_noise_lowers_it():
     assert ssim(image, truth) < 0.99
 
 
+@pytest.mark.parametrize("size", [(11, 11), (37, 52)])
+def test_ssim_is_what_scikit_image_gives(size):
+    truth, noise = torch.rand(2, *size, 3, generator=torch.Generator().manual_seed(1))
+    image = (truth + 0.2 * noise).clamp(0, 1)
+    expected = structural_similarity(
+        image.numpy(),
+        truth.numpy(),
+        win_size=11,
+        gaussian_weights=True,
+        channel_axis=-1,
+        data_range=1.0,
+    )
+    assert ssim(image, truth) == pytest.approx(float(expected), abs=1e-7)
+
+
+def test_ssim_asks_for_a_window():
+    with pytest.raises(ValueError, match="11 x 11"):
+        ssim(torch.rand(10, 20, 3), torch.rand(10, 20, 3))
+
+
 def test_ssim_is_the_formula_of_wang_et_al():
     """Written out with scipy's Gaussian window; the covariances are those of a sample."""
     image, truth = (values.double().numpy() for values in images(seed=3))

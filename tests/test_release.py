@@ -137,7 +137,7 @@ def test_the_version_is_the_same_wherever_it_stands():
 
 def test_doctor_tells_of_what_is_missing_and_for_what(monkeypatch, capsys):
     monkeypatch.setattr(
-        "gscompleter.commands.doctor.requires",
+        "importlib.metadata.requires",
         lambda _: ["numpy>=1", "numpy>=99; extra == 'film'", "not-there; extra == 'poses'"],
     )
     assert run(monkeypatch, "doctor", "--json") == 0

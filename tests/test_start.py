@@ -30,9 +30,13 @@ def imported(tmp_path_factory) -> set[str]:
     "module",
     [
         "matplotlib",
+        "packaging.requirements",
         "rich.progress",
+        "scipy.linalg",
+        "scipy.ndimage",
         "scipy.optimize",
         "scipy.spatial",
+        "skimage",
         "sympy",
     ],
 )

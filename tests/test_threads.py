@@ -5,9 +5,11 @@ import os
 import subprocess
 import sys
 
+import numba
 import pytest
 
 from gscompleter import threads
+from gscompleter.kernels.sharing import meanwhile
 from scenes import camera_at, photographed
 
 COUNTS = """
@@ -69,3 +71,17 @@ def test_the_bytes_of_a_completion_do_not_depend_on_the_threads(tmp_path):
         found.add(hashlib.sha256((out / "completed.ply").read_bytes()).hexdigest())
         assert (out / "generated.ply").stat().st_size > 2000
     assert len(found) == 1
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_meanwhile_something_else_is_made(monkeypatch, count):
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", count)
+    with meanwhile(sorted, [2, 1]) as found:
+        assert found() == [1, 2]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_fails_meanwhile_fails_for_who_asks(monkeypatch, count):
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", count)
+    with pytest.raises(ZeroDivisionError), meanwhile(divmod, 1, 0) as found:
+        found()

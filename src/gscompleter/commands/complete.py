@@ -48,7 +48,7 @@ from gscompleter.explorer import Explorer
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.video import check_writer
-from gscompleter.metrics.coverage import coverage_of
+from gscompleter.kernels.sharing import meanwhile
 from gscompleter.progress import expecting, preparing, shown_on, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
@@ -125,17 +125,16 @@ def write_done(
     """
     task, cameras = done.task, tuple(done.cameras.values())
     said = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
-    looks = looks_around(options, done.completion, cameras, explorer)
-    said["coverage"] = coverage_of(looks).as_summary()
-    summary = write_report(
-        folder,
-        done.completion,
-        task.targets,
-        explorer.completer.renderer,
-        said,
-        task.brought,
-        Around(tuple(looks), cameras),
-    )
+    with meanwhile(looks_around, options, done.completion, cameras, explorer) as looks:
+        summary = write_report(
+            folder,
+            done.completion,
+            task.targets,
+            explorer.completer.renderer,
+            said,
+            task.brought,
+            lambda: Around(tuple(looks()), cameras),
+        )
     write_page(folder, completion_page(folder))
     return summary
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, requires, version
-
-from packaging.requirements import Requirement
+from typing import TYPE_CHECKING
 
 from gscompleter.config.settings import Settings
 from gscompleter.errors import InputError
+
+if TYPE_CHECKING:  # every command reads this file, and only this one needs it
+    from packaging.requirements import Requirement
 
 DISTRIBUTION = "gscompleter"
 """What pip calls the package."""
@@ -129,6 +130,10 @@ def required(extra: str = "") -> list[Requirement]:
     Raises:
         InputError: where pip knows nothing of the package.
     """
+    from importlib.metadata import PackageNotFoundError, requires
+
+    from packaging.requirements import Requirement
+
     try:
         all_of_them = [Requirement(line) for line in requires(DISTRIBUTION) or []]
     except PackageNotFoundError:
@@ -148,6 +153,8 @@ def is_for(extra: str, requirement: Requirement) -> bool:
 
 def installed(requirement: Requirement) -> str | None:
     """The version that is here, where it is one that will do."""
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         there = version(requirement.name)
     except PackageNotFoundError:

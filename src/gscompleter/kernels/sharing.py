@@ -7,6 +7,7 @@ makes parallel takes two to five times as long to compile.
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
 from itertools import pairwise
 
@@ -49,6 +50,20 @@ def side_by_side(function, *arguments):
         return list(map(function, *arguments))
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(function, *arguments))
+
+
+@contextmanager
+def meanwhile(function, *arguments):
+    """Let `function` work on a thread of its own beside what goes on inside, which gets a function
+    that waits for its result; on one thread it works only then.
+
+    It may call kernels itself. What goes on inside does not end before it does.
+    """
+    if numba.config.NUMBA_NUM_THREADS == 1:
+        yield lambda: function(*arguments)
+        return
+    with ThreadPoolExecutor(1) as pool:
+        yield pool.submit(function, *arguments).result
 
 
 def ranges(count, pieces):

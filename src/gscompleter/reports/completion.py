@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from gscompleter.io.files import COMPLETED, CONTEXT
 from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
 from gscompleter.kernels.sharing import side_by_side
-from gscompleter.metrics.coverage import Look
+from gscompleter.metrics.coverage import Look, coverage_of
 from gscompleter.metrics.image import psnr, ssim
 from gscompleter.render import Renderer
 from gscompleter.reports.depth_picture import limits_of, write_depth
@@ -29,6 +29,10 @@ from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompl
 
 GENERATED = "generated.ply"
 """The file with what was added, alone."""
+
+
+Scores = dict[str, float | None]
+"""By their names, what an image scores; None where there is no photograph."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ class Images:
     after: Render
     truth: Float[Tensor, "h w 3"] | None
 
-    def scores(self) -> dict[str, float | None]:
+    def scores(self) -> Scores:
         """PSNR (dB) and SSIM against the photograph; None where there is none."""
         images = {"before": self.before.image, "after": self.after.image}
         return {
@@ -88,7 +92,7 @@ def compare(
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
         if completion.num_kept == len(completion.context):
-            after = frozen.extended(completion.added).context
+            after = frozen.composite(completion.added)
         else:  # some of the context was set aside
             after = renderer.render(completion.scene, camera)
     return Images(frozen.context, after, truth)
@@ -97,23 +101,24 @@ def compare(
 def summarize(
     completion: Completion,
     targets: Sequence[Target],
-    context_images: Sequence[Images],
-    target_images: Sequence[Images],
+    scores: Sequence[Scores],
     said: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The content of `summary.json`: what was `said` in advance, and what came of it."""
+    """The content of `summary.json`: what was `said` in advance, and what came of it; `scores` are
+    those of the photographs, then of the targets."""
+    count = len(completion.views)
     return {
         "version": __version__,
         **said,
         "context": [
             {
                 "frame": view.frame,
-                **images.scores(),
+                **scored,
                 "gain": gain,
                 "contradicted": contradicted_share(view),
             }
-            for view, images, gain in zip(
-                completion.views, context_images, gains_of(completion), strict=True
+            for view, scored, gain in zip(
+                completion.views, scores[:count], gains_of(completion), strict=True
             )
         ],
         "targets": [
@@ -127,14 +132,14 @@ def summarize(
                     key: getattr(result.affine, key)
                     for key in ("scale", "shift", "inliers", "method", "agreement")
                 },
-                **images.scores(),
+                **scored,
                 # the property of completed.ply that marks what this target added
                 "generated": int(result.added.generated[0]) if len(result.added) else None,
                 "added": len(result.added),
                 "notes": list(result.notes),
             }
-            for target, result, images in zip(
-                targets, completion.targets, target_images, strict=True
+            for target, result, scored in zip(
+                targets, completion.targets, scores[count:], strict=True
             )
         ],
         "gaussians": counts(completion),
@@ -148,6 +153,12 @@ def gains_of(completion: Completion) -> list[list[float] | None]:
     if completion.gains is None:
         return [None] * len(completion.views)
     return completion.gains.tolist()
+
+
+def covered_by(around: Around) -> dict[str, Any]:
+    """How much of what surrounds it a completion covers, for the summary; nothing where nobody
+    looked."""
+    return {"coverage": coverage_of(around.looks).as_summary()} if around.looks else {}
 
 
 def contradicted_share(view: View) -> float:
@@ -170,7 +181,7 @@ def write_report(
     renderer: Renderer,
     said: Mapping[str, Any],
     brought: Brought | None = None,
-    around: Around = Around(),
+    around: Callable[[], Around] = Around,
 ) -> dict[str, Any]:
     """Write the three scenes, `images/`, `report.json` and `summary.json`; returns the summary.
 
@@ -181,7 +192,7 @@ def write_report(
         renderer: Draws the scene before and after.
         said: Settings, seed and device, for the summary.
         brought: Where the context comes from, if not from Ψ: `completed.ply` keeps its layout.
-        around: What surrounds it.
+        around: Tells what surrounds it; asked once all else is drawn and written.
 
     Raises:
         InputError: where a file cannot be written.
@@ -191,22 +202,34 @@ def write_report(
         compare(completion, result.target, target.photograph, renderer)
         for target, result in zip(targets, completion.targets, strict=True)
     ]
-    summary = summarize(completion, targets, context_images, target_images, said)
-    if brought is None:
-        save_own(folder, completion)
-    else:
-        context, scene = completion.context, completion.scene
-        save_ply(folder / CONTEXT, context)
-        save_brought(folder, context, scene, completion.set_aside, brought)
-        save_ply(folder / GENERATED, completion.added, provenance=True)
-    shown, pictured = most_changed(around.looks), folder / "images"
+    scores = side_by_side(Images.scores, [*context_images, *target_images])
+    write_scenes(folder, completion, brought)
+    pictured = folder / "images"
     pictured.mkdir()
     results = zip(completion.targets, target_images, strict=True)
     limits = [write_pictures(pictured, n, *pair) for n, pair in enumerate(results, start=1)]
+    surroundings = around()
+    shown = most_changed(surroundings.looks)
     write_looks(pictured, shown)
-    write_record(folder, record_of(completion, limits, shown, around.photographs))
+    write_record(folder, record_of(completion, limits, shown, surroundings.photographs))
+    summary = summarize(completion, targets, scores, {**said, **covered_by(surroundings)})
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     return summary
+
+
+def write_scenes(folder: Path, completion: Completion, brought: Brought | None) -> None:
+    """Write the three scenes, and what was removed of one that was brought.
+
+    Raises:
+        InputError: where a file cannot be written.
+    """
+    if brought is None:
+        save_own(folder, completion)
+        return
+    context, scene = completion.context, completion.scene
+    save_ply(folder / CONTEXT, context)
+    save_brought(folder, context, scene, completion.set_aside, brought)
+    save_ply(folder / GENERATED, completion.added, provenance=True)
 
 
 def write_pictures(
