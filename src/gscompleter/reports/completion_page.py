@@ -6,12 +6,14 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
 from gscompleter.data.formats import FORMATS
+from gscompleter.kernels.sharing import side_by_side
 from gscompleter.reports.camera_figure import PITCH, YAW, camera_figure, placed_cameras
 from gscompleter.reports.figures import affine_scatter, colour_scale, loss_curve, time_bars
 from gscompleter.reports.finished import Affine, Finished, Scores, Summary, TargetRow, read_finished
@@ -73,17 +75,15 @@ def completion_page(folder: Path) -> str:
     found = read_finished(folder)
     summary, record = found.summary, found.record
     gallery, viewer = gallery_of(folder / "images"), viewer_of(folder)
-    sections = zip(summary.targets, record.targets, strict=True)
+    each = partial(section, gallery=gallery, unit=unit_of(summary), viewer=viewer)
+    rows = list(enumerate(zip(summary.targets, record.targets, strict=True), start=1))
     return rendered(
         "completion.html",
         {
             "title": title_of(summary),
             "facts": facts_of(summary),
             "notes": about_scene(summary),
-            "targets": [
-                section(number, row, kept, gallery, unit_of(summary), viewer)
-                for number, (row, kept) in enumerate(sections, start=1)
-            ],
+            "targets": side_by_side(lambda row: each(row[0], *row[1]), rows),
             "coverage": coverage_sentence(summary),
             "around": list(around(found, gallery)),
             "cameras": cameras_of(found),
