@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from jaxtyping import Float
@@ -13,10 +15,20 @@ Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
 Pixels = Float[np.ndarray, "m 2"]
 
 
+KEPT = 32
+"""Images whose features are remembered: a photograph is matched again for every target."""
+
+
 def features_of(view: StereoImage) -> Features:
     grey = cv2.cvtColor((view.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    return _features_in(grey.tobytes(), grey.shape)
+
+
+@lru_cache(KEPT)
+def _features_in(grey: bytes, size: tuple[int, int]) -> Features:
     detector = cv2.SIFT.create(2000, contrastThreshold=0.02)
-    keypoints, descriptors = detector.detectAndCompute(grey, None)
+    image = np.frombuffer(grey, np.uint8).reshape(size)
+    keypoints, descriptors = detector.detectAndCompute(image, None)
     if descriptors is None:
         return np.zeros((0, 2)), np.zeros((0, 128))
     return np.array([k.pt for k in keypoints], np.float64) + 0.5, descriptors.astype(np.float64)

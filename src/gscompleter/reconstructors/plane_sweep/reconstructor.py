@@ -58,7 +58,7 @@ class PlaneSweep(Splatter):
             InputError: as a call.
         """
         views = ranged(views)
-        rig = rig_of(views)
+        rig = rig_of(views, halves=True)
         first, second = matched(rig, views, halves=True)
         open_there = sky_above(rig.images[1], second)
         layers = [
