@@ -79,7 +79,7 @@ def find(scene: Gaussians, views: Sequence[View], trained: Sequence[int]) -> Non
 
 def chosen(evidence: Evidence, told: list[int]) -> Evidence:
     """What some of the photographs say."""
-    return Evidence(evidence.centers[told], evidence.areas[:, told], evidence.agreement[:, told])
+    return Evidence(evidence.centers[told], evidence.areas[told], evidence.agreement[told])
 
 
 def roc(believed: Tensor, wrong: Tensor) -> float:

@@ -85,7 +85,7 @@ def test_surfaces_are_supported_and_shreds_are_not():
 def test_another_exposure_is_no_contradiction(exposure):
     views = [replace(VIEWS[0], image=(exposure * VIEWS[0].image).clamp(0, 1)), VIEWS[1], VIEWS[2]]
     evidence = gather_evidence(SCENE, views, frozen_at(views), SupportConfig())
-    assert evidence.agreement[evidence.areas[:, 0] > 0, 0].median() > 0.8
+    assert evidence.agreement[0, evidence.areas[0] > 0].median() > 0.8
 
 
 def test_a_photograph_of_something_else_contradicts():
@@ -94,11 +94,11 @@ def test_a_photograph_of_something_else_contradicts():
     views = [VIEWS[0], replace(VIEWS[1], image=image), VIEWS[2]]
     evidence = gather_evidence(SCENE, views, frozen_at(views), SupportConfig())
     pixels, z = project(SCENE.means, PHOTOGRAPHS[1])
-    shown = (evidence.areas[:, 1] > 0) & inside(pixels, z, PHOTOGRAPHS[1])
+    shown = (evidence.areas[1] > 0) & inside(pixels, z, PHOTOGRAPHS[1])
     left = pixels[:, 0] < SIZE // 4 - 4
     right = pixels[:, 0] > SIZE // 4 + 4
-    assert evidence.agreement[shown & left, 1].mean() < 0.2
-    assert evidence.agreement[shown & right, 1].mean() > 0.6
+    assert evidence.agreement[1, shown & left].mean() < 0.2
+    assert evidence.agreement[1, shown & right].mean() > 0.6
 
 
 def test_sums_of_weights_make_up_the_alpha():

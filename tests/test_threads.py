@@ -7,6 +7,7 @@ import sys
 
 import numba
 import pytest
+import torch
 
 from gscompleter import threads
 from gscompleter.kernels.sharing import meanwhile
@@ -49,6 +50,14 @@ def test_a_container_is_granted_a_share_of_the_cores(tmp_path, said, cores):
     quota.write_text(said)
     assert threads.granted(quota) == cores
     assert threads.granted(tmp_path / "missing") == float("inf")
+
+
+def test_torch_has_its_threads_back_after_it_had_one():
+    before = torch.get_num_threads()
+    with pytest.raises(KeyError), threads.torch_on_one_thread():
+        assert torch.get_num_threads() == 1
+        raise KeyError
+    assert torch.get_num_threads() == before
 
 
 def test_a_share_of_a_core_is_one_thread(tmp_path, monkeypatch):

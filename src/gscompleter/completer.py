@@ -518,11 +518,13 @@ class GSCompleter:
     ) -> Float[Tensor, "n"]:
         """Support of the scene as it stands, as `camera` sees it. What was added has it all, and so
         has what it does not see."""
-        sums, means = weight_sums(frozen), completion.scene.means
-        seen = (sums[: completion.num_kept] > 0).nonzero()[:, 0]
-        known = evidence.of(rows_in_context(completion, seen))
-        values = support(known, means[seen], sums[seen], camera, self.config.support)
-        return torch.ones_like(sums).index_copy(0, seen, values)
+        sums, aside = weight_sums(frozen), completion.set_aside
+        values, seen = torch.ones_like(sums), sums[: completion.num_kept]
+        if aside is not None:
+            seen = torch.zeros_like(aside, dtype=seen.dtype).masked_scatter(~aside, seen)
+        found = support(evidence, completion.context.means, seen, camera, self.config.support)
+        values[: completion.num_kept] = found if aside is None else found[~aside]
+        return values
 
     def evidence(self, completion: Completion) -> Evidence | None:
         """What the photographs show of a scene that was brought, before any target; None where

@@ -10,12 +10,14 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from gscompleter.config import SupportConfig
 from gscompleter.generators import Request, load_generator
 from gscompleter.interpolation import smoothed
 from gscompleter.kernels.compiled import note_compiled
 from gscompleter.kernels.stereo import best_mean
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
+from gscompleter.stages.support import gather_evidence, support, weight_sums
 from gscompleter.types import Camera, Gaussians, Render, SceneContext, View, observed, sh_from_rgb
 
 SIDE = 64
@@ -59,11 +61,13 @@ def render_with(renderer: str) -> None:
     frozen.extended(gaussians)
 
 
-def fold_brought(_: str) -> None:
-    """Fit the looks of Gaussians to a scene that was brought."""
-    gaussians = some_gaussians()
+def doubt_brought(_: str) -> None:
+    """Ask what supports a scene that was brought, and fit the looks of Gaussians to it."""
+    gaussians, view, config = some_gaussians(), photographs()[0], SupportConfig()
     looks = gaussians.opacities.clone().requires_grad_(), gaussians.sh.clone().requires_grad_()
-    frozen = load_renderer("cpu").freeze(gaussians, camera_at(0))
+    frozen = load_renderer("cpu").freeze(gaussians, view.camera)
+    evidence = gather_evidence(gaussians, [view], [frozen], config)
+    support(evidence, gaussians.means, weight_sums(frozen), view.camera, config)
     frozen.plan_appearance(gaussians)(*looks).sum().backward()
 
 
@@ -93,7 +97,7 @@ def synthesize_with(generator: str) -> None:
 
 PARTS: dict[str, Callable[[str], None]] = {
     "cpu": render_with,
-    "brought": fold_brought,
+    "brought": doubt_brought,
     "warp-inpaint": synthesize_with,
     "plane-sweep": reconstruct_with,
 }

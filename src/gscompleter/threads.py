@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 LIBRARIES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
@@ -28,6 +30,23 @@ def threads() -> int:
     """How many threads compute, as `bound_threads` or the environment says."""
     told = os.environ.get(LIBRARIES[0], "")
     return int(told) if told.isdecimal() and int(told) > 0 else usable_cores()
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """torch computes with one thread meanwhile.
+
+    Between two of its loops its other threads spin, and where the loops are short and take turns
+    with kernels of our own, that takes more time from these than the threads save.
+    """
+    import torch
+
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
 
 
 def usable_cores() -> int:

@@ -380,14 +380,14 @@ class Evidence:
 
     centers: Float[Tensor, "k 3"]
     """Where the photographs were taken, in world coordinates."""
-    areas: Float[Tensor, "n k"]
+    areas: Float[Tensor, "k n"]
     """How much of each Gaussian each photograph shows, in squared scene units."""
-    agreement: Float[Tensor, "n k"]
+    agreement: Float[Tensor, "k n"]
     """How far the scene looks there as the photograph does, in [0, 1]; 0 where it shows nothing."""
 
     def of(self, rows: Int64[Tensor, "m"]) -> Evidence:
         """What they show of some of the Gaussians."""
-        return replace(self, areas=self.areas[rows], agreement=self.agreement[rows])
+        return replace(self, areas=self.areas[:, rows], agreement=self.agreement[:, rows])
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Compiled tile rasteriser of 3D Gaussians, forward and backward, for CPUs.
 
-The image is cut into tiles of 16 × 16 pixels. Gaussians are projected to splats, sorted by depth
-once for the whole image, and binned stably, so that the list of every tile is in depth order. A
+The image is cut into tiles of 16 × 16 pixels. Gaussians are projected to splats and
+binned, and the list of every tile is sorted by depth, stably, which needs no more than the cache. A
 tile walks its list; a splat touches the rows of its bounding box; a row of 16 pixels is one vector.
 LLVM does not find these vectors by itself, so the loop over the rows is written in its own language
 (the intrinsics below); it turns them into whatever the processor has.
@@ -93,7 +93,8 @@ class Layer(NamedTuple):
     opacities: np.ndarray
     """[n] float32."""
     boxes: np.ndarray
-    """Pixels that a splat may touch, x from, x to, y from, y to (excluded) [n, 4] int32."""
+    """Pixels that a splat may touch, x from, x to, y from, y to (excluded) [n, 4] int16, or int32
+    in an image that is larger."""
     tile_start: np.ndarray
     """Where the list of each tile starts [tiles + 1] int64."""
     entries: np.ndarray
@@ -707,7 +708,7 @@ def _basis_slope(x, y, z, g):
 def project(begin, end, gaussians, pinhole, splats, boxes):
     """Project the Gaussians begin..end; those that cannot be seen get an empty box.
 
-    gaussians: GaussianArrays of n. splats [n, 9] float32 and boxes [n, 4] int32 are written. The
+    gaussians: GaussianArrays of n. splats [n, 9] float32 and boxes [n, 4] are written. The
     box encloses the pixels where the alpha of a splat of this opacity reaches 1/255.
     """
     means, quats, scales, opacities, sh = gaussians
@@ -779,73 +780,18 @@ def project(begin, end, gaussians, pinhole, splats, boxes):
 
 
 @njit(cache=True, nogil=True)
-def depth_order(splats, boxes):
-    """The splats with a box, front to back; of equals the first comes first.
+def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
+    """Count how many of the splats begin..end touch each tile.
 
-    A radix sort of the depths' bits, 11 at a time. The near plane keeps depths positive.
-    Returns their indices [m] int32 and their depths [m] float32.
-    """
-    digits, mask = 2048, np.uint32(2047)
-    visible = 0
-    for i in range(len(boxes)):
-        if boxes[i, 0] < boxes[i, 1]:
-            visible += 1
-    order = np.empty(visible, np.int32)
-    keys = np.empty(visible, np.uint32)
-    histograms = np.zeros((3, digits), np.int64)
-    count = 0
-    for i in range(len(boxes)):
-        if boxes[i, 0] < boxes[i, 1]:
-            key = _bits_of(splats[i, DEPTH])
-            order[count], keys[count] = i, key
-            count += 1
-            for step in range(3):
-                histograms[step, (key >> np.uint32(11 * step)) & mask] += 1
-
-    other_order, other_keys = np.empty_like(order), np.empty_like(keys)
-    for step in range(3):
-        shift = np.uint32(11 * step)
-        start = 0
-        for digit in range(digits):
-            size = histograms[step, digit]
-            histograms[step, digit] = start
-            start += size
-        for i in range(visible):
-            key = keys[i]
-            digit = (key >> shift) & mask
-            place = histograms[step, digit]
-            histograms[step, digit] = place + 1
-            other_order[place], other_keys[place] = order[i], key
-        order, other_order = other_order, order
-        keys, other_keys = other_keys, keys
-    return order, keys.view(np.float32)
-
-
-@njit(cache=True, nogil=True)
-def count_entries(
-    begin, end, order, depths, boxes, depth_limits, tiles_x, rectangles, sizes, counts
-):
-    """Count how many of the splats order[begin:end] touch each tile, and vice versa.
-
-    order [m], depths [m]: as `depth_order` returns them. boxes [n, 4].
     depth_limits [tiles] float32: behind it, nothing is seen in the tile.
-    rectangles [m, 4] int16 receives the tiles of each splat: x from, x to, y from, y to
-        (excluded). sizes [n] int32 receives the number of lists each splat gets into.
     counts [tiles] int32 is added to.
     """
-    for rank in range(begin, end):
-        i = order[rank]
-        left, right = boxes[i, 0] >> TILE_SHIFT, ((boxes[i, 1] - 1) >> TILE_SHIFT) + 1
-        top, bottom = boxes[i, 2] >> TILE_SHIFT, ((boxes[i, 3] - 1) >> TILE_SHIFT) + 1
-        rectangles[rank, 0], rectangles[rank, 1] = left, right
-        rectangles[rank, 2], rectangles[rank, 3] = top, bottom
-        size = 0
-        for tile_y in range(top, bottom):
+    for i in range(begin, end):
+        for tile_y in range(boxes[i, 2] >> TILE_SHIFT, (boxes[i, 3] + TILE - 1) >> TILE_SHIFT):
+            left, right = boxes[i, 0] >> TILE_SHIFT, (boxes[i, 1] + TILE - 1) >> TILE_SHIFT
             for tile in range(tile_y * tiles_x + left, tile_y * tiles_x + right):
-                if depths[rank] <= depth_limits[tile]:
+                if splats[i, DEPTH] <= depth_limits[tile]:
                     counts[tile] += 1
-                    size += 1
-        sizes[i] = size
 
 
 @njit(cache=True, nogil=True)
@@ -866,28 +812,82 @@ def places_of(counts):
 
 
 @njit(cache=True, nogil=True)
-def fill_entries(
-    begin, end, order, depths, depth_limits, tiles_x, rectangles, slot_start, places, entries, slots
-):
-    """Enter the splats order[begin:end] into the lists of the tiles they touch.
+def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entries, keys):
+    """Enter the splats begin..end into the lists of the tiles they touch.
 
-    order, depths, depth_limits and rectangles as in `count_entries`.
-    slot_start [n + 1] int64: slots number the entries splat by splat, so that the gradients of a
-        splat lie together whatever tiles they come from.
+    The first arguments are those of `count_entries`.
     places [tiles] int32: where the next entry of each tile goes; counted up.
-    entries [e] int32 receives the index of the splat, and slots [e] int32 its slot.
+    entries [e] int32 receives the index of the splat, and keys [e] uint32 the bits of its depth.
     """
-    for rank in range(begin, end):
-        slot = slot_start[order[rank]]
-        left, right = rectangles[rank, 0], rectangles[rank, 1]
-        for tile_y in range(rectangles[rank, 2], rectangles[rank, 3]):
+    for i in range(begin, end):
+        for tile_y in range(boxes[i, 2] >> TILE_SHIFT, (boxes[i, 3] + TILE - 1) >> TILE_SHIFT):
+            left, right = boxes[i, 0] >> TILE_SHIFT, (boxes[i, 1] + TILE - 1) >> TILE_SHIFT
             for tile in range(tile_y * tiles_x + left, tile_y * tiles_x + right):
-                if depths[rank] <= depth_limits[tile]:
+                if splats[i, DEPTH] <= depth_limits[tile]:
                     place = places[tile]
                     places[tile] = place + 1
-                    entries[place] = order[rank]
-                    slots[place] = slot
-                    slot += 1
+                    entries[place], keys[place] = i, _bits_of(splats[i, DEPTH])
+
+
+@njit(cache=True, nogil=True)
+def sort_lists(begin, end, tile_start, entries, keys):
+    """Sort the lists of the tiles begin..end front to back; of equals the first stays first.
+
+    A radix sort of the depths' bits, 8 at a time, without those in which all are alike. The near
+    plane keeps depths positive. A list and its keys fit into the cache, all together do not.
+    """
+    largest = 0
+    for tile in range(begin, end):
+        largest = max(largest, tile_start[tile + 1] - tile_start[tile])
+    spare_entries, spare_keys = np.empty(largest, np.int32), np.empty(largest, np.uint32)
+    places = np.empty((4, 256), np.int64)
+    for tile in range(begin, end):
+        start, stop = tile_start[tile], tile_start[tile + 1]
+        size = stop - start
+        own_entries, own_keys = entries[start:stop], keys[start:stop]
+        places[:] = 0
+        for k in range(size):
+            for step in range(4):
+                places[step, (own_keys[k] >> np.uint32(8 * step)) & np.uint32(255)] += 1
+        for step in range(4):
+            shift, place, most = np.uint32(8 * step), 0, 0
+            for digit in range(256):
+                count = places[step, digit]
+                most = max(most, count)
+                places[step, digit] = place
+                place += count
+            if most == size:
+                continue
+            for k in range(size):
+                digit = (own_keys[k] >> shift) & np.uint32(255)
+                place = places[step, digit]
+                places[step, digit] = place + 1
+                spare_entries[place], spare_keys[place] = own_entries[k], own_keys[k]
+            for k in range(size):
+                own_entries[k], own_keys[k] = spare_entries[k], spare_keys[k]
+
+
+@njit(cache=True, nogil=True)
+def number_slots(entries, count):
+    """Number the entries [e] int32 splat by splat, so that the gradients of each of the splats
+    0..count lie together whatever tiles they come from.
+
+    Returns the number of each entry [e] int32, and where those of each splat start [count + 1]
+    int64.
+    """
+    slot_start = np.zeros(count + 1, np.int64)
+    for place in range(len(entries)):
+        slot_start[entries[place] + 1] += 1
+    slot = 0
+    for i in range(count + 1):
+        slot += slot_start[i]
+        slot_start[i] = slot
+    slots, taken = np.empty_like(entries), slot_start.copy()
+    for place in range(len(entries)):
+        i = entries[place]
+        slots[place] = taken[i]
+        taken[i] += 1
+    return slots, slot_start
 
 
 @njit(cache=True, nogil=True)
@@ -905,6 +905,22 @@ def number_by_use(entries, count):
             used += 1
         renamed[place] = numbers[i]
     return order[:used], renamed
+
+
+@njit(cache=True, nogil=True)
+def take_splats(begin, end, rows, splats, opacities, boxes, taken):
+    """Copy splats of these rows to the places begin..end; the caller gives what holds them.
+
+    rows [m] int32. taken: splats [m, 9], opacities [m] and boxes [m, 4] to write.
+    """
+    to_splats, to_opacities, to_boxes = taken
+    for place in range(begin, end):
+        i = rows[place]
+        for column in range(NUM_SPLAT_COLUMNS):
+            to_splats[place, column] = splats[i, column]
+        to_opacities[place] = opacities[i]
+        for side in range(4):
+            to_boxes[place, side] = boxes[i, side]
 
 
 @njit(cache=True)
@@ -1251,6 +1267,20 @@ def sum_entries(begin, end, slot_start, gradients, written, totals):
             if written[slot]:
                 for column in range(gradients.shape[1]):
                     totals[i, column] += gradients[slot, column]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def sum_by_name(begin, end, entries, rows, gradients, written, totals):
+    """Sums of the gradients of all entries that name each of the splats begin..end.
+
+    entries [e] int32: the splat of each entry. gradients [e, c] float32, where written [e].
+    rows [splats] int32: the Gaussian of each splat. totals [n, c] float32 is added to.
+    """
+    for place in range(len(entries)):
+        i = entries[place]
+        if begin <= i < end and written[place]:
+            for column in range(gradients.shape[1]):
+                totals[rows[i], column] += gradients[place, column]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

@@ -11,7 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Int32, Int64, Integer
 from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -30,6 +30,10 @@ MAX_SIDE = TILE * np.iinfo(np.int16).max
 
 MAX_ENTRIES = np.iinfo(np.int32).max
 """Of the tiles' lists together, which the kernels number in 32 bits."""
+
+
+NEARLY_ALL = 0.9
+"""Share of splats in use from which on the others may stay: to copy the rest takes longer."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,8 @@ class CpuView:
 
     def extended(self, new: Gaussians) -> CpuView:
         """The same as freezing context and `new` together, in that order."""
-        added, order = by_use(self.viewpoint.bin(arrays_of(new), self.depth_limits).layer)
+        splats = self.viewpoint.project(arrays_of(new))
+        added, order = by_use(self.viewpoint.enter(splats, self.depth_limits))
         count = self.count + len(new)
         if len(added.entries) == 0:
             return replace(self, count=count)
@@ -101,13 +106,12 @@ class CpuView:
         frame = self.frame._replace(used=np.ascontiguousarray(self.frame.used[:, ::-1]))
         slopes = (layers, torch.zeros_like(layers[..., 0]), torch.zeros_like(layers[..., 0]))
         drawn = (nothing, itself, frame, slopes, rasterizer.OF_COLOUR)
-        values, written = self.viewpoint.composite_backward(*drawn)
-        values[~written] = 0
+        gradients = self.viewpoint.composite_backward(*drawn)
         totals = np.zeros((self.count, 3), np.float32)
-        for channel in range(3):
-            totals[self.rows, channel] = np.bincount(
-                self.layer.entries, values[:, channel], minlength=len(self.rows)
-            )
+        named = (self.layer.entries, self.rows, *gradients, totals)
+        pieces = ranges(len(self.rows), self.viewpoint.threads)  # Each looks at all entries.
+        calls = [(*piece, *named) for piece in pieces]
+        run(rasterizer.sum_by_name, calls, self.viewpoint.threads)
         return torch.from_numpy(totals)
 
     def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
@@ -153,8 +157,9 @@ class CpuView:
         """Project `new` once, as far as it touches a tile that is asked for."""
         splats = self.viewpoint.project(arrays_of(new))
         anywhere = np.where(self.viewpoint.tiles_of(where), np.inf, -np.inf).astype(np.float32)
-        sizes = np.diff(self.viewpoint.enter(splats, anywhere).slot_start)
-        splats = replace(splats, boxes=np.where(sizes[:, None] > 0, splats.boxes, np.int32(0)))
+        asked = np.zeros(len(splats.boxes), np.bool_)
+        asked[self.viewpoint.enter(splats, anywhere).entries] = True
+        splats = splats.only(asked)
         limits = np.minimum(anywhere, self.depth_limits)
 
         def render(depths: Float[Tensor, "n"]) -> Render:
@@ -169,14 +174,17 @@ class Splats:
 
     columns: Float32[ndarray, "n 9"]
     opacities: Float32[ndarray, "n"]
-    boxes: Int32[ndarray, "n 4"]
+    boxes: Integer[ndarray, "n 4"]
 
     def at_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
         """The same at other z-depths; what comes nearer than `near` gets an empty box."""
         columns = self.columns.copy()
         columns[:, rasterizer.DEPTH] = depths
-        boxes = np.where(depths[:, None] > near, self.boxes, np.int32(0))
-        return replace(self, columns=columns, boxes=boxes)
+        return replace(self, columns=columns).only(depths > near)
+
+    def only(self, which: Bool[ndarray, "n"]) -> Splats:
+        """The same, where all others get an empty box."""
+        return replace(self, boxes=self.boxes * which[:, None])
 
 
 @dataclass(frozen=True)
@@ -189,6 +197,9 @@ class Binned:
     slot_start: Int64[ndarray, "bounds"]
     """Where the gradients of each Gaussian start, and the end [n + 1]."""
 
+
+SplatArrays = tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]
+"""Splats, their opacities and their boxes, see `Layer`."""
 
 EntryGradients = tuple[Float32[ndarray, "entries columns"], Bool[ndarray, "entries"]]
 """Gradients of the entries of the tiles' lists, by slot, and which of them hold something."""
@@ -209,6 +220,12 @@ class Viewpoint:
     def tiles(self) -> int:
         return self.tiles_x * -(-self.pinhole.height // TILE)
 
+    @property
+    def box_type(self) -> type[np.signedinteger]:
+        """What numbers pixels: the smaller, the less is kept of a view."""
+        fits = max(self.pinhole.width, self.pinhole.height) <= np.iinfo(np.int16).max
+        return np.int16 if fits else np.int32
+
     def empty(self) -> CpuView:
         """The view of a context without Gaussians."""
         height, width = self.pinhole.height, self.pinhole.width
@@ -224,7 +241,7 @@ class Viewpoint:
         layer = Layer(
             np.empty((0, rasterizer.NUM_SPLAT_COLUMNS), np.float32),
             np.empty(0, np.float32),
-            np.empty((0, 4), np.int32),
+            np.empty((0, 4), self.box_type),
             np.zeros(self.tiles + 1, np.int64),
             np.empty(0, np.int32),
         )
@@ -233,45 +250,39 @@ class Viewpoint:
 
     def bin(self, gaussians: GaussianArrays, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
         """Project the Gaussians, sort them and enter them into the lists of the tiles."""
-        return self.enter(self.project(gaussians), depth_limits)
+        return by_splat(self.enter(self.project(gaussians), depth_limits))
 
     def project(self, gaussians: GaussianArrays) -> Splats:
         """The Gaussians as splats; those that cannot be seen get an empty box."""
         n = length_of(gaussians)
         columns = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
-        boxes = np.empty((n, 4), np.int32)
+        boxes = np.empty((n, 4), self.box_type)
         self.share(rasterizer.project, n, gaussians, self.pinhole, columns, boxes)
         return Splats(columns, gaussians.opacities, boxes)
 
-    def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
-        """Sort the splats and enter them into the lists of the tiles."""
-        n, boxes = len(splats.columns), splats.boxes
-        order, depths = rasterizer.depth_order(splats.columns, boxes)
-
-        chunks = ranges(len(order), self.threads)
-        rectangles = np.empty((len(order), 4), np.int16)
-        sizes = np.zeros(n, np.int32)
+    def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Layer:
+        """Enter the splats into the lists of the tiles, and sort these."""
+        chunks = ranges(len(splats.columns), self.threads)
         counts = np.zeros((len(chunks), self.tiles), np.int32)
-        seen = (order, depths, boxes, depth_limits, self.tiles_x, rectangles, sizes)
+        seen = (splats.columns, splats.boxes, depth_limits, self.tiles_x)
         counting = [(*chunk, *seen, count) for chunk, count in zip(chunks, counts, strict=True)]
         run(rasterizer.count_entries, counting, self.threads)
-        slot_start = np.zeros(n + 1, np.int64)
-        np.cumsum(sizes, out=slot_start[1:])
-        if slot_start[-1] > MAX_ENTRIES:
+        total = int(counts.sum(dtype=np.int64))
+        if total > MAX_ENTRIES:
             raise InputError(
-                f"The {n:,} Gaussians cover {slot_start[-1]:,} tiles of the image, and at most "
-                f"{MAX_ENTRIES:,} can be drawn; take fewer or smaller ones, or a smaller image."
+                f"The {len(splats.columns):,} Gaussians cover {total:,} tiles of the image, and at "
+                f"most {MAX_ENTRIES:,} can be drawn; take fewer or smaller ones, or a smaller "
+                "image."
             )
         tile_start = rasterizer.places_of(counts)
-        entries, slots = np.empty(tile_start[-1], np.int32), np.empty(tile_start[-1], np.int32)
-        known = (order, depths, depth_limits, self.tiles_x, rectangles, slot_start)
+        entries, keys = np.empty(total, np.int32), np.empty(total, np.uint32)
         filling = [
-            (*chunk, *known, places, entries, slots)
+            (*chunk, *seen, places, entries, keys)
             for chunk, places in zip(chunks, counts, strict=True)
         ]
         run(rasterizer.fill_entries, filling, self.threads)
-        layer = Layer(splats.columns, splats.opacities, boxes, tile_start, entries)
-        return Binned(layer, slots, slot_start)
+        self.share(rasterizer.sort_lists, self.tiles, tile_start, entries, keys)
+        return Layer(splats.columns, splats.opacities, splats.boxes, tile_start, entries)
 
     def composite(self, view: CpuView, new: Layer) -> Frame:
         """Draw the context of `view` and a new layer merged by depth, where this has anything."""
@@ -385,7 +396,7 @@ class _Slid(torch.autograd.Function):
         ctx: Any, view: CpuView, splats: Splats, limits: Any, depths: Tensor
     ) -> tuple[Tensor, ...]:
         moved = splats.at_depths(float32(depths), view.viewpoint.pinhole.near)
-        binned = view.viewpoint.enter(moved, limits)
+        binned = by_splat(view.viewpoint.enter(moved, limits))
         frame = view.viewpoint.composite(view, binned.layer)
         render = render_of(frame)
         ctx.scene = (view, binned, frame)
@@ -435,8 +446,7 @@ def by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
     they are: a tile then finds its splats near each other in memory, which saves it half of its
     time where there are a million."""
     order, entries = rasterizer.number_by_use(layer.entries, len(layer.splats))
-    splats, opacities, boxes = (array.take(order, axis=0) for array in layer[:3])
-    return Layer(splats, opacities, boxes, layer.tile_start, entries), order
+    return Layer(*chosen([layer], [order]), layer.tile_start, entries), order
 
 
 def joined(
@@ -444,17 +454,23 @@ def joined(
     new: Layer,
     tile_start: Int64[ndarray, "bounds"],
     entries: Int32[ndarray, "entries"],
-) -> tuple[Layer, list[Int64[ndarray, "_"]]]:
-    """The lists of both layers merged, and the splats that these name: the new ones are numbered
-    after those of the context. Also which splats of each layer those are."""
-    named = np.zeros(len(context.splats) + len(new.splats), np.bool_)
+) -> tuple[Layer, list[Int32[ndarray, "_"]]]:
+    """Both layers as one: of their splats those that `entries` names, numbering those of `new`
+    after those of the context. Also which splats of each layer those are.
+
+    The new ones stay as they are where they are alone and nearly all of them are named.
+    """
+    counts = len(context.splats), len(new.splats)
+    named = np.zeros(sum(counts), np.bool_)
     named[entries] = True
-    numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
-    rows = [np.flatnonzero(part) for part in np.split(named, [len(context.splats)])]
-    splats, opacities, boxes = (
-        chosen(pair, rows) for pair in zip(context[:3], new[:3], strict=True)
-    )
-    return Layer(splats, opacities, boxes, tile_start, numbers[entries]), rows
+    if np.count_nonzero(named) >= (NEARLY_ALL if counts[0] == 0 else 1) * len(named):
+        rows = [np.arange(count, dtype=np.int32) for count in counts]
+    else:
+        numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
+        entries = numbers[entries]
+        rows = [np.flatnonzero(part).astype(np.int32) for part in np.split(named, counts[:1])]
+    whole = new[:3] if len(rows[1]) == sum(counts) else chosen([context, new], rows)
+    return Layer(*whole, tile_start, entries), rows
 
 
 def by_itself(layer: Layer) -> Binned:
@@ -463,13 +479,23 @@ def by_itself(layer: Layer) -> Binned:
     return Binned(layer, slots, np.zeros(1, np.int64))
 
 
-def chosen(arrays: Sequence[ndarray], rows: Sequence[Int64[ndarray, "_"]]) -> ndarray:
-    """These rows of each of the arrays, one after the other."""
+def by_splat(layer: Layer) -> Binned:
+    """A layer whose entries keep the gradients of a splat together."""
+    return Binned(layer, *rasterizer.number_slots(layer.entries, len(layer.splats)))
+
+
+def chosen(layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]) -> SplatArrays:
+    """Splats, opacities and boxes of these rows of each of the layers, one after the other."""
     bounds = [0, *accumulate(map(len, rows))]
-    out = np.empty((bounds[-1], *arrays[0].shape[1:]), arrays[0].dtype)
-    for array, row, (start, stop) in zip(arrays, rows, pairwise(bounds), strict=True):
-        array.take(row, axis=0, out=out[start:stop], mode="clip")
-    return out
+    taken = (
+        np.empty((bounds[-1], rasterizer.NUM_SPLAT_COLUMNS), np.float32),
+        np.empty(bounds[-1], np.float32),
+        np.empty((bounds[-1], 4), layers[0].boxes.dtype),
+    )
+    for layer, row, (start, stop) in zip(layers, rows, pairwise(bounds), strict=True):
+        into = tuple(array[start:stop] for array in taken)
+        share(rasterizer.take_splats, len(row), row, *layer[:3], into)
+    return taken
 
 
 def length_of(gaussians: GaussianArrays) -> int:

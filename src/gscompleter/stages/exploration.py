@@ -31,7 +31,6 @@ from gscompleter.stages.candidates import Candidate, opening
 from gscompleter.types import (
     Camera,
     Completion,
-    Evidence,
     Gaussians,
     Render,
     merge,
@@ -146,8 +145,8 @@ def miniature(completion: Completion, most: int = MAX_GAUSSIANS) -> Completion:
     context, evidence, aside = completion.context, completion.evidence, completion.set_aside
     rows, growth = thinning(context, most)
     if evidence is not None:
-        areas = evidence.areas[rows] * growth[:, None] ** 2
-        evidence = Evidence(evidence.centers, areas, evidence.agreement[rows])
+        known = evidence.of(rows)
+        evidence = replace(known, areas=known.areas * growth**2)
     context = thinned(context, most)
     aside = None if aside is None else aside[rows]
     kept = context if aside is None else context[~aside]

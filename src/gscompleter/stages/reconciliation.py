@@ -20,6 +20,7 @@ from gscompleter.config import ReconcileConfig
 from gscompleter.descent import Adam
 from gscompleter.progress import track
 from gscompleter.render import AppearanceRender, FrozenView
+from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import SH_C0, Gaussians, View
 
 FAINT = 0.2
@@ -31,6 +32,7 @@ MAX_BAND = 0.2
 """Largest coefficient of spherical harmonics beyond the constant."""
 
 
+@torch_on_one_thread()
 def reconcile(
     added: Gaussians,
     frozen_target: FrozenView,

@@ -10,17 +10,24 @@ four stages go on from there.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
+from numpy import ndarray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, normalize
+from torch.nn.functional import avg_pool2d
 
 from gscompleter.config import SupportConfig
 from gscompleter.generators.robust import robust_affine
 from gscompleter.geometry import z_depths
+from gscompleter.kernels import evidence as kernels
+from gscompleter.kernels.evidence import Place
+from gscompleter.kernels.sharing import share, side_by_side
 from gscompleter.render import FrozenView
+from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import Camera, Evidence, Gaussians, Render, View
 
 BLUR = 0.01
@@ -33,9 +40,6 @@ ENOUGH = 0.5
 STANDOFF = 0.5
 """Standard deviations of depth along the ray by which something new stands before what is doubted
 and has to stay."""
-LEAST = 1e-6
-"""What a photograph from the opposite direction says, so that it still says something where no
-other does."""
 
 
 def gather_evidence(
@@ -49,18 +53,19 @@ def gather_evidence(
         frozen: The scene frozen at each of them.
         config: How different is too different.
     """
-    differences = [difference(f.context, v) for f, v in zip(frozen, views, strict=True)]
+    with torch_on_one_thread():
+        differences = side_by_side(difference, [f.context for f in frozen], views)
     usual = torch.stack([d.median() for d in differences]).median().item()
     scale = config.max_difference * max(1.0, usual / EXACT)
-    areas = scene.means.new_empty((len(scene), len(views)))
-    agreement = torch.empty_like(areas)
+    means = array_of(scene.means)
+    areas, agreement = np.empty((2, len(views), len(scene)), np.float32)
     for k, (view, different) in enumerate(zip(views, differences, strict=True)):
         agrees = torch.exp(-((different / scale) ** 2))
         layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
-        sums, agreeing, _ = frozen[k].sums(layers).unbind(-1)
-        areas[:, k] = sums * pixel_areas(scene.means, view.camera)
-        agreement[:, k] = agreeing / sums.clamp_min(1e-9)
-    return Evidence(torch.stack([view.camera.center for view in views]), areas, agreement)
+        sums = array_of(frozen[k].sums(layers))
+        share(kernels.tell, len(means), sums, means, place_of(view.camera), areas[k], agreement[k])
+    told = (torch.from_numpy(array).to(scene.means) for array in (areas, agreement))
+    return Evidence(torch.stack([view.camera.center for view in views]), *told)
 
 
 def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
@@ -77,7 +82,8 @@ def support(
     camera: Camera,
     config: SupportConfig = SupportConfig(),
 ) -> Float[Tensor, "n"]:
-    """How far the photographs support each Gaussian as `camera` sees it, in [0, 1].
+    """How far the photographs support each Gaussian as `camera` sees it, in [0, 1]; 1 where it sees
+    nothing.
 
     Args:
         evidence: What the photographs show of n Gaussians.
@@ -86,21 +92,22 @@ def support(
         camera: Who asks.
         config: From how far aside a photograph still tells something.
     """
-    rays = normalize(means - camera.center, dim=-1)
-    agreeing, weights = torch.zeros_like(sums), torch.zeros_like(sums)
-    for k, center in enumerate(evidence.centers):
-        rows = evidence.areas[:, k].nonzero()[:, 0]
-        turn = degrees_between(normalize(means[rows] - center, dim=-1), rays[rows])
-        weight = evidence.areas[rows, k] * (torch.exp(-((turn / config.max_turn) ** 2)) + LEAST)
-        agreeing.index_add_(0, rows, weight * evidence.agreement[rows, k])
-        weights.index_add_(0, rows, weight)
-    share = (shown(evidence, means, sums, camera) / ENOUGH).clamp_max(1.0)
-    return share * agreeing / weights.clamp_min(1e-20)
+    told = map(array_of, (evidence.centers, evidence.areas, evidence.agreement, means, sums))
+    limits = np.float32(math.radians(config.max_turn)), np.float32(ENOUGH)
+    values = np.empty(len(sums), np.float32)
+    share(kernels.support, len(values), *told, place_of(camera), *limits, values)
+    return torch.from_numpy(values).to(sums)
 
 
-def degrees_between(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Angle between unit vectors, in degrees."""
-    return torch.rad2deg(torch.acos((a * b).sum(-1).clamp(-1, 1)))
+def place_of(camera: Camera) -> Place:
+    """Where a camera stands, as the kernels want it."""
+    focal = (camera.K[0, 0] * camera.K[1, 1]).item()
+    return Place(array_of(camera.center), array_of(camera.forward), np.float32(focal))
+
+
+def array_of(values: Float[Tensor, "..."]) -> Float32[ndarray, "..."]:
+    """The values of a tensor as the kernels want them, not copied where they are so already."""
+    return values.detach().to("cpu", torch.float32).contiguous().numpy()
 
 
 def shown(
@@ -109,7 +116,7 @@ def shown(
     """How much of each Gaussian the photograph that shows most of it shows, as a share of what
     `camera` sees; large where it sees nothing. The arguments are those of `support`."""
     needed = sums * pixel_areas(means, camera)
-    return evidence.areas.amax(dim=1) / needed.clamp_min(1e-20)
+    return evidence.areas.amax(dim=0) / needed.clamp_min(1e-20)
 
 
 def weight_sums(frozen: FrozenView) -> Float[Tensor, "n"]:
