@@ -50,9 +50,10 @@ class PlaneSweep(Splatter):
         """The Gaussians of the pixels `wanted` of the first view, a synthesized image.
 
         What fills a hole is seen by no photograph, so that its opacities are left alone; and its
-        depth is that of the surfaces around it, which half the size tells. Its colours are fitted
-        to the synthesized image itself, for drawing takes the half of its sharpness. Other views'
-        depths are those that were measured. The sky tells no depth here; the scene has it.
+        depth is that of the surfaces around it, which are matched and fitted at half the size. Its
+        colours are fitted to the synthesized image itself, for drawing takes the half of its
+        sharpness. Other views' depths are those that were measured. The sky tells no depth here;
+        the scene has it.
 
         Raises:
             InputError: as a call.
@@ -62,7 +63,7 @@ class PlaneSweep(Splatter):
         first, second = matched(rig, views, halves=True)
         open_there = sky_above(rig.images[1], second)
         layers = [
-            surfaces_of(rig.images[0], without(first, sky_shown(rig, open_there))),
+            surfaces_of(rig.images[0], without(first, sky_shown(rig, open_there)), finest=1),
             as_measured(rig.images[1], without(second, open_there)),
         ]
         return self.wanted_of(views, depth_maps(layers, rig.unit, views), wanted)
@@ -97,10 +98,10 @@ def matched(rig: Rig, views: Sequence[View], halves: bool) -> list[Measured]:
     return measured(rig.halved() if large and halves else rig, *depth_range_of(views))
 
 
-def surfaces_of(image: StereoImage, found: Measured) -> Layer:
-    """The surfaces of a view through what was measured there."""
+def surfaces_of(image: StereoImage, found: Measured, finest: int = 0) -> Layer:
+    """The surfaces of a view through what was measured there, to that level of their pyramid."""
     full = found.at_size(image.size)
-    heights = fit_surfaces(full.index, full.weight, image.image)
+    heights = fit_surfaces(full.index, full.weight, image.image, finest)
     return Layer(image, inverse_at(full.planes, heights), full.confidence)
 
 

@@ -41,10 +41,11 @@ ITERATIONS = 100
 """Steps on the finest level, and twice as many on each coarser one, where they cost little."""
 
 
-def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
+def fit_surfaces(measured: Map, confidence: Map, image: Image, finest: int = 0) -> Map:
     """Heights [h, w] that follow `measured` as far as `confidence` [h, w] in [0, 1] goes.
 
-    Where nothing at all is measured, the result is `measured`.
+    Where nothing at all is measured, the result is `measured`. `finest` is the level of the pyramid
+    that it ends with: 0 is the image itself, 1 half its size.
     """
     if not (confidence > 0).any():
         return measured
@@ -53,7 +54,7 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
         levels.append(halved(*levels[-1]))
     heights = beginning(*levels[-1][:2])
     slopes = np.zeros((2, *heights.shape), np.float32)
-    for number, (data, weight, colours) in reversed(list(enumerate(levels))):
+    for number, (data, weight, colours) in reversed(list(enumerate(levels))[finest:]):
         if heights.shape != data.shape:
             heights = doubled(heights, data.shape)
             slopes = np.stack([doubled(slope, data.shape) / 2 for slope in slopes])
@@ -63,7 +64,7 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
         bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
         steps = ITERATIONS * 2**number
         variation.fit(heights, slopes, data, weight, across, down, bend, tolerance, steps)
-    return heights
+    return heights if heights.shape == measured.shape else doubled(heights, measured.shape)
 
 
 def beginning(data: AnyMap, weight: AnyMap) -> AnyMap:
