@@ -447,15 +447,11 @@ def test_depths_that_are_a_little_wrong_are_mended_and_added():
 
 
 def test_what_photographs_make_fade_is_not_added():
-    added = gaussians_of(photographs()[0])
-
-    def left(share: float) -> Gaussians:
-        return replace(added, opacities=share * added.opacities)
-
-    assert is_undone(added, left(0.2))
-    assert not is_undone(added, left(0.3))
+    added = gaussians_of(photographs()[0]).opacities
+    assert is_undone(added, 0.2 * added)
+    assert not is_undone(added, 0.3 * added)
     assert not is_undone(added[:0], added[:0])
-    assert not is_undone(added, left(0.0), HarmConfig(max_loss=None))
+    assert not is_undone(added, 0.0 * added, HarmConfig(max_loss=None))
 
 
 def test_nothing_is_added_before_what_an_earlier_target_sees(monkeypatch):

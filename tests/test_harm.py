@@ -8,7 +8,7 @@ import torch
 from gscompleter.config import HarmConfig
 from gscompleter.render import in_colours, load_renderer
 from gscompleter.stages import harm
-from gscompleter.stages.harm import do_no_harm, error_with_loss, fewest, squared_error
+from gscompleter.stages.harm import do_no_harm, error_with_loss, fewest, is_undone, squared_error
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
 
@@ -20,6 +20,10 @@ CAMERA = camera_at(size=SIZE)
 def half_a_room():
     """A context that lacks the right half of what the camera sees, and the right half."""
     return half_a_room_of(ROOM, CAMERA)
+
+
+MENDED = HarmConfig(max_loss=None)
+"""However much it takes away."""
 
 
 @pytest.mark.parametrize(("halvings", "removals"), [(0, 0), (0, 12), (16, 12)])
@@ -36,8 +40,27 @@ def test_no_photograph_is_matched_worse_than_allowed(halvings, removals, monkeyp
     allowed = error_with_loss(before, 0.05)
     monkeypatch.setattr(harm, "HALVINGS", halvings)
     monkeypatch.setattr(harm, "REMOVALS", removals)
-    mended = do_no_harm(harmful, [frozen], [view], [allowed])
+    mended = do_no_harm(harmful, [frozen], [view], [allowed], MENDED)
     assert squared_error(frozen.composite(mended).image, view.image).item() <= allowed
+    assert len(mended) == len(harmful)
+
+
+def test_what_has_to_go_for_the_most_part_goes_altogether_and_soon(monkeypatch):
+    view = view_of(ROOM, CAMERA)
+    context = gaussians_of(view)
+    harmful = replace(gaussians_of(view, torch.full((SIZE, SIZE), 1.0)), sh=-context.sh)
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    allowed = error_with_loss(squared_error(frozen.context.image, view.image).item(), 0.05)
+    trials: list[bool] = []
+
+    def counted(*arguments: torch.Tensor) -> bool:
+        trials.append(is_undone(*arguments))
+        return trials[-1]
+
+    monkeypatch.setattr(harm, "is_undone", counted)
+    assert len(do_no_harm(harmful, [frozen], [view], [allowed])) == 0
+    assert trials == [*[False] * (len(trials) - 1), True]
+    assert len(trials) < harm.HALVINGS
 
 
 def test_drawings_that_are_known_already_are_asked_instead():
@@ -53,10 +76,10 @@ def test_drawings_that_are_known_already_are_asked_instead():
         asked.append(opacities)
         return folded(opacities)
 
-    mended = do_no_harm(harmful, [frozen], [view], [allowed], drawings=[draw])
+    mended = do_no_harm(harmful, [frozen], [view], [allowed], MENDED, [draw])
     assert len(asked) > 2
     assert squared_error(folded(mended.opacities), view.image).item() <= allowed
-    expected = do_no_harm(harmful, [frozen], [view], [allowed])
+    expected = do_no_harm(harmful, [frozen], [view], [allowed], MENDED)
     assert (mended.opacities - expected.opacities).abs().mean() < 1e-3
 
 

@@ -34,7 +34,7 @@ from gscompleter.stages.context import exposed_alike, init_context, working_rang
 from gscompleter.stages.contradiction import contradicted
 from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
-from gscompleter.stages.harm import do_no_harm, error_with_loss, is_undone, squared_error
+from gscompleter.stages.harm import do_no_harm, error_with_loss, squared_error
 from gscompleter.stages.integration import hole_mask, keep_in_holes, refine_opacities
 from gscompleter.stages.kept_views import KeptViews
 from gscompleter.stages.reconciliation import reconcile
@@ -446,8 +446,7 @@ class GSCompleter:
                 kept, sight.frozen, reference, holes, plans, watching, allowed, settings
             )
             drawings = [in_colours(plan, refined.sh) for plan in plans]
-        harmless = do_no_harm(refined, frozen, watching, allowed, config.harm, drawings)
-        return (refined[:0] if is_undone(refined, harmless, config.harm) else harmless), losses
+        return do_no_harm(refined, frozen, watching, allowed, config.harm, drawings), losses
 
     def sight(self, completion: Completion, target: Camera, wide: Camera | None = None) -> Sight:
         """The scene as it stands, frozen at the target's wider camera, and the target's anchor.

@@ -32,7 +32,8 @@ def do_no_harm(
     config: HarmConfig = HarmConfig(),
     drawings: Sequence[OpacityImage] | None = None,
 ) -> Gaussians:
-    """`added` with opacities lowered until no photograph is matched worse than allowed.
+    """`added` with opacities lowered until no photograph is matched worse than allowed; nothing of
+    it where that takes so much that the photographs contradict all of it.
 
     In a view that got worse, a Gaussian is harmful where less opacity would bring the view nearer
     to its photograph. The most harmful ones are halved, no more of them than it takes. Where that
@@ -63,6 +64,8 @@ def do_no_harm(
         lowered = [check.to_lower(trial, image, opacities, added) for check, image in worse]
         left = 0.5 if trial < HALVINGS else 0.0
         opacities = torch.where(torch.stack(lowered).any(dim=0), left * opacities, opacities)
+        if is_undone(added.opacities, opacities, config):
+            return added[:0]
     return replace(added, opacities=opacities, encoded=None)
 
 
@@ -106,13 +109,14 @@ class Check:
         return falling_on(dilate(pixels, REACH), added, self.view.camera)
 
 
-def is_undone(added: Gaussians, harmless: Gaussians, config: HarmConfig = HarmConfig()) -> bool:
-    """Whether so much of the opacity of what is `added` had to go, until it was `harmless`, that
-    the photographs contradict all of it."""
-    if config.max_loss is None:
+def is_undone(
+    added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: HarmConfig = HarmConfig()
+) -> bool:
+    """Whether of the opacities of what was `added` so little is `left` that the photographs
+    contradict all of it."""
+    if config.max_loss is None or len(added) == 0:
         return False
-    left = harmless.opacities.sum() / added.opacities.sum().clamp_min(1e-12)
-    return len(added) > 0 and 1 - left.item() > config.max_loss
+    return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_loss
 
 
 def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
