@@ -34,11 +34,13 @@ class KeptViews:
         self._renderer, self._most = renderer, most
         self._scene: weakref.ref[Gaussians] | None = None
         self._views: Views = {}
+        self._thinned: dict[tuple[int, int], Gaussians] = {}
+        """What is drawn of the context, and of what each target added, by their rows."""
 
     def of(self, completion: Completion, cameras: Sequence[Camera]) -> tuple[FrozenView, ...]:
         """The scene as it stands, frozen at each of `cameras`."""
         if self._scene is None or self._scene() is not completion.scene:
-            self._scene, self._views = weakref.ref(completion.scene), {}
+            self._scene, self._views, self._thinned = weakref.ref(completion.scene), {}, {}
         views, keys = self._views, [key_of(camera) for camera in cameras]
         behind = {views[key][0] if key in views else 0 for key in keys}
         missing = {count: self._since(completion, count) for count in behind}
@@ -62,8 +64,11 @@ class KeptViews:
             return completion.scene[count:]
         added = [len(result.added) for result in completion.targets]
         bounds = [0, *accumulate(added, initial=completion.num_kept)]
-        parts = [completion.scene[a:b] for a, b in pairwise(bounds) if a >= count]
-        return merge([completion.scene[:0], *(thinned(part, self._most) for part in parts)])
+        parts = [part for part in pairwise(bounds) if part[0] >= count]
+        for start, stop in parts:
+            if (start, stop) not in self._thinned:
+                self._thinned[start, stop] = thinned(completion.scene[start:stop], self._most)
+        return merge([completion.scene[:0], *(self._thinned[part] for part in parts)])
 
 
 def key_of(camera: Camera) -> Hashable:
