@@ -185,7 +185,7 @@ def test_what_is_lifted_shows_the_synthesized_image_as_sharply_as_it_is(rig):
         load_renderer("cpu").render(g, views[0].camera).image for g in (lifted, plain)
     )
     ratios = [gradient_energy_ratio(x, views[0].image, inner) for x in (drawn, blurred)]
-    assert ratios[1] < 0.8
+    assert ratios[1] < 0.9
     assert 0.9 < ratios[0] < 1.1
     errors = [(x - views[0].image)[inner].square().mean() for x in (drawn, blurred)]
     assert errors[0] < 0.5 * errors[1]

@@ -99,11 +99,6 @@ def test_whatever_becomes_an_index_lies_within_the_image(odd):
         assert clipped == np.clip(np.float32(odd), 0, 5)
 
 
-def test_a_share_of_more_than_all_sources_is_all_of_them():
-    costs = np.random.default_rng(0).integers(0, 255, (3, 120)).astype(np.uint8)
-    assert (stereo.best_mean(costs, 9.0, 140) == stereo.best_mean(costs, 1.0, 140)).all()
-
-
 @pytest.mark.parametrize("size", [(0, 5), (-1, 5), (MAX_SIDE + 1, 5), (10**9, 10**9)])
 def test_an_image_that_cannot_be_numbered_is_refused(size):
     camera = replace(camera_at(size=16), width=size[0], height=size[1])

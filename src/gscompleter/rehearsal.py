@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import torch
 
 from gscompleter.config import SupportConfig
 from gscompleter.generators import Request, load_generator
 from gscompleter.interpolation import smoothed
 from gscompleter.kernels.compiled import note_compiled
-from gscompleter.kernels.stereo import best_mean
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.stages.support import gather_evidence, support, weight_sums
@@ -45,16 +43,17 @@ def camera_at(place: int) -> Camera:
 
 
 def render_with(renderer: str) -> None:
-    """Draw some Gaussians in all the ways there are, and ask for gradients."""
+    """Draw some Gaussians in all the ways there are, and ask for gradients: first in those in which
+    models draw, which another process is about to look for."""
     drawing, camera, gaussians = load_renderer(renderer), camera_at(0), some_gaussians()
     frozen = drawing.freeze(gaussians, camera)
     opacities = gaussians.opacities.clone().requires_grad_()
     means = gaussians.means.clone().requires_grad_()
-    moved = observed(means, gaussians.quats, gaussians.scales, opacities, gaussians.sh)
-    frozen.composite(moved).image.sum().backward()
     frozen.plan(gaussians)(opacities).image.sum().backward()
     grey = torch.full((SIDE, SIDE, 3), 0.5)
     frozen.plan_colours(gaussians)(torch.rand(len(gaussians), 3), grey)
+    moved = observed(means, gaussians.quats, gaussians.scales, opacities, gaussians.sh)
+    frozen.composite(moved).image.sum().backward()
     depths = torch.full((len(gaussians),), DEPTH, requires_grad=True)
     everywhere = torch.ones(SIDE, SIDE, dtype=torch.bool)
     frozen.plan_depths(gaussians, everywhere)(depths).depth.sum().backward()
@@ -79,9 +78,8 @@ def some_gaussians() -> Gaussians:
 
 
 def reconstruct_with(reconstructor: str) -> None:
-    """Make Gaussians of the two photographs, and weigh what three would cost."""
+    """Make Gaussians of the two photographs."""
     load_reconstructor(reconstructor)(photographs())
-    best_mean([np.zeros(1, np.uint8)] * 2, 0.5, np.uint8(0))
 
 
 def synthesize_with(generator: str) -> None:

@@ -244,46 +244,6 @@ def _match_tiles(
                     costs[place + x * count] = value
 
 
-def best_mean(costs, fraction, unseen_cost):
-    """The mean of the best `fraction` of the sources' costs, each [cells], for each cell.
-
-    A surface that is hidden from some of the views costs there whatever hides it; the views that
-    see it decide. Where no source sees the plane, it costs `unseen_cost`.
-    """
-    if len(costs) == 1:
-        return np.where(costs[0] == UNSEEN, unseen_cost, costs[0])
-    merged = np.empty(len(costs[0]), np.uint8)
-    share(_merge_cells, len(merged), np.stack(costs), fraction, unseen_cost, merged)
-    return merged
-
-
-@njit(cache=True, nogil=True)
-def _merge_cells(begin, end, costs, fraction, unseen_cost, merged):
-    """Fill in the means of the cells from `begin` to `end`."""
-    n = costs.shape[0]
-    ranked = np.empty(n, np.int32)
-    for k in range(begin, end):
-        seen = 0
-        for i in range(n):
-            value = np.int32(costs[i, k])
-            if value == UNSEEN:
-                continue
-            at = seen
-            while at > 0 and ranked[at - 1] > value:
-                ranked[at] = ranked[at - 1]
-                at -= 1
-            ranked[at] = value
-            seen += 1
-        if seen == 0:
-            merged[k] = unseen_cost
-            continue
-        count = max(1, min(seen, np.int32(np.ceil(seen * fraction))))
-        total = 0
-        for i in range(count):
-            total += ranked[i]
-        merged[k] = np.uint8(total // count)
-
-
 @njit(cache=True, fastmath={"contract"}, inline="always")
 def _step(cost, before, lowest, after, total, small, large):
     """One step of a path: returns the lowest cost at the new pixel."""

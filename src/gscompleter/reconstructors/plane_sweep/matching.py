@@ -24,8 +24,6 @@ NOISE = 0.015
 """Standard deviation of noise in colour; weaker texture correlates with nothing."""
 DETAIL = 0.4
 """Share of the pixels' own difference in the cost; the rest is correlation of windows."""
-BEST_SHARE = 0.5
-"""Share of the sources, the best ones, whose mean cost counts."""
 UNSEEN_COST = 140
 """Cost (0 to 254) of a plane at which no other view sees the pixel."""
 
@@ -79,11 +77,16 @@ def matched_costs(
     inverse_depths: Float[np.ndarray, "d"],
     bands: Bands,
 ) -> UInt8[np.ndarray, "cells"]:
-    """Costs in 0 to 254 of the planes that `bands` names; of several sources the best count."""
+    """Costs in 0 to 254 of the planes that `bands` names; of several sources the best counts.
+
+    A surface that is hidden from one of them costs there whatever hides it; a view that sees it
+    decides.
+    """
     settings = (RADIUS, np.float32(NOISE), np.float32(DETAIL))
     planes = (inverse_depths, bands)
     costs = [
         stereo.matching_costs(reference.image, source.image, transform, *planes, *settings)
         for source, transform in sources
     ]
-    return stereo.best_mean(costs, BEST_SHARE, np.uint8(UNSEEN_COST))
+    best = np.minimum.reduce(costs)
+    return np.where(best == stereo.UNSEEN, np.uint8(UNSEEN_COST), best)
