@@ -56,6 +56,7 @@ def marked(monkeypatch, tmp_path) -> list[str]:
     monkeypatch.setattr(compilation, "PARTS", ("cpu", "plane-sweep"))
     monkeypatch.setattr(rehearsal, "PARTS", dict.fromkeys(compilation.PARTS, done.append))
     monkeypatch.setattr(compilation, "threads", lambda: 1)
+    monkeypatch.setattr(compilation, "_begun", {})
     return done
 
 
@@ -131,6 +132,23 @@ print(process.args[-1:], process.poll(), process.pid)
     assert (name, state, life.stderr) == ("['plane-sweep']", "None", "")
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid), 0)
+
+
+def test_what_was_begun_is_waited_for_once(monkeypatch, marked):
+    begun: list[subprocess.Popen[bytes]] = []
+
+    def idle(names: list[str]) -> subprocess.Popen[bytes]:
+        begun.append(subprocess.Popen([sys.executable, "-c", "pass", *names]))
+        return begun[-1]
+
+    monkeypatch.setattr(compilation, "begun_apart", idle)
+    monkeypatch.setattr(compilation, "threads", lambda: 2)
+    compilation.begin(["plane-sweep"])
+    compilation.begin(["plane-sweep"])
+    assert compilation.compile_kernels(["cpu", "plane-sweep"]) > 0
+    assert [(process.args[-1], process.returncode) for process in begun] == [("plane-sweep", 0)]
+    assert marked == ["cpu"]
+    assert compilation._begun == {}
 
 
 def test_one_process_alone_begins_nothing(monkeypatch, marked):

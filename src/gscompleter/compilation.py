@@ -44,7 +44,7 @@ SECONDS = 30
 
 Process = subprocess.Popen[bytes]
 _begun: dict[str, Process] = {}
-"""The process that rehearses each part that was begun ahead."""
+"""The process that rehearses each part that was begun ahead, until it is waited for."""
 
 
 def begin(names: Iterable[str]) -> None:
@@ -58,7 +58,7 @@ def begin(names: Iterable[str]) -> None:
         return
     from gscompleter.kernels.compiled import is_compiled
 
-    lacking = [part for part in wanted if not is_compiled(part)]
+    lacking = [part for part in wanted if part not in _begun and not is_compiled(part)]
     if lacking:
         process = begun_apart(lacking)
         atexit.register(stopped, process)
@@ -94,7 +94,7 @@ def shares_of(names: Sequence[str], count: int) -> tuple[list[str], list[str]]:
     """What this process rehearses, and what another does where there are as many as `count`."""
     own = [name for name in names if name in DRAWING]
     rest = [name for name in names if name in MODELS]
-    if _begun or (own and count > 1):
+    if any(name in _begun for name in rest) or (own and count > 1):
         return own, rest
     return [*own, *rest], []
 
@@ -103,7 +103,7 @@ def shares_of(names: Sequence[str], count: int) -> tuple[list[str], list[str]]:
 def rehearsed_apart(names: Sequence[str]) -> Iterator[None]:
     """Rehearse parts in another process meanwhile; those that are begun there are waited for."""
     new = [name for name in names if name not in _begun]
-    processes = {_begun[name] for name in names if name in _begun}
+    processes = {_begun.pop(name) for name in names if name in _begun}
     if new:
         processes.add(begun_apart(new))
     try:
