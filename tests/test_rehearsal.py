@@ -79,6 +79,10 @@ print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
     assert others == []
 
 
+def test_each_part_that_is_named_is_rehearsed():
+    assert tuple(rehearsal.PARTS) == compilation.PARTS
+
+
 def test_what_is_compiled_is_compiled_once(marked):
     assert compilation.compile_kernels(["cpu", "mvsplat"]) > 0
     assert marked == ["cpu"]

@@ -1,8 +1,8 @@
 """Kernels compiled once for a machine, before a completion meets them one after the other.
 
 numba compiles one kernel at a time in a process. Two processes share the parts that have some:
-this one, and one that is begun before torch is imported here. So this file imports neither torch
-nor numba but where it needs them.
+this one, and one that is begun before torch is imported here. Every command reads this file, so
+that it imports what takes long only where it needs it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 from gscompleter.garbage import staying
-from gscompleter.progress import expecting, stage
 from gscompleter.threads import threads
 
 BROUGHT = "brought"
@@ -75,6 +74,7 @@ def compile_kernels(names: Sequence[str]) -> float | None:
         subprocess.CalledProcessError: where a process fails; it has said why.
     """
     from gscompleter.kernels.compiled import is_compiled
+    from gscompleter.progress import expecting, stage
 
     missing = [name for name in PARTS if name in names and not is_compiled(name)]
     if not missing:

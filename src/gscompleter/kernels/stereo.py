@@ -103,7 +103,7 @@ def matching_costs(reference, source, transform, inverse_depths, bands, radius, 
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy", inline="always")
-def _compare(y, own, own_mean, own_square, other, other_mean, other_square, cross, line):
+def _compare(y, own, own_mean, other, other_mean, other_square, cross, line):
     """Of row y, from sums over windows: sums of squared deviations and their products, in place,
     and in line[0] how much the pixels' own deviations differ.
 
@@ -228,7 +228,7 @@ def _match_tiles(
             _box_sums(product, cross, column, rows, cols, radius)
             for y in range(rows):
                 place = first + y * cols * count + plane
-                _compare(y, own, own_mean, own_square, other, other_mean, other_square, cross, line)
+                _compare(y, own, own_mean, other, other_mean, other_square, cross, line)
                 for x in range(cols):
                     correlation = cross[y, x] / np.sqrt(
                         (max(other_square[y, x], np.float32(0)) + floor)

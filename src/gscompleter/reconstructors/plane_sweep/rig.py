@@ -15,7 +15,7 @@ from gscompleter.reconstructors.plane_sweep.epipolar import rotated_to_matches
 from gscompleter.reconstructors.plane_sweep.fusion import Transforms
 from gscompleter.types import View
 
-HALVED_FROM = 384
+FEATURES_HALVED_FROM = 384
 """Pixels of the shortest side from which half the size has features enough to tell a pose."""
 
 
@@ -43,7 +43,7 @@ def rig_of(views: Sequence[View], halves: bool = False) -> Rig:
         InputError: fewer than two views, no baseline between them.
     """
     images, unit = stereo_images(views)
-    large = min(min(image.size) for image in images) >= HALVED_FROM
+    large = min(min(image.size) for image in images) >= FEATURES_HALVED_FROM
     neighbours = neighbours_at_half(images) if halves and large else neighbours_among(images)
     transforms = {}
     for i, j in combinations(range(len(images)), 2):
