@@ -14,6 +14,7 @@ from gscompleter.geometry import inside, project
 from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
+from gscompleter.render.cpu import CpuView
 from gscompleter.stages.harm import squared_error
 from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed
@@ -131,6 +132,22 @@ def test_shreds_give_way_to_what_belongs_there():
         before = psnr(RENDERER.render(SCENE, view.camera).image, view.image)
         after = psnr(RENDERER.render(completion.scene, view.camera).image, view.image)
         assert after > before - 0.05
+
+
+def test_views_that_rest_change_nothing(monkeypatch):
+    targets = [TARGET, camera_at(-0.5, yaw=-25, size=SIZE)]
+    asked = (VIEWS[::2], targets, SCENE, VIEWS[1:2])
+    awake = knowing()(*asked)
+    rested = []
+    resting = CpuView.resting
+    monkeypatch.setattr(CpuView, "resting", lambda *a: rested.append(a) or resting(*a))
+    monkeypatch.setattr("gscompleter.stages.kept_views.MAX_KEPT", 0)
+    found = knowing()(*asked)
+    assert len(rested) > 0
+    assert len(awake.targets[0].added) > 0
+    for name in ("means", "opacities", "sh"):
+        assert torch.equal(getattr(found.scene, name), getattr(awake.scene, name)), name
+    assert found.allowed_errors == awake.allowed_errors
 
 
 def test_without_its_photographs_a_scene_is_taken_as_it_is():

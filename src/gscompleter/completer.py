@@ -36,7 +36,7 @@ from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.harm import do_no_harm, error_with_loss, squared_error
 from gscompleter.stages.integration import hole_mask, keep_in_holes, refine_opacities
-from gscompleter.stages.kept_views import KeptViews
+from gscompleter.stages.kept_views import KeptViews, fill_memory
 from gscompleter.stages.reconciliation import reconcile
 from gscompleter.stages.registration import Registration, register
 from gscompleter.stages.setting_aside import not_needed
@@ -428,8 +428,8 @@ class GSCompleter:
     ) -> tuple[Gaussians, tuple[float, ...]]:
         """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
-        watching = (*completion.views, *completion.witnesses)
-        frozen, allowed = self.at(completion, watching), completion.allowed_errors
+        watching, allowed = (*completion.views, *completion.witnesses), completion.allowed_errors
+        frozen = self.watching(completion)
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
             near_frozen = [frozen_views[i] for i in nearest]
@@ -531,7 +531,7 @@ class GSCompleter:
         if not self.config.support.doubts:
             return None
         views, config = (*completion.views, *completion.witnesses), self.config.support
-        return gather_evidence(completion.scene, views, self.at(completion, views), config)
+        return gather_evidence(completion.scene, views, self.in_turn(completion), config)
 
     def without_unsupported(self, sight: Sight) -> Sight:
         """`sight` once what covers its holes, and no photograph shows or needs, is set aside.
@@ -595,12 +595,30 @@ class GSCompleter:
             error_with_loss(
                 squared_error(v.compared(r.image), v.image).item(), max(tolerance, ROUNDING)
             )
-            for r, v in zip(contexts_of(self.at(completion, watching)), watching, strict=True)
+            for r, v in zip(contexts_of(self.watching(completion)), watching, strict=True)
         )
 
     def at(self, completion: Completion, views: Sequence[View]) -> tuple[FrozenView, ...]:
         """The scene as it stands, frozen at the cameras of photographs."""
         return self.frozen.of(completion, [view.camera for view in views])
+
+    def in_turn(self, completion: Completion) -> Iterator[FrozenView]:
+        """The scene as it stands, frozen at one photograph after the other: of the context, then
+        of the witnesses, whose views rest once the next is asked for, where all would take too much
+        memory."""
+        number = len(completion.views) + len(completion.witnesses)
+        too_much = fill_memory(number, completion.scene)
+        yield from self.at(completion, completion.views)
+        for witness in completion.witnesses:
+            yield from self.at(completion, [witness])
+            if too_much:
+                self.frozen.rest(completion, [witness.camera])
+
+    def watching(self, completion: Completion) -> tuple[FrozenView, ...]:
+        """The same at all of them."""
+        for _ in self.in_turn(completion):
+            pass
+        return self.at(completion, (*completion.views, *completion.witnesses))
 
     def small_renders(self, completion: Completion, cameras: Sequence[Camera]) -> Sequence[Render]:
         """What cameras of small images see of the scene as it stands, about."""

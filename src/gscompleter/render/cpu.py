@@ -21,7 +21,7 @@ from gscompleter.errors import InputError
 from gscompleter.kernels import rasterizer
 from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
 from gscompleter.kernels.sharing import ranges, run, share
-from gscompleter.render import ColourErrors, ColourSums, DepthRender, OpacityRender
+from gscompleter.render import ColourErrors, ColourSums, DepthRender, FrozenView, OpacityRender
 from gscompleter.render.folded import Folded, float32, folded
 from gscompleter.types import Camera, Gaussians, Render
 
@@ -100,6 +100,18 @@ class CpuView:
         frame = frame._replace(used=used)
         return CpuView(self.viewpoint, layer, frame, depth_limits, rows, count)
 
+    def resting(self, context: Gaussians) -> FrozenView:
+        from gscompleter.render.resting import RestingView
+
+        return RestingView(
+            self.viewpoint,
+            (arrays_of(context),),
+            self.frame,
+            self.depth_limits,
+            self.layer.tile_start,
+            self.rows[self.layer.entries],
+        )
+
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """By the backward pass alone: the frame that is kept tells what every pixel let through."""
         nothing, itself = self.viewpoint.empty().layer, by_itself(self.layer)
@@ -128,8 +140,7 @@ class CpuView:
 
     def plan(self, new: Gaussians) -> OpacityRender:
         """Project, sort and bin `new` once, with boxes that hold for every opacity."""
-        opaque = replace(new, opacities=torch.ones_like(new.opacities))
-        binned = self.viewpoint.bin(arrays_of(opaque), self.depth_limits)
+        binned = self.viewpoint.bin(opaque(new), self.depth_limits)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
             return Render(*_Planned.apply(self, binned, opacities.to("cpu", torch.float32)))
@@ -138,8 +149,7 @@ class CpuView:
 
     def plan_appearance(self, new: Gaussians) -> Folded:
         """Project, sort and bin `new` once, and fold what is frozen around it."""
-        opaque = replace(new, opacities=torch.ones_like(new.opacities))
-        arrays = arrays_of(opaque)
+        arrays = opaque(new)
         return folded(self, self.viewpoint.bin(arrays, self.depth_limits), arrays.means)
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
@@ -509,6 +519,12 @@ def length_of(gaussians: GaussianArrays) -> int:
 def arrays_of(gaussians: Gaussians) -> GaussianArrays:
     """The Gaussians as the kernels want them, without gradients."""
     return GaussianArrays(*(float32(getattr(gaussians, name)) for name in GaussianArrays._fields))
+
+
+def opaque(gaussians: Gaussians) -> GaussianArrays:
+    """The same at opacity 1, with which they touch all that they can touch with less."""
+    arrays = arrays_of(gaussians)
+    return arrays._replace(opacities=np.ones_like(arrays.opacities))
 
 
 def render_of(frame: Frame) -> Render:

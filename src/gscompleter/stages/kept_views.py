@@ -17,6 +17,11 @@ from gscompleter.types import Camera, Completion, Gaussians, merge
 Views = dict[Hashable, tuple[int, FrozenView]]
 """By camera, how many Gaussians of the scene are frozen in a view, and the view."""
 
+MAX_KEPT = 6 * 2**30
+"""Bytes that the views of photographs may take together while none of them rests."""
+BYTES_A_SPLAT = 52
+"""What each Gaussian that is seen takes in a view."""
+
 
 class KeptViews:
     """What cameras see of the scene that was looked at last.
@@ -53,6 +58,13 @@ class KeptViews:
             views[key] = len(completion.scene), view
         return tuple(views[key][1] for key in keys)
 
+    def rest(self, completion: Completion, cameras: Sequence[Camera]) -> None:
+        """Let the views of the scene as it stands at `cameras` lie in less memory from now on."""
+        whole = self._since(completion, 0)
+        for key in map(key_of, cameras):
+            count, view = self._views[key]
+            self._views[key] = count, view.resting(whole)
+
     def grown(self, before: Gaussians, after: Gaussians) -> None:
         """Be told that the scene `after` is `before`, and something that was added to it."""
         if self._scene is not None and self._scene() is before:
@@ -69,6 +81,11 @@ class KeptViews:
             if (start, stop) not in self._thinned:
                 self._thinned[start, stop] = thinned(completion.scene[start:stop], self._most)
         return merge([completion.scene[:0], *(self._thinned[part] for part in parts)])
+
+
+def fill_memory(number: int, scene: Gaussians) -> bool:
+    """Whether that many views of a scene would take more than `MAX_KEPT`."""
+    return number * len(scene) * BYTES_A_SPLAT > MAX_KEPT
 
 
 def key_of(camera: Camera) -> Hashable:

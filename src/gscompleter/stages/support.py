@@ -11,7 +11,8 @@ four stages go on from there.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 
 import numpy as np
 import torch
@@ -35,6 +36,8 @@ BLUR = 0.01
 image: an edge may lie a pixel aside."""
 EXACT = 0.02
 """Median difference of colour up to which a scene counts as exact."""
+TELLING = 8
+"""Photographs, the first ones, that tell how exact a scene is."""
 ENOUGH = 0.5
 """Share of what a camera sees of a Gaussian that a photograph has to show for full support."""
 STANDOFF = 0.5
@@ -43,29 +46,42 @@ and has to stay."""
 
 
 def gather_evidence(
-    scene: Gaussians, views: Sequence[View], frozen: Sequence[FrozenView], config: SupportConfig
+    scene: Gaussians, views: Sequence[View], frozen: Iterable[FrozenView], config: SupportConfig
 ) -> Evidence:
     """What photographs show of each Gaussian, and how far the scene looks like them there.
 
     Args:
         scene: The n Gaussians.
         views: The k photographs, whose cameras know the depth range.
-        frozen: The scene frozen at each of them.
+        frozen: The scene frozen at each of them. Behind the first `TELLING` they are asked for one
+            by one, and none is kept.
         config: How different is too different.
     """
+    remaining = iter(frozen)
+    first = list(islice(remaining, TELLING))
     with torch_on_one_thread():
-        differences = side_by_side(difference, [f.context for f in frozen], views)
+        differences = side_by_side(difference, [f.context for f in first], views[: len(first)])
     usual = torch.stack([d.median() for d in differences]).median().item()
     scale = config.max_difference * max(1.0, usual / EXACT)
     means = array_of(scene.means)
     areas, agreement = np.empty((2, len(views), len(scene)), np.float32)
-    for k, (view, different) in enumerate(zip(views, differences, strict=True)):
+    for k, (view, seen) in enumerate(zip(views, in_turn(first, remaining), strict=True)):
+        with torch_on_one_thread():
+            different = differences[k] if k < TELLING else difference(seen.context, view)
         agrees = torch.exp(-((different / scale) ** 2))
         layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
-        sums = array_of(frozen[k].sums(layers))
+        sums = array_of(seen.sums(layers))
         share(kernels.tell, len(means), sums, means, place_of(view.camera), areas[k], agreement[k])
     told = (torch.from_numpy(array).to(scene.means) for array in (areas, agreement))
     return Evidence(torch.stack([view.camera.center for view in views]), *told)
+
+
+def in_turn(first: list[FrozenView], others: Iterator[FrozenView]) -> Iterator[FrozenView]:
+    """Those of a list, of which none stays there, then the others."""
+    first.reverse()
+    while first:
+        yield first.pop()
+    yield from others
 
 
 def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
