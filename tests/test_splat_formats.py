@@ -24,9 +24,9 @@ from gscompleter import (
     save_ply,
     save_splat,
 )
-from gscompleter.splats.compressed_ply import near_together
 from gscompleter.splats.frames import ABOUT_X, ABOUT_Z, half_turned, moved
 from gscompleter.splats.labels import place_of_labels
+from gscompleter.splats.order import near_together
 from scenes import camera_at, random_gaussians, scaled
 from splat_files import (
     FORMATS_BUT_PLY,

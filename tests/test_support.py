@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,6 +16,8 @@ from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
 from gscompleter.render.cpu import CpuView
+from gscompleter.reports.completion import Brought, as_in_file
+from gscompleter.splats.order import WORTH, order_nearby
 from gscompleter.stages.harm import squared_error
 from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed
@@ -237,16 +240,40 @@ def complete(scene, splat, out, *more):
     return ["complete", scene, "--scene", splat, *asked, "--out", out, "--quiet", *more]
 
 
-def test_the_command_sets_aside_and_strip_puts_back(tmp_path, monkeypatch):
+@pytest.mark.parametrize("worth", [0, WORTH], ids=["sorted", "as-given"])
+def test_the_command_sets_aside_and_strip_puts_back(tmp_path, monkeypatch, worth):
+    """To the byte, whether or not the scene was sorted in between."""
+    monkeypatch.setattr("gscompleter.commands.complete.WORTH", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = tmp_path / "splat.ply", tmp_path / "out"
     save_ply(splat, SCENE)
     assert run(monkeypatch, *complete(scene, splat, out)) == 0
     removed = load_ply(out / "removed.ply")
     assert len(removed) > 0
+    assert torch.equal(load_ply(out / "context.ply").means, SCENE.means)
     assert (out / "images" / "target1_support.png").is_file()
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
     assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()
+
+
+def test_a_sorted_scene_is_the_same_in_the_order_of_its_file():
+    order = order_nearby(SCENE)
+    sides = SCENE.means[order].diff(dim=0).norm(dim=1)
+    assert sorted(order.tolist()) == list(range(len(SCENE)))
+    assert (
+        sides.median()
+        < 0.2 * SCENE.means[torch.randperm(len(SCENE))].diff(dim=0).norm(dim=1).median()
+    )
+    added, brought = SCENE[:3], Brought(Path("splat.ply"), order=order)
+    for aside in (None, torch.arange(len(SCENE)) % 3 == 0):
+        sorted_aside = None if aside is None else aside[order]
+        context = SCENE[order]
+        left = context if aside is None else context[~aside[order]]
+        found = as_in_file(context, merge([left, added]), sorted_aside, brought)
+        kept = SCENE if aside is None else SCENE[~aside]
+        assert torch.equal(found[0].means, SCENE.means)
+        assert torch.equal(found[1].means, merge([kept, added]).means)
+        assert (found[2] is None) if aside is None else torch.equal(found[2], aside)
 
 
 def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
@@ -258,7 +285,9 @@ def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
     assert torch.equal(load_ply(out / "completed.ply").means[: len(SCENE)], SCENE.means)
 
 
-def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch):
+@pytest.mark.parametrize("worth", [0, WORTH], ids=["sorted", "as-given"])
+def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch, worth):
+    monkeypatch.setattr("gscompleter.commands.complete.WORTH", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *complete(scene, splat, out)) == 0

@@ -176,7 +176,10 @@ class Gaussians(Movable):
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """The Gaussians at `index`: a boolean mask [n], integers [m] or a slice."""
         tensors = {name: part for name, part in vars(self).items() if part is not None}
-        return replace(self, **{name: tensor[index] for name, tensor in tensors.items()})
+        if isinstance(index, Tensor) and index.dtype == torch.int64:
+            index = index.to(self.means.device)  # in the way that is twice as fast as indexing
+            return replace(self, **{n: part.index_select(0, index) for n, part in tensors.items()})
+        return replace(self, **{n: part[index] for n, part in tensors.items()})
 
     @property
     def sh_degree(self) -> int:

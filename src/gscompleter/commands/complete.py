@@ -60,6 +60,7 @@ from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
 from gscompleter.reports.plain_words import NO_TARGET, exposures, moved
 from gscompleter.splats.formats import load_splat
+from gscompleter.splats.order import WORTH, order_nearby
 from gscompleter.types import Camera, Completion, View
 
 
@@ -196,7 +197,12 @@ def with_splat(
         given = load_splat(path, options.drop_nonfinite)
     compile_kernels([*parts, *([BROUGHT] if "cpu" in parts else [])])
     with preparing("placing the scene"):
-        return in_frame_of_splat(task, given, path, options, opened)
+        if len(given) < WORTH:
+            return in_frame_of_splat(task, given, path, options, opened)
+        order = order_nearby(given)
+        task = in_frame_of_splat(task, given[order], path, options, opened)
+        assert task.brought is not None
+        return replace(task, brought=replace(task.brought, order=order))
 
 
 def said_in_advance(

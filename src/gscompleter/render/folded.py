@@ -21,17 +21,21 @@ from gscompleter.kernels import rasterizer as kernels
 from gscompleter.kernels.rasterizer import Fragments
 
 if TYPE_CHECKING:
-    from gscompleter.render.cpu import Binned, CpuView
+    from gscompleter.render.cpu import Binned, CpuView, Viewpoint
 
 
 @dataclass(frozen=True)
 class Folded:
     """New Gaussians of which only opacities and colours change, in a frozen scene."""
 
-    view: CpuView
+    viewpoint: Viewpoint
+    image: Float32[ndarray, "h w 3"]
+    """The frozen scene alone."""
     binned: Binned
     means: Float32[ndarray, "n 3"]
     fragments: Fragments
+    solid: Float32[ndarray, "solid 9"]
+    """The frozen splats that have fragments, as `Layer` has them."""
 
     def __call__(
         self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
@@ -50,18 +54,18 @@ class Folded:
     def colours(self, sh: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n 3"]:
         """As the camera sees them; of those that it does not see, anything."""
         colours = np.empty((len(sh), 3), np.float32)
-        seen = (self.shown, self.view.viewpoint.pinhole.center, self.means)
-        self.view.viewpoint.share(kernels.shade, len(self.shown), *seen, sh, colours)
+        seen = (self.shown, self.viewpoint.pinhole.center, self.means)
+        self.viewpoint.share(kernels.shade, len(self.shown), *seen, sh, colours)
         return colours
 
     def draw(
         self, opacities: Float32[ndarray, "n"], colours: Float32[ndarray, "n 3"]
     ) -> Float32[ndarray, "h w 3"]:
         """The frozen image, drawn anew where it has fragments."""
-        image = self.view.frame.image.copy()
-        drawn = (self.fragments, self.view.layer.splats, opacities, colours, image)
+        image = self.image.copy()
+        drawn = (self.fragments, self.solid, opacities, colours, image)
         count = len(self.fragments.tiles)
-        self.view.viewpoint.share(kernels.draw_fragments, count, *drawn)
+        self.viewpoint.share(kernels.draw_fragments, count, *drawn)
         return image
 
     def slopes(
@@ -74,20 +78,20 @@ class Folded:
         """Of opacities and colours, from those of the image."""
         values = np.empty((len(self.binned.slots), 4), np.float32)
         written = np.zeros(len(values), np.bool_)
-        drawn = (self.fragments, self.view.layer.splats, opacities, colours, image, d_image)
+        drawn = (self.fragments, self.solid, opacities, colours, image, d_image)
         count = len(self.fragments.tiles)
         received = (values, written)
-        self.view.viewpoint.share(kernels.draw_fragments_backward, count, *drawn, *received)
-        return self.view.viewpoint.sums(self.binned, received)
+        self.viewpoint.share(kernels.draw_fragments_backward, count, *drawn, *received)
+        return self.viewpoint.sums(self.binned, received)
 
     def slopes_of_sh(
         self, colours: Float32[ndarray, "n 3"], slopes: Float32[ndarray, "n 3"], bands: int
     ) -> Float32[ndarray, "n k 3"]:
         """Of spherical harmonics, from those of colours."""
         d_sh = np.zeros((len(colours), bands, 3), np.float32)
-        seen = (self.shown, self.view.viewpoint.pinhole.center, self.means)
+        seen = (self.shown, self.viewpoint.pinhole.center, self.means)
         received = (colours, slopes, d_sh)
-        self.view.viewpoint.share(kernels.shade_backward, len(self.shown), *seen, *received)
+        self.viewpoint.share(kernels.shade_backward, len(self.shown), *seen, *received)
         return d_sh
 
 
@@ -139,7 +143,19 @@ def folded(view: CpuView, binned: Binned, means: Float32[ndarray, "n 3"]) -> Fol
     counts = np.empty((len(tiles), 2), np.int64)
     known = (context, new, binned.slots, room)
     viewpoint.share(kernels.find_fragments, len(tiles), *known, found, counts)
-    return Folded(view, binned, means, packed(found, room, counts))
+    fragments, solid = with_solid(packed(found, room, counts), context.splats)
+    return Folded(viewpoint, view.frame.image, binned, means, fragments, solid)
+
+
+def with_solid(
+    fragments: Fragments, splats: Float32[ndarray, "splats 9"]
+) -> tuple[Fragments, Float32[ndarray, "solid 9"]]:
+    """The fragments, and those of the frozen splats that they name, numbered anew: most of a scene
+    has none, and need not be kept."""
+    frozen, names = fragments.names < 0, fragments.names.copy()
+    named, names[frozen] = np.unique(~names[frozen], return_inverse=True)
+    names[frozen] = ~names[frozen]
+    return fragments._replace(names=names), splats[named]
 
 
 def packed(

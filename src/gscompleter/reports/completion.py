@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter import __version__
@@ -55,6 +55,8 @@ class Brought:
     path: Path
     kept: Bool[Tensor, "n"] | None = None
     """Which of its Gaussians the context holds, in their order; None for all."""
+    order: Int64[Tensor, "n"] | None = None
+    """Which of these each Gaussian of the context is, where it has them in another order."""
 
 
 @dataclass(frozen=True)
@@ -226,9 +228,9 @@ def write_scenes(folder: Path, completion: Completion, brought: Brought | None) 
     if brought is None:
         save_own(folder, completion)
         return
-    context, scene = completion.context, completion.scene
-    save_ply(folder / CONTEXT, context)
-    save_brought(folder, context, scene, completion.set_aside, brought)
+    found = as_in_file(completion.context, completion.scene, completion.set_aside, brought)
+    save_ply(folder / CONTEXT, found[0])
+    save_brought(folder, *found, brought)
     save_ply(folder / GENERATED, completion.added, provenance=True)
 
 
@@ -282,6 +284,20 @@ def save_own(folder: Path, completion: Completion) -> None:
     paths = [folder / name for name in (CONTEXT, COMPLETED, GENERATED)]
     scenes = completion.context, completion.scene, completion.added
     side_by_side(save_ply, paths, scenes, (None, True, True))
+
+
+def as_in_file(
+    context: Gaussians, scene: Gaussians, aside: Bool[Tensor, "n"] | None, brought: Brought
+) -> tuple[Gaussians, Gaussians, Bool[Tensor, "n"] | None]:
+    """The arguments in the order of the file, and what was added to the scene behind it."""
+    if brought.order is None:
+        return context, scene, aside
+    places = brought.order.argsort().to(context.means.device)
+    kept = torch.ones_like(places, dtype=torch.bool) if aside is None else ~aside
+    stays = kept[places]
+    number = (kept.cumsum(0) - 1)[places[stays]]
+    added = torch.arange(len(number), len(scene), device=number.device)
+    return context[places], scene[torch.cat([number, added])], None if aside is None else ~stays
 
 
 def save_brought(

@@ -11,7 +11,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8, UInt32
 from numpy import ndarray
 
@@ -124,19 +123,6 @@ def _rest(path: Path, table: ndarray | None, count: int) -> Float[ndarray, "n k 
 
 
 # --------------------------------------------------------------------------------------- write
-
-
-def near_together(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians along a Morton curve, so that those of a chunk lie close to each other."""
-    means = gaussians.means.double().numpy()
-    low, high = means.min(0), means.max(0)
-    extent = np.maximum(high - low, np.finfo(np.float64).tiny)
-    cells = ((means - low) / extent * (2**21 - 1)).astype(np.uint64)
-    code = np.zeros(len(cells), np.uint64)
-    for bit in range(21):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return gaussians[torch.from_numpy(code.argsort(kind="stable"))]
 
 
 def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:

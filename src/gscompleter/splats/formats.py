@@ -12,13 +12,13 @@ from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.ply import load_ply, save_ply, whole
 from gscompleter.splats.compressed_ply import (
     is_compressed,
-    near_together,
     read_compressed_ply,
     write_compressed_ply,
 )
 from gscompleter.splats.glb import is_glb, read_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.labels import load_labels, save_labels
+from gscompleter.splats.order import near_together
 from gscompleter.splats.sog import META, is_sog, read_sog
 from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import is_spz, read_spz, write_spz

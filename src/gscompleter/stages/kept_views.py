@@ -17,7 +17,7 @@ from gscompleter.types import Camera, Completion, Gaussians, merge
 Views = dict[Hashable, tuple[int, FrozenView]]
 """By camera, how many Gaussians of the scene are frozen in a view, and the view."""
 
-MAX_KEPT = 6 * 2**30
+MAX_KEPT = 2 * 2**30
 """Bytes that the views of photographs may take together while none of them rests."""
 BYTES_A_SPLAT = 52
 """What each Gaussian that is seen takes in a view."""
