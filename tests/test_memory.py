@@ -3,7 +3,13 @@
 import pytest
 
 from gscompleter import InputError
-from gscompleter.memory import check_memory, memory_bytes, needed_bytes
+from gscompleter.memory import (
+    check_memory,
+    check_scene_memory,
+    memory_bytes,
+    needed_bytes,
+    scene_bytes,
+)
 
 
 @pytest.fixture
@@ -29,6 +35,29 @@ def test_the_estimate_holds_what_was_measured_and_not_twice_as_much():
     """Peak resident memory of `complete` on two photographs and one target."""
     for pixels, measured in ((256 * 256, 669 * 10**6), (512 * 768, 1514 * 10**6)):
         assert 0.95 * measured < needed_bytes(pixels, 3) < 2 * measured
+
+
+WITNESSES = [256 * 384] * 2 + [213 * 320] * 28
+
+
+@pytest.mark.parametrize(("count", "measured"), [(1, 4.55), (4, 5.14), (10, 10.6)])
+def test_the_estimate_of_a_scene_holds_what_was_measured(count, measured):
+    """Peak resident memory in GB of `complete` with so many million Gaussians and `WITNESSES`."""
+    needed = needed_bytes(256 * 384, 3) + scene_bytes(count * 10**6, 18, WITNESSES)
+    assert 0.95 * measured * 10**9 < needed < 1.5 * measured * 10**9
+
+
+def test_memory_grows_less_than_with_each_photograph_of_a_large_scene():
+    one, many = (scene_bytes(10**7, 18, WITNESSES[:n]) for n in (8, 30))
+    assert many - one < 22 * 10**7 * 16 + 22 * 10**8
+
+
+def test_a_scene_that_does_not_fit_is_refused_with_both_numbers(sixteen_gigabytes):
+    check_scene_memory(10**7, 18, WITNESSES, 256 * 384, 3)
+    with pytest.raises(
+        InputError, match=r"Gaussians of the scene and 30 photographs need about .*"
+    ):
+        check_scene_memory(10**8, 18, WITNESSES, 256 * 384, 3)
 
 
 def test_a_container_may_hold_less_than_the_machine(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig, ReconcileConfig, SupportConfig
 from gscompleter.geometry import inside, project
 from gscompleter.io.ply import load_ply, save_ply
+from gscompleter.memory import needed_bytes
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
 from gscompleter.render.cpu import CpuView
@@ -144,7 +145,7 @@ def test_views_that_rest_change_nothing(monkeypatch):
     rested = []
     resting = CpuView.resting
     monkeypatch.setattr(CpuView, "resting", lambda *a: rested.append(a) or resting(*a))
-    monkeypatch.setattr("gscompleter.stages.kept_views.MAX_KEPT", 0)
+    monkeypatch.setattr("gscompleter.memory.MAX_KEPT", 0)
     found = knowing()(*asked)
     assert len(rested) > 0
     assert len(awake.targets[0].added) > 0
@@ -283,6 +284,16 @@ def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
     assert run(monkeypatch, *complete(scene, splat, out, "--keep-unsupported")) == 0
     assert not (out / "removed.ply").exists()
     assert torch.equal(load_ply(out / "completed.ply").means[: len(SCENE)], SCENE.means)
+
+
+def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, capsys):
+    scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
+    save_ply(tmp_path / "splat.ply", SCENE)
+    there = needed_bytes(48 * 48, 3)
+    monkeypatch.setattr("gscompleter.memory.memory_bytes", lambda: there)
+    assert run(monkeypatch, *complete(scene, tmp_path / "splat.ply", tmp_path / "out")) == 2
+    assert f"The {len(SCENE):,} Gaussians of the scene and 3 photographs" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("worth", [0, WORTH], ids=["sorted", "as-given"])

@@ -18,6 +18,7 @@ from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import between, bordered, project, same_camera, sample, slide, widened
 from gscompleter.masks import dilate, is_enclosed
+from gscompleter.memory import fill_memory
 from gscompleter.progress import stage, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, in_colours, load_renderer
@@ -36,7 +37,7 @@ from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.harm import do_no_harm, error_with_loss, squared_error
 from gscompleter.stages.integration import hole_mask, keep_in_holes, refine_opacities
-from gscompleter.stages.kept_views import KeptViews, fill_memory
+from gscompleter.stages.kept_views import KeptViews
 from gscompleter.stages.reconciliation import reconcile
 from gscompleter.stages.registration import Registration, register
 from gscompleter.stages.setting_aside import not_needed
@@ -607,7 +608,7 @@ class GSCompleter:
         of the witnesses, whose views rest once the next is asked for, where all would take too much
         memory."""
         number = len(completion.views) + len(completion.witnesses)
-        too_much = fill_memory(number, completion.scene)
+        too_much = fill_memory(number, len(completion.scene))
         yield from self.at(completion, completion.views)
         for witness in completion.witnesses:
             yield from self.at(completion, [witness])

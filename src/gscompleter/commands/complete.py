@@ -24,6 +24,7 @@ from gscompleter.commands.opening import (
     Opened,
     Task,
     check_context,
+    check_scene,
     check_targets,
     in_frame_of_splat,
     open_scene,
@@ -195,6 +196,8 @@ def with_splat(
     with preparing("reading the scene"):
         task = with_witnesses(task, opened.photographs)
         given = load_splat(path, options.drop_nonfinite)
+        if "cpu" in parts:
+            check_scene(task, given)
     compile_kernels([*parts, *([BROUGHT] if "cpu" in parts else [])])
     with preparing("placing the scene"):
         if len(given) < WORTH:

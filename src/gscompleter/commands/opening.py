@@ -32,7 +32,7 @@ from gscompleter.frames.similarity import moved_camera, moved_view
 from gscompleter.io.files import SUMMARY
 from gscompleter.io.ply import drawable_rows
 from gscompleter.matching.depth_range import estimate_depth_range
-from gscompleter.memory import check_memory, images_that_fit
+from gscompleter.memory import check_memory, check_scene_memory, images_that_fit
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.reports.completion import Brought, Target
 from gscompleter.splats.formats import format_of
@@ -398,6 +398,24 @@ def check_sizes(cameras: Sequence[Camera]) -> None:
     """Refuse images with nothing in them to match and to score, and those beyond all memory."""
     check_sides(cameras)
     check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
+
+
+def check_scene(task: Task, scene: Gaussians) -> None:
+    """Refuse a scene that does not fit into memory together with what its photographs tell of it.
+
+    Raises:
+        InputError: where there is less than it needs.
+    """
+    cameras = [v.camera for v in task.views] + [target.camera for target in task.targets]
+    pixels = max(camera.width * camera.height for camera in cameras)
+    check_scene_memory(*of_scene(task, scene), pixels, len(cameras))
+
+
+def of_scene(task: Task, scene: Gaussians) -> tuple[int, int, list[int]]:
+    """What the memory that a scene needs depends on: the arguments of `scene_bytes`."""
+    cameras = [view.camera for view in (*task.views, *(task.witnesses or ()))]
+    numbers = sum(part[0].numel() for part in vars(scene).values() if part is not None)
+    return len(scene), numbers, [camera.width * camera.height for camera in cameras]
 
 
 def check_sides(cameras: Sequence[Camera]) -> None:

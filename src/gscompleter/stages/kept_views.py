@@ -17,11 +17,6 @@ from gscompleter.types import Camera, Completion, Gaussians, merge
 Views = dict[Hashable, tuple[int, FrozenView]]
 """By camera, how many Gaussians of the scene are frozen in a view, and the view."""
 
-MAX_KEPT = 2 * 2**30
-"""Bytes that the views of photographs may take together while none of them rests."""
-BYTES_A_SPLAT = 52
-"""What each Gaussian that is seen takes in a view."""
-
 
 class KeptViews:
     """What cameras see of the scene that was looked at last.
@@ -81,11 +76,6 @@ class KeptViews:
             if (start, stop) not in self._thinned:
                 self._thinned[start, stop] = thinned(completion.scene[start:stop], self._most)
         return merge([completion.scene[:0], *(self._thinned[part] for part in parts)])
-
-
-def fill_memory(number: int, scene: Gaussians) -> bool:
-    """Whether that many views of a scene would take more than `MAX_KEPT`."""
-    return number * len(scene) * BYTES_A_SPLAT > MAX_KEPT
 
 
 def key_of(camera: Camera) -> Hashable:

@@ -27,6 +27,7 @@ from gscompleter.geometry import z_depths
 from gscompleter.kernels import evidence as kernels
 from gscompleter.kernels.evidence import Place
 from gscompleter.kernels.sharing import share, side_by_side
+from gscompleter.memory import AWAKE
 from gscompleter.render import FrozenView
 from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import Camera, Evidence, Gaussians, Render, View
@@ -36,8 +37,6 @@ BLUR = 0.01
 image: an edge may lie a pixel aside."""
 EXACT = 0.02
 """Median difference of colour up to which a scene counts as exact."""
-TELLING = 8
-"""Photographs, the first ones, that tell how exact a scene is."""
 ENOUGH = 0.5
 """Share of what a camera sees of a Gaussian that a photograph has to show for full support."""
 STANDOFF = 0.5
@@ -53,12 +52,12 @@ def gather_evidence(
     Args:
         scene: The n Gaussians.
         views: The k photographs, whose cameras know the depth range.
-        frozen: The scene frozen at each of them. Behind the first `TELLING` they are asked for one
-            by one, and none is kept.
+        frozen: The scene frozen at each of them. The first `AWAKE` tell how exact the scene is; the
+            others are asked for one by one, and none is kept.
         config: How different is too different.
     """
     remaining = iter(frozen)
-    first = list(islice(remaining, TELLING))
+    first = list(islice(remaining, AWAKE))
     with torch_on_one_thread():
         differences = side_by_side(difference, [f.context for f in first], views[: len(first)])
     usual = torch.stack([d.median() for d in differences]).median().item()
@@ -67,7 +66,7 @@ def gather_evidence(
     areas, agreement = np.empty((2, len(views), len(scene)), np.float32)
     for k, (view, seen) in enumerate(zip(views, in_turn(first, remaining), strict=True)):
         with torch_on_one_thread():
-            different = differences[k] if k < TELLING else difference(seen.context, view)
+            different = differences[k] if k < AWAKE else difference(seen.context, view)
         agrees = torch.exp(-((different / scale) ** 2))
         layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
         sums = array_of(seen.sums(layers))
