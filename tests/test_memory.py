@@ -43,21 +43,21 @@ WITNESSES = [256 * 384] * 2 + [213 * 320] * 28
 @pytest.mark.parametrize(("count", "measured"), [(1, 4.55), (4, 5.14), (10, 10.6)])
 def test_the_estimate_of_a_scene_holds_what_was_measured(count, measured):
     """Peak resident memory in GB of `complete` with so many million Gaussians and `WITNESSES`."""
-    needed = needed_bytes(256 * 384, 3) + scene_bytes(count * 10**6, 18, WITNESSES)
+    needed = needed_bytes(256 * 384, 3) + scene_bytes(count * 10**6, 18, 2, WITNESSES)
     assert 0.95 * measured * 10**9 < needed < 1.5 * measured * 10**9
 
 
 def test_memory_grows_less_than_with_each_photograph_of_a_large_scene():
-    one, many = (scene_bytes(10**7, 18, WITNESSES[:n]) for n in (8, 30))
+    one, many = (scene_bytes(10**7, 18, 2, WITNESSES[:n]) for n in (8, 30))
     assert many - one < 22 * 10**7 * 16 + 22 * 10**8
 
 
 def test_a_scene_that_does_not_fit_is_refused_with_both_numbers(sixteen_gigabytes):
-    check_scene_memory(10**7, 18, WITNESSES, 256 * 384, 3)
+    check_scene_memory(10**7, 18, 2, WITNESSES, 256 * 384, 3)
     with pytest.raises(
         InputError, match=r"Gaussians of the scene and 30 photographs need about .*"
     ):
-        check_scene_memory(10**8, 18, WITNESSES, 256 * 384, 3)
+        check_scene_memory(10**8, 18, 2, WITNESSES, 256 * 384, 3)
 
 
 def test_a_container_may_hold_less_than_the_machine(tmp_path, monkeypatch):

@@ -532,7 +532,7 @@ class GSCompleter:
         if not self.config.support.doubts:
             return None
         views, config = (*completion.views, *completion.witnesses), self.config.support
-        return gather_evidence(completion.scene, views, self.in_turn(completion), config)
+        return gather_evidence(completion.scene, views, self.watching(completion), config)
 
     def without_unsupported(self, sight: Sight) -> Sight:
         """`sight` once what covers its holes, and no photograph shows or needs, is set aside.
@@ -603,23 +603,17 @@ class GSCompleter:
         """The scene as it stands, frozen at the cameras of photographs."""
         return self.frozen.of(completion, [view.camera for view in views])
 
-    def in_turn(self, completion: Completion) -> Iterator[FrozenView]:
-        """The scene as it stands, frozen at one photograph after the other: of the context, then
-        of the witnesses, whose views rest once the next is asked for, where all would take too much
-        memory."""
-        number = len(completion.views) + len(completion.witnesses)
-        too_much = fill_memory(number, len(completion.scene))
-        yield from self.at(completion, completion.views)
-        for witness in completion.witnesses:
-            yield from self.at(completion, [witness])
-            if too_much:
-                self.frozen.rest(completion, [witness.camera])
-
     def watching(self, completion: Completion) -> tuple[FrozenView, ...]:
-        """The same at all of them."""
-        for _ in self.in_turn(completion):
-            pass
-        return self.at(completion, (*completion.views, *completion.witnesses))
+        """The scene as it stands, frozen at every photograph: of the context, then of witnesses,
+        whose views rest where all would take too much memory."""
+        views, witnesses = completion.views, completion.witnesses
+        frozen = self.at(completion, views)
+        if not fill_memory(len(views) + len(witnesses), len(completion.scene)):
+            return (*frozen, *self.at(completion, witnesses))
+        for witness in witnesses:
+            self.at(completion, [witness])
+            self.frozen.rest(completion, [witness.camera])
+        return (*frozen, *self.at(completion, witnesses))
 
     def small_renders(self, completion: Completion, cameras: Sequence[Camera]) -> Sequence[Render]:
         """What cameras of small images see of the scene as it stands, about."""

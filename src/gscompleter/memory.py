@@ -22,8 +22,8 @@ Measured on eight photographs instead of two, at 256 x 256 and 480 x 480."""
 MAX_KEPT = 2 * 2**30
 """Bytes of splats that frozen views of a scene that was brought may hold together. Where all its
 photographs need more, views of those that are no context hold names instead."""
-AWAKE = 8
-"""Views with splats that are held at once where not all may hold them."""
+WAKING_BYTES = 300
+"""What each Gaussian takes while a view is frozen or woken."""
 BYTES_PER_SPLAT, BYTES_PER_NAME = 52, 7
 """What each Gaussian takes in a frozen view, and in one that holds names."""
 BYTES_PER_PIXEL_OF_A_WITNESS = 850
@@ -59,7 +59,7 @@ def needed_bytes(pixels: int, images: int) -> int:
 
 
 def check_scene_memory(
-    count: int, numbers: int, photographs: Sequence[int], pixels: int, images: int
+    count: int, numbers: int, contexts: int, photographs: Sequence[int], pixels: int, images: int
 ) -> None:
     """Refuse the completion of a scene that was brought where it needs more memory than there is.
 
@@ -68,7 +68,7 @@ def check_scene_memory(
     Raises:
         InputError: with both numbers.
     """
-    needed = needed_bytes(pixels, images) + scene_bytes(count, numbers, photographs)
+    needed = needed_bytes(pixels, images) + scene_bytes(count, numbers, contexts, photographs)
     there = memory_bytes()
     if there is not None and needed > there:
         raise InputError(
@@ -78,18 +78,19 @@ def check_scene_memory(
         )
 
 
-def scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
+def scene_bytes(count: int, numbers: int, contexts: int, photographs: Sequence[int]) -> int:
     """About how much memory a scene that was brought takes besides, at most. Measured with 30
     photographs: 4.6 GB in all of a million Gaussians, 5.1 of 4, 10.6 of 10 million.
 
     Args:
         count: Its Gaussians.
         numbers: What each of them is made of, in float32.
-        photographs: Pixels of each of its photographs, as small as they are looked at.
+        contexts: How many of its photographs are the context.
+        photographs: Pixels of each of all of them, as small as they are looked at.
     """
     number = len(photographs)
-    awake = min(number, AWAKE) if fill_memory(number, count) else number
-    views = awake * BYTES_PER_SPLAT + (number - awake) * BYTES_PER_NAME
+    awake = contexts if fill_memory(number, count) else number
+    views = awake * BYTES_PER_SPLAT + (number - awake) * BYTES_PER_NAME + WAKING_BYTES
     told = 2 * 4 * number  # how much of each the photographs show, and how they agree
     fitted = BYTES_PER_PIXEL_OF_A_WITNESS * sum(photographs)
     return count * (2 * 4 * numbers + told + views) + fitted

@@ -411,11 +411,12 @@ def check_scene(task: Task, scene: Gaussians) -> None:
     check_scene_memory(*of_scene(task, scene), pixels, len(cameras))
 
 
-def of_scene(task: Task, scene: Gaussians) -> tuple[int, int, list[int]]:
+def of_scene(task: Task, scene: Gaussians) -> tuple[int, int, int, list[int]]:
     """What the memory that a scene needs depends on: the arguments of `scene_bytes`."""
     cameras = [view.camera for view in (*task.views, *(task.witnesses or ()))]
     numbers = sum(part[0].numel() for part in vars(scene).values() if part is not None)
-    return len(scene), numbers, [camera.width * camera.height for camera in cameras]
+    sizes = [camera.width * camera.height for camera in cameras]
+    return len(scene), numbers, len(task.views), sizes
 
 
 def check_sides(cameras: Sequence[Camera]) -> None:

@@ -11,8 +11,7 @@ four stages go on from there.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import islice
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -27,7 +26,6 @@ from gscompleter.geometry import z_depths
 from gscompleter.kernels import evidence as kernels
 from gscompleter.kernels.evidence import Place
 from gscompleter.kernels.sharing import share, side_by_side
-from gscompleter.memory import AWAKE
 from gscompleter.render import FrozenView
 from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import Camera, Evidence, Gaussians, Render, View
@@ -45,42 +43,29 @@ and has to stay."""
 
 
 def gather_evidence(
-    scene: Gaussians, views: Sequence[View], frozen: Iterable[FrozenView], config: SupportConfig
+    scene: Gaussians, views: Sequence[View], frozen: Sequence[FrozenView], config: SupportConfig
 ) -> Evidence:
     """What photographs show of each Gaussian, and how far the scene looks like them there.
 
     Args:
         scene: The n Gaussians.
         views: The k photographs, whose cameras know the depth range.
-        frozen: The scene frozen at each of them. The first `AWAKE` tell how exact the scene is; the
-            others are asked for one by one, and none is kept.
+        frozen: The scene frozen at each of them.
         config: How different is too different.
     """
-    remaining = iter(frozen)
-    first = list(islice(remaining, AWAKE))
     with torch_on_one_thread():
-        differences = side_by_side(difference, [f.context for f in first], views[: len(first)])
+        differences = side_by_side(difference, [f.context for f in frozen], views)
     usual = torch.stack([d.median() for d in differences]).median().item()
     scale = config.max_difference * max(1.0, usual / EXACT)
     means = array_of(scene.means)
     areas, agreement = np.empty((2, len(views), len(scene)), np.float32)
-    for k, (view, seen) in enumerate(zip(views, in_turn(first, remaining), strict=True)):
-        with torch_on_one_thread():
-            different = differences[k] if k < AWAKE else difference(seen.context, view)
+    for k, (view, different) in enumerate(zip(views, differences, strict=True)):
         agrees = torch.exp(-((different / scale) ** 2))
         layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
-        sums = array_of(seen.sums(layers))
+        sums = array_of(frozen[k].sums(layers))
         share(kernels.tell, len(means), sums, means, place_of(view.camera), areas[k], agreement[k])
     told = (torch.from_numpy(array).to(scene.means) for array in (areas, agreement))
     return Evidence(torch.stack([view.camera.center for view in views]), *told)
-
-
-def in_turn(first: list[FrozenView], others: Iterator[FrozenView]) -> Iterator[FrozenView]:
-    """Those of a list, of which none stays there, then the others."""
-    first.reverse()
-    while first:
-        yield first.pop()
-    yield from others
 
 
 def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
