@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import max_pool2d
 
 from gscompleter.errors import InputError
-from gscompleter.kernels import rasterizer
+from gscompleter.kernels import lists, rasterizer
 from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
 from gscompleter.kernels.sharing import ranges, run, share
 from gscompleter.render import ColourErrors, ColourSums, DepthRender, FrozenView, OpacityRender
@@ -93,8 +93,8 @@ class CpuView:
         entries = np.empty(tile_start[-1], np.int32)
         depth_limits = np.empty(self.viewpoint.tiles, np.float32)
         walked = (self.layer, added, frame.used, frame.full)
-        lists = (tile_start, entries, depth_limits)
-        self.viewpoint.share(rasterizer.merge_lists, len(used), *walked, *lists)
+        merged = (tile_start, entries, depth_limits)
+        self.viewpoint.share(rasterizer.merge_lists, len(used), *walked, *merged)
         layer, kept = joined(self.layer, added, tile_start, entries)
         rows = np.concatenate([self.rows[kept[0]], order[kept[1]] + np.int32(self.count)])
         frame = frame._replace(used=used)
@@ -123,7 +123,7 @@ class CpuView:
         named = (self.layer.entries, self.rows, *gradients, totals)
         pieces = ranges(len(self.rows), self.viewpoint.threads)  # Each looks at all entries.
         calls = [(*piece, *named) for piece in pieces]
-        run(rasterizer.sum_by_name, calls, self.viewpoint.threads)
+        run(lists.sum_by_name, calls, self.viewpoint.threads)
         return torch.from_numpy(totals)
 
     def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
@@ -276,7 +276,7 @@ class Viewpoint:
         counts = np.zeros((len(chunks), self.tiles), np.int32)
         seen = (splats.columns, splats.boxes, depth_limits, self.tiles_x)
         counting = [(*chunk, *seen, count) for chunk, count in zip(chunks, counts, strict=True)]
-        run(rasterizer.count_entries, counting, self.threads)
+        run(lists.count_entries, counting, self.threads)
         total = int(counts.sum(dtype=np.int64))
         if total > MAX_ENTRIES:
             raise InputError(
@@ -284,14 +284,14 @@ class Viewpoint:
                 f"most {MAX_ENTRIES:,} can be drawn; take fewer or smaller ones, or a smaller "
                 "image."
             )
-        tile_start = rasterizer.places_of(counts)
+        tile_start = lists.places_of(counts)
         entries, keys = np.empty(total, np.int32), np.empty(total, np.uint32)
         filling = [
             (*chunk, *seen, places, entries, keys)
             for chunk, places in zip(chunks, counts, strict=True)
         ]
-        run(rasterizer.fill_entries, filling, self.threads)
-        self.share(rasterizer.sort_lists, self.tiles, tile_start, entries, keys)
+        run(lists.fill_entries, filling, self.threads)
+        self.share(lists.sort_lists, self.tiles, tile_start, entries, keys)
         return Layer(splats.columns, splats.opacities, splats.boxes, tile_start, entries)
 
     def composite(self, view: CpuView, new: Layer) -> Frame:
@@ -334,7 +334,7 @@ class Viewpoint:
     def sums(self, new: Binned, gradients: EntryGradients) -> Float32[ndarray, "n columns"]:
         """For each Gaussian, the sums of the gradients of its entries."""
         totals = np.empty((len(new.slot_start) - 1, gradients[0].shape[1]), np.float32)
-        self.share(rasterizer.sum_entries, len(totals), new.slot_start, *gradients, totals)
+        self.share(lists.sum_entries, len(totals), new.slot_start, *gradients, totals)
         return totals
 
     def tiles_of(self, where: Bool[Tensor, "h w"]) -> Bool[ndarray, "tiles"]:
@@ -455,7 +455,7 @@ def by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
     """The layer with its splats in the order in which the tiles name them, those alone, and which
     they are: a tile then finds its splats near each other in memory, which saves it half of its
     time where there are a million."""
-    order, entries = rasterizer.number_by_use(layer.entries, len(layer.splats))
+    order, entries = lists.number_by_use(layer.entries, len(layer.splats))
     return Layer(*chosen([layer], [order]), layer.tile_start, entries), order
 
 
@@ -491,7 +491,7 @@ def by_itself(layer: Layer) -> Binned:
 
 def by_splat(layer: Layer) -> Binned:
     """A layer whose entries keep the gradients of a splat together."""
-    return Binned(layer, *rasterizer.number_slots(layer.entries, len(layer.splats)))
+    return Binned(layer, *lists.number_slots(layer.entries, len(layer.splats)))
 
 
 def chosen(layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]) -> SplatArrays:
@@ -504,7 +504,7 @@ def chosen(layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]) -> Spla
     )
     for layer, row, (start, stop) in zip(layers, rows, pairwise(bounds), strict=True):
         into = tuple(array[start:stop] for array in taken)
-        share(rasterizer.take_splats, len(row), row, *layer[:3], into)
+        share(lists.take_splats, len(row), row, *layer[:3], into)
     return taken
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.kernels import rasterizer
+from gscompleter.kernels import lists
 from gscompleter.kernels.rasterizer import Frame, GaussianArrays, Layer
 from gscompleter.render import ColourErrors, DepthRender, OpacityRender
 from gscompleter.render.cpu import CpuView, Viewpoint, arrays_of, opaque, render_of
@@ -54,7 +54,7 @@ class RestingView:
         sizes = np.diff(self.tile_start)
         start = np.concatenate([[0], np.cumsum(np.where(where, sizes, 0), dtype=np.int64)])
         named, count = self.names[np.repeat(where, sizes)], sum(len(p.means) for p in self.parts)
-        order, entries = rasterizer.number_by_use(named, count)
+        order, entries = lists.number_by_use(named, count)
         splats = self.viewpoint.project(taken(self.parts, order))
         layer = Layer(splats.columns, splats.opacities, splats.boxes, start, entries)
         frame = self.frame._replace(used=np.where(where[:, None], self.frame.used, 0))
