@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Int32, Int64, Integer
 from numpy import ndarray
 from torch import Tensor
 
@@ -117,26 +117,21 @@ class RestingView:
 
 def taken(parts: Sequence[GaussianArrays], names: Int32[ndarray, "m"]) -> GaussianArrays:
     """These Gaussians of all parts, which are numbered one after the other."""
+    if len(parts) == 1:
+        return rows_of(parts[0], names)
     bounds = np.cumsum([0, *(len(part.means) for part in parts)])
-    places = [
-        torch.from_numpy(np.flatnonzero((start <= names) & (names < stop)))
-        for start, stop in pairwise(bounds)
+    owned = [np.flatnonzero((a <= names) & (names < b)) for a, b in pairwise(bounds)]
+    found = [
+        rows_of(part, names[here] - start)
+        for part, here, start in zip(parts, owned, bounds[:-1], strict=True)
     ]
-    rows = [
-        torch.from_numpy(names)[place] - int(start)
-        for place, start in zip(places, bounds[:-1], strict=True)
-    ]
+    whole = GaussianArrays(*map(np.concatenate, zip(*found, strict=True)))
+    return rows_of(whole, np.concatenate(owned).argsort())
 
-    def field(arrays: Sequence[ndarray]) -> ndarray:
-        values = [
-            torch.from_numpy(array).index_select(0, row)
-            for array, row in zip(arrays, rows, strict=True)
-        ]
-        if len(values) == 1:
-            return values[0].numpy()
-        found = values[0].new_empty((len(names), *values[0].shape[1:]))
-        for place, value in zip(places, values, strict=True):
-            found[place] = value
-        return found.numpy()
 
-    return GaussianArrays(*map(field, zip(*parts, strict=True)))
+def rows_of(gaussians: GaussianArrays, rows: Integer[ndarray, "m"]) -> GaussianArrays:
+    """These of the Gaussians, taken by several threads."""
+    index = torch.from_numpy(rows)
+    return GaussianArrays(
+        *(torch.from_numpy(array).index_select(0, index).numpy() for array in gaussians)
+    )
