@@ -53,11 +53,18 @@ def test_memory_grows_less_than_with_each_photograph_of_a_large_scene():
 
 
 def test_a_scene_that_does_not_fit_is_refused_with_both_numbers(sixteen_gigabytes):
-    check_scene_memory(10**7, 18, 2, WITNESSES, 256 * 384, 3)
+    check_scene_memory(10**7, 30, 16 * 10**9)
     with pytest.raises(
-        InputError, match=r"Gaussians of the scene and 30 photographs need about .*"
+        InputError,
+        match=r"^The 10,000,000 Gaussians of the scene and 30 photographs need about 17 GB of "
+        r"memory, and there are 16 GB; bring a part",
     ):
-        check_scene_memory(10**8, 18, 2, WITNESSES, 256 * 384, 3)
+        check_scene_memory(10**7, 30, 16 * 10**9 + 1)
+
+
+def test_ten_million_gaussians_fit_where_a_hundred_do_not():
+    few, many = (scene_bytes(10**power, 18, 2, WITNESSES) for power in (7, 8))
+    assert needed_bytes(256 * 384, 3) + few < 16 * 10**9 < many
 
 
 def test_a_container_may_hold_less_than_the_machine(tmp_path, monkeypatch):

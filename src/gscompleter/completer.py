@@ -606,14 +606,11 @@ class GSCompleter:
     def watching(self, completion: Completion) -> tuple[FrozenView, ...]:
         """The scene as it stands, frozen at every photograph: of the context, then of witnesses,
         whose views rest where all would take too much memory."""
-        views, witnesses = completion.views, completion.witnesses
-        frozen = self.at(completion, views)
-        if not fill_memory(len(views) + len(witnesses), len(completion.scene)):
-            return (*frozen, *self.at(completion, witnesses))
-        for witness in witnesses:
-            self.at(completion, [witness])
-            self.frozen.rest(completion, [witness.camera])
-        return (*frozen, *self.at(completion, witnesses))
+        witnesses = [view.camera for view in completion.witnesses]
+        number = len(completion.views) + len(witnesses)
+        too_much = fill_memory(number, len(completion.scene))
+        kept = self.frozen.at_rest if too_much else self.frozen.of
+        return (*self.at(completion, completion.views), *kept(completion, witnesses))
 
     def small_renders(self, completion: Completion, cameras: Sequence[Camera]) -> Sequence[Render]:
         """What cameras of small images see of the scene as it stands, about."""

@@ -43,14 +43,9 @@ def check_memory(pixels: int, images: int) -> None:
     Raises:
         InputError: with both numbers.
     """
-    needed, there = needed_bytes(pixels, images), memory_bytes()
-    if there is not None and needed > there:
-        raise InputError(
-            f"{quoted(f'{images:,}')} images of up to {quoted(f'{pixels:,}')} pixels need about "
-            f"{gigabytes(needed)} of memory, and there are {gigabytes(there)}; choose a smaller "
-            "resolution, or fewer views.",
-            "resolution",
-        )
+    number = f"{quoted(f'{images:,}')} images of up to {quoted(f'{pixels:,}')} pixels"
+    remedy = "choose a smaller resolution, or fewer views"
+    _refuse_beyond_memory(needed_bytes(pixels, images), number, remedy, "resolution")
 
 
 def needed_bytes(pixels: int, images: int) -> int:
@@ -58,25 +53,31 @@ def needed_bytes(pixels: int, images: int) -> int:
     return PROGRAM_BYTES + pixels * (BYTES_PER_PIXEL + images * BYTES_PER_PIXEL_OF_A_VIEW)
 
 
-def check_scene_memory(
-    count: int, numbers: int, contexts: int, photographs: Sequence[int], pixels: int, images: int
-) -> None:
+def check_scene_memory(count: int, photographs: int, needed: int) -> None:
     """Refuse the completion of a scene that was brought where it needs more memory than there is.
 
     Args:
-        count, numbers, contexts, photographs: As in `scene_bytes`.
-        pixels, images: As in `check_memory`.
+        count: Its Gaussians.
+        photographs: How many there are of it.
+        needed: What the completion holds at most, in bytes.
 
     Raises:
         InputError: with both numbers.
     """
-    needed = needed_bytes(pixels, images) + scene_bytes(count, numbers, contexts, photographs)
+    number = f"The {quoted(f'{count:,}')} Gaussians of the scene and {photographs} photographs"
+    remedy = "bring a part of the scene, or a folder with fewer photographs"
+    _refuse_beyond_memory(needed, number, remedy)
+
+
+def _refuse_beyond_memory(
+    needed: int, number: str, remedy: str, argument: str | None = None
+) -> None:
     there = memory_bytes()
     if there is not None and needed > there:
         raise InputError(
-            f"The {quoted(f'{count:,}')} Gaussians of the scene and {len(photographs)} photographs "
-            f"need about {gigabytes(needed)} of memory, and there are {gigabytes(there)}; bring a "
-            "part of the scene, or a folder with fewer photographs."
+            f"{number} need about {gigabytes(needed)} of memory, and there are "
+            f"{gigabytes(there)}; {remedy}.",
+            argument,
         )
 
 

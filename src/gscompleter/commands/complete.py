@@ -200,12 +200,9 @@ def with_splat(
             check_scene(task, given)
     compile_kernels([*parts, *([BROUGHT] if "cpu" in parts else [])])
     with preparing("placing the scene"):
-        if len(given) < WORTH:
-            return in_frame_of_splat(task, given, path, options, opened)
-        order = order_nearby(given)
-        task = in_frame_of_splat(task, given[order], path, options, opened)
-        assert task.brought is not None
-        return replace(task, brought=replace(task.brought, order=order))
+        order = order_nearby(given) if len(given) >= WORTH else None
+        given = given if order is None else given[order]
+        return in_frame_of_splat(task, given, path, options, opened, order)
 
 
 def said_in_advance(

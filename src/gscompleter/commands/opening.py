@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from rich.console import Console
 from torch import Tensor
 
@@ -32,7 +32,13 @@ from gscompleter.frames.similarity import moved_camera, moved_view
 from gscompleter.io.files import SUMMARY
 from gscompleter.io.ply import drawable_rows
 from gscompleter.matching.depth_range import estimate_depth_range
-from gscompleter.memory import check_memory, check_scene_memory, images_that_fit
+from gscompleter.memory import (
+    check_memory,
+    check_scene_memory,
+    images_that_fit,
+    needed_bytes,
+    scene_bytes,
+)
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.reports.completion import Brought, Target
 from gscompleter.splats.formats import format_of
@@ -190,9 +196,16 @@ def task_of(
 
 
 def in_frame_of_splat(
-    task: Task, scene: Gaussians, path: Path, options: SceneOptions, opened: Opened
+    task: Task,
+    scene: Gaussians,
+    path: Path,
+    options: SceneOptions,
+    opened: Opened,
+    order: Int64[Tensor, "n"] | None = None,
 ) -> Task:
     """`task` with the splat of a file, its cameras brought to where the photographs show it.
+
+    `order` says where in the file each Gaussian lies, if they are not in its order.
 
     Raises:
         InputError: where the photographs show something else.
@@ -211,7 +224,7 @@ def in_frame_of_splat(
         frame=found.transform @ task.frame,
         origin=given.origin if found.method == "given" else origin,
         scene=scene,
-        brought=Brought(path, rows_kept(path) if options.drop_nonfinite else None),
+        brought=Brought(path, rows_kept(path) if options.drop_nonfinite else None, order),
         method=found.method,
         said=found.sentence(),
         witnesses=[moved_view(view, found.transform) for view in task.witnesses or ()],
@@ -408,15 +421,16 @@ def check_scene(task: Task, scene: Gaussians) -> None:
     """
     cameras = [v.camera for v in task.views] + [target.camera for target in task.targets]
     pixels = max(camera.width * camera.height for camera in cameras)
-    check_scene_memory(*of_scene(task, scene), pixels, len(cameras))
+    needed = needed_bytes(pixels, len(cameras)) + scene_needs(task, scene)
+    check_scene_memory(len(scene), len(task.views) + len(task.witnesses or ()), needed)
 
 
-def of_scene(task: Task, scene: Gaussians) -> tuple[int, int, int, list[int]]:
-    """What the memory that a scene needs depends on: the arguments of `scene_bytes`."""
+def scene_needs(task: Task, scene: Gaussians) -> int:
+    """About how much memory a scene that is brought to a task takes besides, in bytes."""
     cameras = [view.camera for view in (*task.views, *(task.witnesses or ()))]
     numbers = sum(part[0].numel() for part in vars(scene).values() if part is not None)
     sizes = [camera.width * camera.height for camera in cameras]
-    return len(scene), numbers, len(task.views), sizes
+    return scene_bytes(len(scene), numbers, len(task.views), sizes)
 
 
 def check_sides(cameras: Sequence[Camera]) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from gscompleter.commands.opening import Opened, Task, of_scene
+from gscompleter.commands.opening import Opened, Task, scene_needs
 from gscompleter.commands.options import CompleteOptions, SceneOptions, most
 from gscompleter.data.formats import FORMATS
 from gscompleter.data.frame import Frame
 from gscompleter.errors import quoted
-from gscompleter.memory import gigabytes, memory_bytes, needed_bytes, scene_bytes
+from gscompleter.memory import gigabytes, memory_bytes, needed_bytes
 from gscompleter.types import Camera, Gaussians
 
 TOLD = {
@@ -143,7 +143,7 @@ def memory_line(options: CompleteOptions, task: Task) -> str:
     images = len(task.views) + (len(task.targets) or most(options))
     needed = needed_bytes(pixels, images)
     if task.scene is not None and task.scene.means.device.type == "cpu":
-        needed += scene_bytes(*of_scene(task, task.scene))
+        needed += scene_needs(task, task.scene)
     there = memory_bytes()
     of = "" if there is None else f" of {gigabytes(there)}"
     return f", up to {gigabytes(needed)}{of} of memory"

@@ -89,7 +89,7 @@ class CpuView:
         frame = self.viewpoint.composite(self, added)
         used = np.zeros_like(frame.used)
         used[:, 0] = frame.used.sum(axis=1)
-        tile_start = np.concatenate([[0], np.cumsum(used[:, 0], dtype=np.int64)])
+        tile_start = starts_of(used[:, 0])
         entries = np.empty(tile_start[-1], np.int32)
         depth_limits = np.empty(self.viewpoint.tiles, np.float32)
         walked = (self.layer, added, frame.used, frame.full)
@@ -105,7 +105,7 @@ class CpuView:
 
         return RestingView(
             self.viewpoint,
-            (arrays_of(context),),
+            (replace(context, encoded=None),),
             self.frame,
             self.depth_limits,
             self.layer.tile_start,
@@ -449,6 +449,11 @@ def pinhole_of(camera: Camera) -> Pinhole:
 def touched(layer: Layer) -> Int64[ndarray, "touched"]:
     """The tiles in which a layer has anything to draw."""
     return np.flatnonzero(np.diff(layer.tile_start))
+
+
+def starts_of(sizes: Integer[ndarray, "tiles"]) -> Int64[ndarray, "bounds"]:
+    """Where lists of these sizes start, one after the other, and the end."""
+    return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)])
 
 
 def by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:

@@ -12,16 +12,16 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64, Integer
+from jaxtyping import Bool, Float, Float32, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.kernels import lists
-from gscompleter.kernels.rasterizer import Frame, GaussianArrays, Layer
+from gscompleter.kernels.rasterizer import Frame, Layer
 from gscompleter.render import ColourErrors, DepthRender, OpacityRender
-from gscompleter.render.cpu import CpuView, Viewpoint, arrays_of, opaque, render_of
+from gscompleter.render.cpu import CpuView, Viewpoint, arrays_of, opaque, render_of, starts_of
 from gscompleter.render.folded import Folded
-from gscompleter.types import Gaussians, Render
+from gscompleter.types import Gaussians, Render, merge
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class RestingView:
     """A `CpuView` that keeps names in place of splats, and wakes where something new meets it."""
 
     viewpoint: Viewpoint
-    parts: tuple[GaussianArrays, ...]
+    parts: tuple[Gaussians, ...]
     """The context, and what extended it, one after the other."""
     frame: Frame
     """The context alone."""
@@ -52,10 +52,10 @@ class RestingView:
     def awake(self, where: Bool[ndarray, "tiles"]) -> CpuView:
         """The view as it was frozen, with empty lists in all other tiles."""
         sizes = np.diff(self.tile_start)
-        start = np.concatenate([[0], np.cumsum(np.where(where, sizes, 0), dtype=np.int64)])
-        named, count = self.names[np.repeat(where, sizes)], sum(len(p.means) for p in self.parts)
+        start = starts_of(np.where(where, sizes, 0))
+        named, count = self.names[np.repeat(where, sizes)], sum(map(len, self.parts))
         order, entries = lists.number_by_use(named, count)
-        splats = self.viewpoint.project(taken(self.parts, order))
+        splats = self.viewpoint.project(arrays_of(taken(self.parts, order)))
         layer = Layer(splats.columns, splats.opacities, splats.boxes, start, entries)
         frame = self.frame._replace(used=np.where(where[:, None], self.frame.used, 0))
         return CpuView(self.viewpoint, layer, frame, self.depth_limits, order, count)
@@ -72,10 +72,10 @@ class RestingView:
         used = np.where(where[:, None], grown.frame.used, self.frame.used)
         return replace(
             self,
-            parts=(*self.parts, arrays_of(new)),
+            parts=(*self.parts, replace(new, encoded=None)),
             frame=grown.frame._replace(used=used),
             depth_limits=np.where(where, grown.depth_limits, self.depth_limits),
-            tile_start=np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]),
+            tile_start=starts_of(sizes),
             names=names,
         )
 
@@ -115,23 +115,14 @@ class RestingView:
         return self.around(new).plan_depths(new, where)
 
 
-def taken(parts: Sequence[GaussianArrays], names: Int32[ndarray, "m"]) -> GaussianArrays:
+def taken(parts: Sequence[Gaussians], names: Int32[ndarray, "m"]) -> Gaussians:
     """These Gaussians of all parts, which are numbered one after the other."""
     if len(parts) == 1:
-        return rows_of(parts[0], names)
-    bounds = np.cumsum([0, *(len(part.means) for part in parts)])
+        return parts[0][torch.from_numpy(names.astype(np.int64))]
+    bounds = np.cumsum([0, *map(len, parts)])
     owned = [np.flatnonzero((a <= names) & (names < b)) for a, b in pairwise(bounds)]
     found = [
-        rows_of(part, names[here] - start)
+        part[torch.from_numpy(names[here] - start)]
         for part, here, start in zip(parts, owned, bounds[:-1], strict=True)
     ]
-    whole = GaussianArrays(*map(np.concatenate, zip(*found, strict=True)))
-    return rows_of(whole, np.concatenate(owned).argsort())
-
-
-def rows_of(gaussians: GaussianArrays, rows: Integer[ndarray, "m"]) -> GaussianArrays:
-    """These of the Gaussians, taken by several threads."""
-    index = torch.from_numpy(rows)
-    return GaussianArrays(
-        *(torch.from_numpy(array).index_select(0, index).numpy() for array in gaussians)
-    )
+    return merge(found)[torch.from_numpy(np.concatenate(owned).argsort())]

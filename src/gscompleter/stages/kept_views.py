@@ -53,12 +53,13 @@ class KeptViews:
             views[key] = len(completion.scene), view
         return tuple(views[key][1] for key in keys)
 
-    def rest(self, completion: Completion, cameras: Sequence[Camera]) -> None:
-        """Let the views of the scene as it stands at `cameras` lie in less memory from now on."""
-        whole = self._since(completion, 0)
-        for key in map(key_of, cameras):
-            count, view = self._views[key]
-            self._views[key] = count, view.resting(whole)
+    def at_rest(self, completion: Completion, cameras: Sequence[Camera]) -> tuple[FrozenView, ...]:
+        """The same, in views that take less memory; one at a time holds more."""
+        for camera in cameras:
+            (view,) = self.of(completion, [camera])
+            resting = view.resting(self._since(completion, 0))
+            self._views[key_of(camera)] = len(completion.scene), resting
+        return self.of(completion, cameras)
 
     def grown(self, before: Gaussians, after: Gaussians) -> None:
         """Be told that the scene `after` is `before`, and something that was added to it."""
