@@ -2,13 +2,16 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from gscompleter import __version__
 from scenes import camera_at, photographed
 
 COMPLETE = """
 import sys
+from pathlib import Path
 from gscompleter.cli import main
 main()
 print(*sys.modules)
@@ -43,3 +46,41 @@ def imported(tmp_path_factory) -> set[str]:
 def test_a_completion_does_not_wait_for(imported, module):
     assert "gscompleter.completer" in imported
     assert module not in imported
+
+
+ENDING = """
+import atexit, sys
+from gscompleter.cli import run
+
+class Late:
+    def __del__(self): print("taken back")
+late = Late()
+
+sys.argv = ["gscompleter", *sys.argv[1:]]
+run()
+atexit.register(print, "done at the end")
+"""
+
+
+def ended(*words: str, **settings) -> subprocess.CompletedProcess[str]:
+    """The command as it is installed, in a process of its own."""
+    command = [sys.executable, "-c", ENDING, *words]
+    return subprocess.run(command, text=True, stderr=subprocess.PIPE, check=False, **settings)
+
+
+def test_the_command_ends_once_all_is_done_and_said():
+    done = ended("--version", stdout=subprocess.PIPE)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [__version__, "done at the end"]
+
+
+def test_what_is_wrong_ends_as_ever():
+    done = ended("view", "nowhere", stdout=subprocess.PIPE)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_what_could_not_be_said_is_no_success():
+    with open("/dev/full", "w") as full:
+        assert ended("--version", stdout=full).returncode != 0

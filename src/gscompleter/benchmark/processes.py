@@ -15,10 +15,10 @@ from gscompleter.errors import InputError
 ENTRY = """
 import sys
 from pathlib import Path
-from gscompleter.cli import main
+from gscompleter.cli import run
 peak = Path(sys.argv.pop(1))
 try:
-    main()
+    run()
 finally:
     from gscompleter.runs.memory import peak_of_process
     peak.write_text(str(peak_of_process() or ""))
