@@ -52,7 +52,8 @@ def main() -> None:
     # 4. Integrate: what lies in the hole, with opacities that suit all images.
     holes = hole_mask(at_target.context.alpha)
     added = keep_in_holes(registered.gaussians, lifted.pixel_index, holes, target)
-    added, _ = refine_opacities(added, at_target, reference, at_views, views)
+    planned = [view.plan(added) for view in at_views]
+    added, _ = refine_opacities(added, at_target.plan(added), reference, planned, views)
     left = hole_mask(at_target.composite(added).alpha)
     print(
         f"holes: {holes.float().mean():.1%} of the target's pixels, {left.float().mean():.1%} left"

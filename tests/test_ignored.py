@@ -82,9 +82,9 @@ def test_refinement_asks_nothing_there():
     reference = photograph_of(ROOM, CAMERA)
 
     def refined(photographs: list[View]) -> torch.Tensor:
-        frozens = [frozen] * len(photographs)
-        config = RefineConfig(iterations=3)
-        return refine_opacities(added, frozen, reference, frozens, photographs, config)[0].opacities
+        plan, config = frozen.plan(added), RefineConfig(iterations=3)
+        plans = [plan] * len(photographs)
+        return refine_opacities(added, plan, reference, plans, photographs, config)[0].opacities
 
     assert torch.equal(refined([replace(odd, ignored=mask)]), refined([]))
     assert not torch.equal(refined([odd]), refined([]))

@@ -21,7 +21,7 @@ from gscompleter.masks import dilate, is_enclosed
 from gscompleter.memory import fill_memory
 from gscompleter.progress import stage, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.render import FrozenView, Renderer, in_colours, load_renderer
+from gscompleter.render import FrozenView, Renderer, image_of, in_colours, load_renderer
 from gscompleter.stages.anchor import (
     AnchorChoice,
     Synthesized,
@@ -273,7 +273,7 @@ class GSCompleter:
             return replace(result, notes=(*reference.notes, *notes, NOTHING_ADDED))
         with clock("integrate"):
             kept = self.keep(sight, lifted, registration, frozen_views)
-            added, losses = self.refine(sight, kept, reference, frozen_views)
+            added, losses = self.refine(sight, kept, reference)
             after = sight.frozen.composite(added).cropped(sight.window)
         return replace(
             result,
@@ -421,11 +421,7 @@ class GSCompleter:
         return slide(kept, camera, ratio, self.config.registration.footprint)
 
     def refine(
-        self,
-        sight: Sight,
-        kept: Gaussians,
-        reference: Synthesized,
-        frozen_views: Sequence[FrozenView],
+        self, sight: Sight, kept: Gaussians, reference: Synthesized
     ) -> tuple[Gaussians, tuple[float, ...]]:
         """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
@@ -433,12 +429,14 @@ class GSCompleter:
         frozen = self.watching(completion)
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
-            near_frozen = [frozen_views[i] for i in nearest]
             near_views = [completion.views[i] for i in nearest]
+            planned = [view.plan(kept) for view in frozen]
+            near = [planned[i] for i in nearest]
+            at_target = sight.frozen.plan(kept)
             refined, losses = refine_opacities(
-                kept, sight.frozen, reference, near_frozen, near_views, config.refine
+                kept, at_target, reference, near, near_views, config.refine
             )
-            drawings = None
+            drawings = [image_of(plan) for plan in planned]
         else:
             holes, degree = self.holes(sight), completion.context.sh_degree
             settings = config.reconcile.at_most(degree)

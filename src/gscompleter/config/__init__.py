@@ -45,16 +45,16 @@ class AffineConfig(Settings):
 class RegistrationConfig(Settings):
     affine: AffineConfig = AffineConfig()
     """Settings of the coarse fit."""
-    iterations: Count = 12
+    iterations: Count = 7
     """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
-    learning_rate: Step = 0.013
+    learning_rate: Step = 0.02
     """Step of Adam, in the unit that `step` names."""
     schedule: Literal["falling", "constant"] = "falling"
     """Whether the step falls linearly to nothing, so that few iterations reach far and still end
     close."""
-    beta1: Memory = 0.5
-    """Adam's memory of gradients. Its usual 0.9 remembers half of so short a run and overshoots."""
-    beta2: Memory = 0.9
+    beta1: Memory = 0.0
+    """Adam's memory of gradients. Its usual 0.9 remembers all of so short a run and overshoots."""
+    beta2: Memory = 0.8
     """Adam's memory of their squares; usually 0.999."""
     step: Literal["relative", "literal"] = "relative"
     """`relative`: of each primitive's own distance, so that the unit of the scene does not

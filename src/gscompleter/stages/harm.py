@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -57,11 +58,11 @@ def do_no_harm(
     checks = [Check(*each) for each in zip(views, before, drawings, allowed_errors, strict=True)]
     opacities = added.opacities
     for trial in range(HALVINGS + REMOVALS + 1):
-        drawn = [(check, check.draw(opacities)) for check in checks]
-        worse = [(check, image) for check, image in drawn if check.excess(image) > 0]
+        drawn = [Drawn.of(check, opacities) for check in checks]
+        worse = [seen for seen in drawn if seen.excess > 0]
         if not worse:
             break
-        lowered = [check.to_lower(trial, image, opacities, added) for check, image in worse]
+        lowered = [seen.to_lower(trial, added) for seen in worse]
         left = 0.5 if trial < HALVINGS else 0.0
         opacities = torch.where(torch.stack(lowered).any(dim=0), left * opacities, opacities)
         if is_undone(added.opacities, opacities, config):
@@ -81,32 +82,47 @@ class Check:
     allowed: float
     """Largest mean squared error."""
 
-    def excess(self, image: Float[Tensor, "h w 3"]) -> float:
-        """How far the mean squared error of `image` lies over what is allowed."""
-        return squared_error(self.view.compared(image), self.view.image).item() - self.allowed
 
-    def to_lower(
-        self,
-        trial: int,
-        image: Float[Tensor, "h w 3"],
-        opacities: Float[Tensor, "n"],
-        added: Gaussians,
-    ) -> Bool[Tensor, "n"]:
-        """Which of `added`, of the opacities that gave `image`, are to give way."""
+@dataclass(frozen=True)
+class Drawn:
+    """A photograph that is checked, and what is seen there."""
+
+    check: Check
+    opacities: Float[Tensor, "n"]
+    """Those that are drawn, which `image` has slopes in."""
+    image: Float[Tensor, "h w 3"]
+
+    @staticmethod
+    def of(check: Check, opacities: Float[Tensor, "n"]) -> Drawn:
+        """What `check` sees with these opacities."""
+        with torch.enable_grad():
+            variable = opacities.detach().clone().requires_grad_()
+            return Drawn(check, variable, check.draw(variable))
+
+    @cached_property
+    def excess(self) -> float:
+        """How far the mean squared error of the image lies over what is allowed."""
+        view = self.check.view
+        seen = view.compared(self.image.detach())
+        return squared_error(seen, view.image).item() - self.check.allowed
+
+    def to_lower(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
+        """Which of `added` are to give way."""
         if HALVINGS <= trial < HALVINGS + REMOVALS:
-            return self.at_worst(image, added)
-        _, slope = error_slope(self.draw, self.view, opacities)
+            return self.at_worst(added)
+        slope = slope_of(self.image, self.check.view, self.opacities)
         if trial < HALVINGS:
-            return fewest(slope * opacities / 2, self.excess(image))
+            return fewest(slope * self.opacities.detach() / 2, self.excess)
         return slope != 0
 
-    def at_worst(self, image: Float[Tensor, "h w 3"], added: Gaussians) -> Bool[Tensor, "n"]:
-        """Those of `added` at the fewest pixels of `image` that make up for its excess."""
-        compared = map(self.view.compared, (image, self.before))
-        errors, before = (squared_errors(image, self.view.image) for image in compared)
+    def at_worst(self, added: Gaussians) -> Bool[Tensor, "n"]:
+        """Those of `added` at the fewest pixels of the image that make up for its excess."""
+        view = self.check.view
+        compared = map(view.compared, (self.image.detach(), self.check.before))
+        errors, before = (squared_errors(image, view.image) for image in compared)
         relief = (errors - before) / errors.numel()
-        pixels = fewest(relief.flatten(), self.excess(image)).view(relief.shape)
-        return falling_on(dilate(pixels, REACH), added, self.view.camera)
+        pixels = fewest(relief.flatten(), self.excess).view(relief.shape)
+        return falling_on(dilate(pixels, REACH), added, view.camera)
 
 
 def is_undone(
@@ -139,9 +155,18 @@ def error_slope(
     """Error against the photograph, and how it grows with each opacity."""
     with torch.enable_grad():
         variable = opacities.detach().clone().requires_grad_()
-        image = view.compared(draw(variable))
-        (slope,) = torch.autograd.grad((image - view.image).square().mean(), variable)
-    return squared_error(image.detach(), view.image).item(), slope
+        image = draw(variable)
+    slope = slope_of(image, view, variable)
+    return squared_error(view.compared(image.detach()), view.image).item(), slope
+
+
+def slope_of(
+    image: Float[Tensor, "h w 3"], view: View, variable: Float[Tensor, "n"]
+) -> Float[Tensor, "n"]:
+    """How the error of `image` against the photograph grows with each of what it was drawn with."""
+    with torch.enable_grad():
+        error = (view.compared(image) - view.image).square().mean()
+    return torch.autograd.grad(error, variable)[0]
 
 
 def squared_error(image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]) -> Tensor:

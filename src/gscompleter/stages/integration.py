@@ -14,7 +14,7 @@ from gscompleter.config import HoleConfig, RefineConfig
 from gscompleter.descent import Adam
 from gscompleter.geometry import inside, project
 from gscompleter.progress import track
-from gscompleter.render import FrozenView
+from gscompleter.render import OpacityRender
 from gscompleter.types import Camera, Gaussians, View
 
 
@@ -54,9 +54,9 @@ def has_settled(losses: Sequence[float], min_fall: float) -> bool:
 
 def refine_opacities(
     added: Gaussians,
-    frozen_target: FrozenView,
+    at_target: OpacityRender,
     reference: View,
-    frozen_views: Sequence[FrozenView],
+    at_views: Sequence[OpacityRender],
     views: Sequence[View],
     config: RefineConfig = RefineConfig(),
 ) -> tuple[Gaussians, tuple[float, ...]]:
@@ -64,12 +64,19 @@ def refine_opacities(
 
     Everything else of them, and all of the scene, stays as it is: what was good cannot be
     forgotten.
+
+    Args:
+        added: Gaussians that join the scene.
+        at_target: The scene with `added`, planned at the target.
+        reference: The synthesized image there.
+        at_views: The same, planned at the camera of each of `views`.
+        views: Photographs that it has to agree with, too.
+        config: Weights and steps.
     """
     if config.iterations == 0 or len(added) == 0:
         return added, ()
-    plans = [(frozen_target.plan(added), reference, config.target_weight)]
-    seen = zip(frozen_views, views, strict=True)
-    plans += [(frozen.plan(added), view, 1.0) for frozen, view in seen]
+    plans = [(at_target, reference, config.target_weight)]
+    plans += [(plan, view, 1.0) for plan, view in zip(at_views, views, strict=True)]
 
     logit = config.parametrization == "logit"
     start = added.opacities.logit(eps=1e-4) if logit else added.opacities
