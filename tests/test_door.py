@@ -16,7 +16,7 @@ from gscompleter.cli import parsed
 from gscompleter.commands import complete as command
 from gscompleter.commands import opening
 from gscompleter.commands.evaluate import chosen_tasks
-from gscompleter.commands.opening import Opened, Task, read_task
+from gscompleter.commands.opening import Opened, Task, near_and_far, read_task
 from gscompleter.commands.options import CompleteOptions
 from gscompleter.commands.understood import budget_line
 from gscompleter.data.formats import open_photographs
@@ -273,3 +273,15 @@ def test_evaluate_tells_the_notes_of_what_it_opens_once(tmp_path):
         notes: list[str] = []
         assert chosen_tasks(options, [], notes)
         assert notes == [note]
+
+
+def test_a_splat_is_doubted_by_photographs_that_are_near_and_by_some_from_everywhere():
+    """Half of them stand beside the target; of a path that is long, no stretch goes without."""
+    path = {2 * n: camera_at(0.1 * n) for n in range(60)}
+    chosen = near_and_far([camera_at(0.45)], path, 16)
+    assert chosen == sorted(set(chosen))
+    assert len(chosen) == 16
+    assert set(range(2, 18, 2)) <= set(chosen)
+    assert max(b - a for a, b in zip(chosen, [*chosen[1:], 118], strict=True)) < 118 / 4
+    assert near_and_far([camera_at(0.45)], path, 60) == list(path)
+    assert near_and_far([camera_at(0.45)], {}, 16) == []

@@ -42,6 +42,7 @@ from gscompleter.memory import (
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.reports.completion import Brought, Target
 from gscompleter.splats.formats import format_of
+from gscompleter.stages.candidates import spread_cameras
 from gscompleter.stages.context import working_range
 from gscompleter.stages.overview import overview, select_overview
 from gscompleter.stages.selection import points_before, select_context
@@ -232,17 +233,28 @@ def in_frame_of_splat(
 
 
 def with_witnesses(task: Task, given: Photographs) -> Task:
-    """`task` with the photographs that are neither context nor target, those closest to the
-    targets, or to the context where there is none; none of them that cannot be read."""
+    """`task` with photographs that are neither context nor target, closest to the targets, or to
+    the context where there is none, and from all sides; none of them that cannot be read."""
     taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
     others = [frame for frame in range(len(given)) if frame not in taken]
     cameras = usable_cameras(given, others, WITNESS_SIDE)
     wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
     views = []
-    for frame in closest(wanted, cameras, MAX_WITNESSES):
+    for frame in near_and_far(wanted, cameras, MAX_WITNESSES):
         with suppress(InputError):
             views += given.views([frame], WITNESS_SIDE)
     return replace(task, witnesses=[view.to(task.views[0].image.device) for view in views])
+
+
+def near_and_far(wanted: Sequence[Camera], cameras: Mapping[int, Camera], count: int) -> list[int]:
+    """The frames, ascending, of up to `count` cameras: half of them closest to `wanted`, the others
+    far apart among the rest. What is added near a target can stand before any photograph."""
+    near = closest(wanted, cameras, count if len(cameras) <= count else count // 2)
+    rest = [frame for frame in cameras if frame not in near]
+    if not rest:
+        return near
+    far = spread_cameras([cameras[frame] for frame in rest], count - len(near))
+    return sorted([*near, *(rest[i] for i in far)])
 
 
 def with_working_range(task: Task, renderer: Renderer) -> Task:
