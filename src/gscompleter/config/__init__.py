@@ -154,17 +154,21 @@ class ReconcileConfig(Settings):
     """How what is added to a scene that is doubted is fitted to all photographs at once. It takes
     the place of `RefineConfig` there."""
 
-    iterations: Count = 75
+    iterations: Count = 60
     """Steps of Adam; 0 leaves colours and opacities as they were lifted."""
     views_per_step: Annotated[int, Interval(ge=1, le=1000)] = 4
     """How many photographs take part in a step, besides the synthesized image."""
     photograph_weight: Weight = 20.0
     """Weight of what a photograph's error is above the allowed, as a share of it, against the error
     in the holes, as a share of what it was."""
-    opacity_step: Step = 0.2
+    opacity_step: Step = 0.25
     """Step of Adam on the logit of opacities."""
-    colour_step: Step = 0.03
+    colour_step: Step = 0.04
     """Step of Adam on spherical harmonics."""
+    beta1: Memory = 0.7
+    """Adam's memory of slopes; usually 0.9. Each step asks other photographs."""
+    beta2: Memory = 0.95
+    """Adam's memory of their squares; usually 0.999."""
     sh_degree: Annotated[int, Interval(ge=0, le=3)] = 2
     """Degree of spherical harmonics up to which an added Gaussian may look different from
     different sides, as those of a trained scene do; never above the scene's."""
