@@ -32,6 +32,7 @@ def imported(tmp_path_factory) -> set[str]:
 @pytest.mark.parametrize(
     "module",
     [
+        "PIL.WmfImagePlugin",
         "matplotlib",
         "packaging.requirements",
         "rich.progress",

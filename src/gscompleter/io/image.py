@@ -169,6 +169,7 @@ def _decoded(data: bytes, name: str) -> Image.Image:
 
 
 def _open(file: Path | io.BytesIO, name: str, needed: str) -> Image.Image:
+    Image.preinit()  # the usual formats; otherwise Pillow loads all that it knows to open the first
     try:
         return Image.open(file, formats=FORMATS)
     except Image.DecompressionBombError as error:
