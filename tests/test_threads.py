@@ -4,13 +4,14 @@ import hashlib
 import os
 import subprocess
 import sys
+import threading
 
 import numba
 import pytest
 import torch
 
 from gscompleter import threads
-from gscompleter.kernels.sharing import meanwhile
+from gscompleter.kernels.sharing import many_at_once, meanwhile, share
 from scenes import camera_at, photographed
 
 COUNTS = """
@@ -94,3 +95,25 @@ def test_what_fails_meanwhile_fails_for_who_asks(monkeypatch, count):
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", count)
     with pytest.raises(ZeroDivisionError), meanwhile(divmod, 1, 0) as found:
         found()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_many_are_made_at_once_each_on_a_thread_of_its_own(monkeypatch, count):
+    """What a kernel is given there it does where it is called; elsewhere threads share it."""
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", count)
+
+    def threads_of(_number: int) -> tuple[int, set[int]]:
+        found: list[int] = []
+        share(lambda _begin, _end: found.append(threading.get_ident()), 8)
+        return threading.get_ident(), set(found)
+
+    for own, used in many_at_once(threads_of, range(20)):
+        assert used == {own}
+    own, used = threads_of(0)
+    assert (used == {own}) == (count == 1)
+
+
+def test_many_at_once_come_in_their_order_and_fail_for_who_asks():
+    assert list(many_at_once(lambda a, b: a - b, [5, 6, 7], [1, 2, 3])) == [4, 4, 4]
+    with pytest.raises(ZeroDivisionError):
+        list(many_at_once(divmod, [1, 2], [1, 0]))

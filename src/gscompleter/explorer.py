@@ -11,6 +11,7 @@ from torch import Tensor
 from gscompleter.completer import Clock, GSCompleter
 from gscompleter.config import ExplorationConfig
 from gscompleter.geometry import same_camera
+from gscompleter.kernels.sharing import many_at_once
 from gscompleter.progress import stage, track
 from gscompleter.stages.anchor import select_anchor
 from gscompleter.stages.candidates import (
@@ -129,7 +130,10 @@ class Explorer:
         """What there is to gain at each of `offers`, in the scene as it stands."""
         small = miniature(completion)
         anchors = [self.look(small, view.camera) for view in small.views]
-        return [self.choice(small, anchors, offer) for offer in track(offers, "finding targets")]
+        each = map if small.scene.means.is_cuda else many_at_once
+        choices = each(lambda offer: self.choice(small, anchors, offer), offers)
+        counted = zip(track(offers, "finding targets"), choices, strict=True)
+        return [choice for _, choice in counted]
 
     def choice(
         self, completion: Completion, anchors: Sequence[Look], candidate: Candidate

@@ -45,9 +45,9 @@ class AffineConfig(Settings):
 class RegistrationConfig(Settings):
     affine: AffineConfig = AffineConfig()
     """Settings of the coarse fit."""
-    iterations: Count = 7
+    iterations: Count = 8
     """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
-    learning_rate: Step = 0.02
+    learning_rate: Step = 0.019
     """Step of Adam, in the unit that `step` names."""
     schedule: Literal["falling", "constant"] = "falling"
     """Whether the step falls linearly to nothing, so that few iterations reach far and still end

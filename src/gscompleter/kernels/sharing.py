@@ -6,6 +6,7 @@ makes parallel takes two to five times as long to compile.
 """
 
 import os
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
@@ -17,13 +18,27 @@ PIECES_PER_THREAD = 4
 """Pieces take unequally long; more of them than threads even that out."""
 
 
+class _Thread(threading.local):
+    """What is known of the thread that asks."""
+
+    alone = False
+    """Whether the kernels that it calls are not shared."""
+
+
+_thread = _Thread()
+
+
+def _stay_alone():
+    _thread.alone = True
+
+
 def share(kernel, count, *arguments, threads=None):
     """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time.
 
     The result depends neither on the pieces nor on the threads, which are NUMBA_NUM_THREADS if left
     out: as many as there are usable cores where that is not set.
     """
-    threads = threads or numba.config.NUMBA_NUM_THREADS
+    threads = 1 if _thread.alone else threads or numba.config.NUMBA_NUM_THREADS
     pieces = ranges(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
     run(kernel, [(*piece, *arguments) for piece in pieces], threads)
 
@@ -31,7 +46,7 @@ def share(kernel, count, *arguments, threads=None):
 def run(kernel, calls, threads=None):
     """Call a kernel, which releases the interpreter lock, with each of `calls`."""
     threads = threads or numba.config.NUMBA_NUM_THREADS
-    if threads == 1 or len(calls) == 1:
+    if threads == 1 or len(calls) == 1 or _thread.alone:
         for arguments in calls:
             kernel(*arguments)
         return
@@ -50,6 +65,17 @@ def side_by_side(function, *arguments):
         return list(map(function, *arguments))
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(function, *arguments))
+
+
+def many_at_once(function, *arguments):
+    """The same one after the other, for many that are small: the kernels that `function` calls stay
+    on its thread, where they need not wait for each other."""
+    threads = numba.config.NUMBA_NUM_THREADS
+    if threads == 1:
+        yield from map(function, *arguments)
+        return
+    with ThreadPoolExecutor(threads, initializer=_stay_alone) as pool:
+        yield from pool.map(function, *arguments)
 
 
 @contextmanager
