@@ -200,8 +200,10 @@ def test_a_target_is_widened_only_where_a_hole_reaches_its_edge():
 
 
 def test_targets_are_synthesized_together_where_the_generator_can():
+    """Each has a hole that reaches its edge, whether or not those before it were completed; so it
+    is as wide among others as alone."""
     views, (_, target) = photographs(), cameras()
-    others = [camera_at(x, yaw=12, size=SIZE) for x in (0.9, 1.1, 1.3)]
+    others = [camera_at(x, yaw=12, size=SIZE) for x in (0.9, 1.4, 1.9)]
     targets = [target, views[0].camera, *others]
     generator = KnowingTogether()
     together = GSCompleter(KnowingReconstructor(), generator)(views, targets)
