@@ -11,7 +11,6 @@ from scenes import camera_at, photographed
 
 COMPLETE = """
 import sys
-from pathlib import Path
 from gscompleter.cli import main
 main()
 print(*sys.modules)

@@ -32,21 +32,26 @@ def _stay_alone():
     _thread.alone = True
 
 
+def _sharing(threads):
+    """How many threads share a kernel that is called here, and is to have so many."""
+    return 1 if _thread.alone else threads or numba.config.NUMBA_NUM_THREADS
+
+
 def share(kernel, count, *arguments, threads=None):
     """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time.
 
     The result depends neither on the pieces nor on the threads, which are NUMBA_NUM_THREADS if left
     out: as many as there are usable cores where that is not set.
     """
-    threads = 1 if _thread.alone else threads or numba.config.NUMBA_NUM_THREADS
+    threads = _sharing(threads)
     pieces = ranges(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
     run(kernel, [(*piece, *arguments) for piece in pieces], threads)
 
 
 def run(kernel, calls, threads=None):
     """Call a kernel, which releases the interpreter lock, with each of `calls`."""
-    threads = threads or numba.config.NUMBA_NUM_THREADS
-    if threads == 1 or len(calls) == 1 or _thread.alone:
+    threads = _sharing(threads)
+    if threads == 1 or len(calls) == 1:
         for arguments in calls:
             kernel(*arguments)
         return

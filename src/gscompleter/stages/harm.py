@@ -95,9 +95,7 @@ class Drawn:
     @staticmethod
     def of(check: Check, opacities: Float[Tensor, "n"]) -> Drawn:
         """What `check` sees with these opacities."""
-        with torch.enable_grad():
-            variable = opacities.detach().clone().requires_grad_()
-            return Drawn(check, variable, check.draw(variable))
+        return Drawn(check, *drawn_with(check.draw, opacities))
 
     @cached_property
     def excess(self) -> float:
@@ -153,11 +151,19 @@ def error_slope(
     draw: OpacityImage, view: View, opacities: Float[Tensor, "n"]
 ) -> tuple[float, Float[Tensor, "n"]]:
     """Error against the photograph, and how it grows with each opacity."""
-    with torch.enable_grad():
-        variable = opacities.detach().clone().requires_grad_()
-        image = draw(variable)
+    variable, image = drawn_with(draw, opacities)
     slope = slope_of(image, view, variable)
     return squared_error(view.compared(image.detach()), view.image).item(), slope
+
+
+def drawn_with(
+    draw: OpacityImage, opacities: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "h w 3"]]:
+    """The opacities as what varies, and the image that is drawn with them, which has slopes in
+    them."""
+    with torch.enable_grad():
+        variable = opacities.detach().clone().requires_grad_()
+        return variable, draw(variable)
 
 
 def slope_of(
