@@ -15,10 +15,10 @@ from torch import Tensor
 from gscompleter.config import CompleterConfig, RegistrationConfig
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
+from gscompleter.frames.thinning import thinned
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import between, bordered, project, same_camera, sample, slide, widened
 from gscompleter.masks import dilate, is_enclosed
-from gscompleter.memory import fill_memory
 from gscompleter.progress import stage, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import FrozenView, Renderer, image_of, in_colours, load_renderer
@@ -38,6 +38,7 @@ from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.harm import do_no_harm, error_with_loss, squared_error
 from gscompleter.stages.integration import hole_mask, keep_in_holes, refine_opacities
 from gscompleter.stages.kept_views import KeptViews
+from gscompleter.stages.proxy import proxy_of
 from gscompleter.stages.reconciliation import reconcile
 from gscompleter.stages.registration import Registration, register
 from gscompleter.stages.setting_aside import not_needed
@@ -148,7 +149,22 @@ class GSCompleter:
     @cached_property
     def small(self) -> KeptViews:
         """The same at cameras of small images, about."""
-        return KeptViews(self.renderer, MAX_GAUSSIANS)
+        return KeptViews(
+            self.renderer,
+            lambda completion, start, stop: thinned(completion.scene[start:stop], MAX_GAUSSIANS),
+        )
+
+    @cached_property
+    def witnessing(self) -> KeptViews:
+        """The same at the cameras of witnesses, which see a proxy of its context."""
+        return KeptViews(
+            self.renderer,
+            lambda completion, start, stop: (
+                completion.scene[start:stop]
+                if start or completion.proxy is None
+                else completion.proxy
+            ),
+        )
 
     def __call__(
         self,
@@ -212,7 +228,7 @@ class GSCompleter:
             if scene is None:
                 completion = self.wary_of_what_moved(completion)
             if scene is not None and witnesses is not None:
-                completion = replace(completion, evidence=self.evidence(completion))
+                completion = self.doubted(completion)
             allowed = self.allowed_errors(completion)
         return replace(completion, allowed_errors=allowed, seconds=clock.seconds)
 
@@ -244,7 +260,7 @@ class GSCompleter:
         result = self.completed(sight, result, reference, clock)
         reached = sight.completion if len(result.added) else completion
         advanced = followed_by(reached, result, clock.seconds)
-        for kept in (self.frozen, self.small):
+        for kept in (self.frozen, self.small, self.witnessing):
             kept.grown(reached.scene, advanced.scene)
         return advanced
 
@@ -425,7 +441,7 @@ class GSCompleter:
     ) -> tuple[Gaussians, tuple[float, ...]]:
         """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
-        watching, allowed = (*completion.views, *completion.witnesses), completion.allowed_errors
+        watching, allowed = photographs_of(completion), completion.allowed_errors
         frozen = self.watching(completion)
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
@@ -517,20 +533,21 @@ class GSCompleter:
         """Support of the scene as it stands, as `camera` sees it. What was added has it all, and so
         has what it does not see."""
         sums, aside = weight_sums(frozen), completion.set_aside
-        values, seen = torch.ones_like(sums), sums[: completion.num_kept]
-        if aside is not None:
-            seen = torch.zeros_like(aside, dtype=seen.dtype).masked_scatter(~aside, seen)
-        found = support(evidence, completion.context.means, seen, camera, self.config.support)
+        values, seen = torch.ones_like(sums), in_context(completion, sums[: completion.num_kept])
+        found = support(evidence, seen, camera, self.config.support)
         values[: completion.num_kept] = found if aside is None else found[~aside]
         return values
 
-    def evidence(self, completion: Completion) -> Evidence | None:
-        """What the photographs show of a scene that was brought, before any target; None where
-        nothing is doubted."""
-        if not self.config.support.doubts:
-            return None
-        views, config = (*completion.views, *completion.witnesses), self.config.support
-        return gather_evidence(completion.scene, views, self.watching(completion), config)
+    def doubted(self, completion: Completion) -> Completion:
+        """`completion` of a scene that was brought, before any target, and what the photographs
+        show of it where it is doubted."""
+        views, config = photographs_of(completion), self.config.support
+        proxy = proxy_of(completion.scene, [view.camera for view in views])
+        completion = replace(completion, proxy=proxy.scene)
+        if not config.doubts:
+            return completion
+        evidence = gather_evidence(proxy, views, self.watching(completion), config)
+        return replace(completion, evidence=evidence)
 
     def without_unsupported(self, sight: Sight) -> Sight:
         """`sight` once what covers its holes, and no photograph shows or needs, is set aside.
@@ -544,13 +561,24 @@ class GSCompleter:
         doubtful = self.unseen_in_holes(sight, completion.evidence)
         if not doubtful.any():
             return sight
-        views = (*completion.views, *completion.witnesses)
-        taken = not_needed(completion.scene, doubtful, views, self.renderer)
+        taken = self.not_needed(completion, doubtful)
         if not taken.any():
             return sight
         again = self.without_stereo(without(completion, taken), sight.window)
         # Photographs, and what stereo makes of them, stay as they are.
         return replace(again, stereo=sight.stereo)
+
+    def not_needed(self, completion: Completion, doubtful: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """The `doubtful` Gaussians of the scene as it stands that no photograph needs."""
+        views, rest = photographs_of(completion), completion.scene[~doubtful]
+        seen = proxy_of(rest, [view.camera for view in views]).scene
+        shown = [rest] * len(completion.views) + [seen] * len(completion.witnesses)
+        around = [
+            self.renderer.freeze(scene, view.camera)
+            for scene, view in zip(shown, views, strict=True)
+        ]
+        gone = not_needed(completion.scene[doubtful], around, views)
+        return doubtful.masked_scatter(doubtful, gone)
 
     def unseen_in_holes(self, sight: Sight, evidence: Evidence) -> Bool[Tensor, "n"]:
         """Which Gaussians of the scene as it stands cover holes and are shown by no photograph."""
@@ -560,10 +588,13 @@ class GSCompleter:
         layers = torch.stack([everywhere, holes.to(everywhere), 0 * everywhere], dim=-1)
         sums, covering, _ = sight.frozen.sums(layers).unbind(-1)
         of_context = (covering > MIN_COVER) & (scene.generated == 0)
-        rows = of_context[: completion.num_kept].nonzero()[:, 0]
-        known = evidence.of(rows_in_context(completion, rows))
-        unseen = shown(known, scene.means[rows], sums[rows], camera) < UNSEEN
-        return torch.zeros_like(of_context).index_fill(0, rows[unseen], True)
+        kept = completion.num_kept
+        seen = shown(evidence, in_context(completion, sums[:kept]), camera)
+        aside = completion.set_aside
+        unseen = (seen if aside is None else seen[~aside]) < UNSEEN
+        of_context[:kept] &= unseen
+        of_context[kept:] = False
+        return of_context
 
     def window(self, completion: Completion, target: Camera) -> Window:
         """The target and its wider camera, as wide as the generator can draw."""
@@ -589,7 +620,7 @@ class GSCompleter:
     def allowed_errors(self, completion: Completion) -> tuple[float, ...]:
         """Largest mean squared error that each photograph may have once all is done."""
         tolerance = 0.0 if completion.evidence is not None else self.config.harm.tolerance or 0.0
-        watching = (*completion.views, *completion.witnesses)
+        watching = photographs_of(completion)
         return tuple(
             error_with_loss(
                 squared_error(v.compared(r.image), v.image).item(), max(tolerance, ROUNDING)
@@ -602,13 +633,10 @@ class GSCompleter:
         return self.frozen.of(completion, [view.camera for view in views])
 
     def watching(self, completion: Completion) -> tuple[FrozenView, ...]:
-        """The scene as it stands, frozen at every photograph: of the context, then of witnesses,
-        whose views rest where all would take too much memory."""
-        witnesses = [view.camera for view in completion.witnesses]
-        number = len(completion.views) + len(witnesses)
-        too_much = fill_memory(number, len(completion.scene))
-        kept = self.frozen.at_rest if too_much else self.frozen.of
-        return (*self.at(completion, completion.views), *kept(completion, witnesses))
+        """The scene as it stands, frozen at every photograph of the context, then its proxy at
+        those of witnesses."""
+        witnesses = self.witnessing.of(completion, [v.camera for v in completion.witnesses])
+        return (*self.at(completion, completion.views), *witnesses)
 
     def small_renders(self, completion: Completion, cameras: Sequence[Camera]) -> Sequence[Render]:
         """What cameras of small images see of the scene as it stands, about."""
@@ -626,8 +654,23 @@ def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:
     if aside is None:
         aside = torch.zeros(len(completion.context), dtype=torch.bool, device=taken.device)
     rows = rows_in_context(completion, taken[: completion.num_kept].nonzero()[:, 0])
-    aside = aside.index_fill(0, rows, True)
-    return replace(completion, scene=completion.scene[~taken], set_aside=aside)
+    aside, scene = aside.index_fill(0, rows, True), completion.scene[~taken]
+    completion = replace(completion, scene=scene, set_aside=aside)
+    cameras = [view.camera for view in photographs_of(completion)]
+    return replace(completion, proxy=proxy_of(scene[: completion.num_kept], cameras).scene)
+
+
+def photographs_of(completion: Completion) -> tuple[View, ...]:
+    """All that are compared with the scene."""
+    return (*completion.views, *completion.witnesses)
+
+
+def in_context(completion: Completion, values: Float[Tensor, "kept"]) -> Float[Tensor, "n"]:
+    """Values of what the scene keeps of its context, as values of all of this; 0 of the others."""
+    aside = completion.set_aside
+    if aside is None:
+        return values
+    return values.new_zeros(len(aside)).masked_scatter(~aside, values)
 
 
 def rows_in_context(completion: Completion, rows: Int64[Tensor, "m"]) -> Int64[Tensor, "m"]:

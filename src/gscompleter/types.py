@@ -378,19 +378,41 @@ class TargetCompletion:
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What k photographs show of each of the n Gaussians of a scene that was brought."""
+class Proxy:
+    """A scene of n Gaussians drawn with m, each of which stands for a run of neighbours."""
 
+    scene: Gaussians
+    """The m Gaussians."""
+    run: Int64[Tensor, "n"] | None = None
+    """Which of them stands for each of the n; None where they are the same."""
+    shares: Float[Tensor, "n"] | None = None
+    """How much of that each of the n is; None where they are the same."""
+
+    def summed(self, values: Float[Tensor, "n *c"]) -> Float[Tensor, "m *c"]:
+        """Values of the n, added up for each of the m."""
+        if self.run is None:
+            return values
+        nothing = values.new_zeros((len(self.scene), *values.shape[1:]))
+        return nothing.index_add_(0, self.run, values)
+
+    def spread(self, values: Float[Tensor, "m"]) -> Float[Tensor, "n"]:
+        """To each of the n the value of what stands for it."""
+        return values if self.run is None else values[self.run]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What k photographs show of each of the m Gaussians that a scene that was brought is drawn
+    with."""
+
+    proxy: Proxy
+    """How the n Gaussians of the scene are drawn."""
     centers: Float[Tensor, "k 3"]
     """Where the photographs were taken, in world coordinates."""
-    areas: Float[Tensor, "k n"]
+    areas: Float[Tensor, "k m"]
     """How much of each Gaussian each photograph shows, in squared scene units."""
-    agreement: Float[Tensor, "k n"]
+    agreement: Float[Tensor, "k m"]
     """How far the scene looks there as the photograph does, in [0, 1]; 0 where it shows nothing."""
-
-    def of(self, rows: Int64[Tensor, "m"]) -> Evidence:
-        """What they show of some of the Gaussians."""
-        return replace(self, areas=self.areas[:, rows], agreement=self.agreement[:, rows])
 
 
 @dataclass(frozen=True)
@@ -423,6 +445,8 @@ class Completion:
     gains: Float[Tensor, "v 3"] | None = None
     """By how much each photograph, as it was taken, is brighter than in `views`, by channel; None
     where exposures were not evened out."""
+    proxy: Gaussians | None = None
+    """What of the context the scene begins with, as `witnesses` see it; None for itself."""
     evidence: Evidence | None = None
     """What `views` and `witnesses` show of the context; None where a context is not doubted."""
     set_aside: Bool[Tensor, "n"] | None = None

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.config import ExplorationConfig
@@ -31,7 +31,9 @@ from gscompleter.stages.candidates import Candidate, opening
 from gscompleter.types import (
     Camera,
     Completion,
+    Evidence,
     Gaussians,
+    Proxy,
     Render,
     merge,
     observed,
@@ -144,11 +146,23 @@ def miniature(completion: Completion, most: int = MAX_GAUSSIANS) -> Completion:
     them."""
     context, evidence, aside = completion.context, completion.evidence, completion.set_aside
     rows, growth = thinning(context, most)
-    if evidence is not None:
-        known = evidence.of(rows)
-        evidence = replace(known, areas=known.areas * growth**2)
     context = thinned(context, most)
+    evidence = None if evidence is None else thinned_evidence(evidence, context, rows, growth)
     aside = None if aside is None else aside[rows]
     kept = context if aside is None else context[~aside]
     scene = merge([kept, thinned(completion.added, most)])
-    return replace(completion, scene=scene, context=context, evidence=evidence, set_aside=aside)
+    completion = replace(completion, proxy=None, evidence=evidence, set_aside=aside)
+    return replace(completion, scene=scene, context=context)
+
+
+def thinned_evidence(
+    evidence: Evidence,
+    thin: Gaussians,
+    rows: Int64[Tensor, "r"],
+    growth: Float[Tensor, "r"],
+) -> Evidence:
+    """Evidence on a scene of which these rows stay, each grown so many times; `thin` is those."""
+    proxy, runs = evidence.proxy, rows if evidence.proxy.run is None else evidence.proxy.run[rows]
+    shares = growth**2 if proxy.shares is None else growth**2 * proxy.shares[rows]
+    areas, agreement = evidence.areas[:, runs] * shares, evidence.agreement[:, runs]
+    return Evidence(Proxy(thin), evidence.centers, areas, agreement)

@@ -7,15 +7,18 @@ target. What they see of it is frozen once and then extended by what was added s
 from __future__ import annotations
 
 import weakref
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from itertools import accumulate, pairwise
 
-from gscompleter.frames.thinning import thinned
 from gscompleter.render import FrozenView, Renderer
 from gscompleter.types import Camera, Completion, Gaussians, merge
 
 Views = dict[Hashable, tuple[int, FrozenView]]
 """By camera, how many Gaussians of the scene are frozen in a view, and the view."""
+
+Drawn = Callable[[Completion, int, int], Gaussians]
+"""What is drawn of the Gaussians start..stop of a scene: of its context, or of what a target
+added."""
 
 
 class KeptViews:
@@ -24,23 +27,23 @@ class KeptViews:
     Nothing but time depends on whether a view was kept: it is the same as one that is frozen anew.
     """
 
-    def __init__(self, renderer: Renderer, most: int | None = None) -> None:
+    def __init__(self, renderer: Renderer, drawn: Drawn | None = None) -> None:
         """
         Args:
             renderer: Freezes and extends the views.
-            most: Gaussians of the context, and of what each target added, that are drawn at most;
-                None for all.
+            drawn: What is drawn in place of the context, and of what each target added; None for
+                themselves.
         """
-        self._renderer, self._most = renderer, most
+        self._renderer, self._drawn = renderer, drawn
         self._scene: weakref.ref[Gaussians] | None = None
         self._views: Views = {}
-        self._thinned: dict[tuple[int, int], Gaussians] = {}
+        self._parts: dict[tuple[int, int], Gaussians] = {}
         """What is drawn of the context, and of what each target added, by their rows."""
 
     def of(self, completion: Completion, cameras: Sequence[Camera]) -> tuple[FrozenView, ...]:
         """The scene as it stands, frozen at each of `cameras`."""
         if self._scene is None or self._scene() is not completion.scene:
-            self._scene, self._views, self._thinned = weakref.ref(completion.scene), {}, {}
+            self._scene, self._views, self._parts = weakref.ref(completion.scene), {}, {}
         views, keys = self._views, [key_of(camera) for camera in cameras]
         behind = {views[key][0] if key in views else 0 for key in keys}
         missing = {count: self._since(completion, count) for count in behind}
@@ -53,14 +56,6 @@ class KeptViews:
             views[key] = len(completion.scene), view
         return tuple(views[key][1] for key in keys)
 
-    def at_rest(self, completion: Completion, cameras: Sequence[Camera]) -> tuple[FrozenView, ...]:
-        """The same, in views that take less memory; one at a time holds more."""
-        for camera in cameras:
-            (view,) = self.of(completion, [camera])
-            resting = view.resting(self._since(completion, 0))
-            self._views[key_of(camera)] = len(completion.scene), resting
-        return self.of(completion, cameras)
-
     def grown(self, before: Gaussians, after: Gaussians) -> None:
         """Be told that the scene `after` is `before`, and something that was added to it."""
         if self._scene is not None and self._scene() is before:
@@ -68,15 +63,16 @@ class KeptViews:
 
     def _since(self, completion: Completion, count: int) -> Gaussians:
         """What is drawn of a scene behind its first `count` Gaussians, as many as it had once."""
-        if self._most is None:
+        if self._drawn is None:
             return completion.scene[count:]
         added = [len(result.added) for result in completion.targets]
         bounds = [0, *accumulate(added, initial=completion.num_kept)]
-        parts = [part for part in pairwise(bounds) if part[0] >= count]
-        for start, stop in parts:
-            if (start, stop) not in self._thinned:
-                self._thinned[start, stop] = thinned(completion.scene[start:stop], self._most)
-        return merge([completion.scene[:0], *(self._thinned[part] for part in parts)])
+        wanted = [part for part in pairwise(bounds) if part[0] >= count]
+        for part in wanted:
+            if part not in self._parts:
+                self._parts[part] = self._drawn(completion, *part)
+        parts = [self._parts[part] for part in wanted]
+        return parts[0] if len(parts) == 1 else merge([completion.scene[:0], *parts])
 
 
 def key_of(camera: Camera) -> Hashable:

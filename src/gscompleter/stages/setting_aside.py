@@ -6,13 +6,13 @@ a photograph needs always stays.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.render import OpacityRender, Renderer, image_of
+from gscompleter.render import FrozenView, OpacityRender, Renderer, image_of
 from gscompleter.stages.harm import error_slope, fewest, squared_error
 from gscompleter.types import Gaussians, View
 
@@ -26,18 +26,30 @@ any it would not be drawn, and would tell nothing."""
 
 
 def not_needed(
-    scene: Gaussians, doubtful: Bool[Tensor, "n"], views: Sequence[View], renderer: Renderer
+    doubtful: Gaussians, around: Sequence[FrozenView], views: Sequence[View]
 ) -> Bool[Tensor, "n"]:
-    """The `doubtful` Gaussians of `scene` without which no photograph is matched worse.
+    """Which of the `doubtful` Gaussians can go without any photograph being matched worse.
 
-    Those that a photograph needs most are put back, no more of them than it takes, until each is
-    matched as well as by the whole scene.
+    Those that a photograph needs most stay, no more of them than it takes, until each is matched as
+    well as by the whole scene.
+
+    Args:
+        doubtful: The n Gaussians.
+        around: The scene without them, frozen at each photograph.
+        views: The photographs.
     """
-    doubtful = doubtful & ~wanted(scene, doubtful, views, renderer)
-    if not doubtful.any():
-        return doubtful
-    allowed = [error_of(scene, view, renderer).item() for view in views]
-    return without_needed(scene, doubtful, views, allowed, renderer)
+    told = [
+        error_slope(image_of(frozen.plan(doubtful)), view, doubtful.opacities)
+        for frozen, view in zip(around, views, strict=True)
+    ]
+    missed = [-slope * doubtful.opacities > LITTLE * error for error, slope in told]
+    wanted = torch.stack(missed).any(dim=0)
+    if wanted.all():
+        return ~wanted
+    spare, kept = doubtful[~wanted], doubtful[wanted]
+    plans = [frozen.extended(kept).plan(spare) for frozen in around]
+    gone = all_gone(spare.opacities, lambda: plans, views, [error for error, _ in told])
+    return torch.zeros_like(wanted).masked_scatter(~wanted, gone)
 
 
 def without_needed(
@@ -47,36 +59,41 @@ def without_needed(
     allowed: Sequence[float],
     renderer: Renderer,
 ) -> Bool[Tensor, "n"]:
-    """The `doubtful` Gaussians but for those that a photograph needs most, no more of them than it
-    takes for its mean squared error to be `allowed`.
+    """The `doubtful` Gaussians of `scene` but for those that a photograph needs most, no more of
+    them than it takes for its mean squared error to be `allowed`."""
+    candidates, rest = scene[doubtful], scene[~doubtful]
+
+    def plans() -> Iterator[OpacityRender]:
+        # One at a time: all of many photographs would not fit into memory.
+        return (renderer.freeze(rest, view.camera).plan(candidates) for view in views)
+
+    gone = all_gone(candidates.opacities, plans, views, allowed)
+    return doubtful.masked_scatter(doubtful, gone)
+
+
+def all_gone(
+    opacities: Float[Tensor, "n"],
+    plans: Callable[[], Iterable[OpacityRender]],
+    views: Sequence[View],
+    allowed: Sequence[float],
+) -> Bool[Tensor, "n"]:
+    """Which Gaussians can be missing together, as long as the error of every photograph is allowed.
 
     What is put back for one photograph may change another, so they are asked until all agree.
+
+    Args:
+        opacities: Those of the n Gaussians.
+        plans: Gives what draws each of `views` with other opacities of them.
+        views: The photographs.
+        allowed: Largest mean squared error of each.
     """
-    candidates, rest = scene[doubtful], scene[~doubtful]
-    missing = torch.ones(len(candidates), dtype=torch.bool, device=doubtful.device)
+    missing = torch.ones_like(opacities, dtype=torch.bool)
     before = None
     while before is None or not torch.equal(missing, before):
         before = missing
-        for view, error in zip(views, allowed, strict=True):
-            # One at a time: all of many photographs would not fit into memory.
-            plan = renderer.freeze(rest, view.camera).plan(candidates)
-            missing = missing & ~needed(plan, candidates.opacities, missing, view, error)
-    return doubtful.masked_scatter(doubtful, missing)
-
-
-def wanted(
-    scene: Gaussians, doubtful: Bool[Tensor, "n"], views: Sequence[View], renderer: Renderer
-) -> Bool[Tensor, "n"]:
-    """Which of the `doubtful` Gaussians some photograph would miss by itself."""
-    candidates, rest = scene[doubtful], scene[~doubtful]
-    missed = torch.zeros(len(candidates), dtype=torch.bool, device=doubtful.device)
-    for view in views:
-        plan = renderer.freeze(rest, view.camera).plan(candidates)
-        error, slope = error_slope(image_of(plan), view, candidates.opacities)
-        missed |= -slope * candidates.opacities > LITTLE * error
-    result = doubtful.clone()
-    result[doubtful] = missed
-    return result
+        for plan, view, error in zip(plans(), views, allowed, strict=True):
+            missing = missing & ~needed(plan, opacities, missing, view, error)
+    return missing
 
 
 def needed(

@@ -28,7 +28,7 @@ from gscompleter.kernels.evidence import Place
 from gscompleter.kernels.sharing import share, side_by_side
 from gscompleter.render import FrozenView
 from gscompleter.threads import torch_on_one_thread
-from gscompleter.types import Camera, Evidence, Gaussians, Render, View
+from gscompleter.types import Camera, Evidence, Gaussians, Proxy, Render, View
 
 BLUR = 0.01
 """Radius over which differences of colour, and support, are averaged, of the longer side of an
@@ -43,29 +43,34 @@ and has to stay."""
 
 
 def gather_evidence(
-    scene: Gaussians, views: Sequence[View], frozen: Sequence[FrozenView], config: SupportConfig
+    proxy: Proxy, views: Sequence[View], frozen: Sequence[FrozenView], config: SupportConfig
 ) -> Evidence:
     """What photographs show of each Gaussian, and how far the scene looks like them there.
 
     Args:
-        scene: The n Gaussians.
+        proxy: How the scene is drawn.
         views: The k photographs, whose cameras know the depth range.
-        frozen: The scene frozen at each of them.
+        frozen: The scene, or its proxy, frozen at each of them.
         config: How different is too different.
     """
     with torch_on_one_thread():
         differences = side_by_side(difference, [f.context for f in frozen], views)
     usual = torch.stack([d.median() for d in differences]).median().item()
     scale = config.max_difference * max(1.0, usual / EXACT)
-    means = array_of(scene.means)
-    areas, agreement = np.empty((2, len(views), len(scene)), np.float32)
+    means = array_of(proxy.scene.means)
+    areas, agreement = np.empty((2, len(views), len(means)), np.float32)
     for k, (view, different) in enumerate(zip(views, differences, strict=True)):
         agrees = torch.exp(-((different / scale) ** 2))
         layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
-        sums = array_of(frozen[k].sums(layers))
+        sums = array_of(of_proxy(frozen[k].sums(layers), proxy))
         share(kernels.tell, len(means), sums, means, place_of(view.camera), areas[k], agreement[k])
-    told = (torch.from_numpy(array).to(scene.means) for array in (areas, agreement))
-    return Evidence(torch.stack([view.camera.center for view in views]), *told)
+    told = (torch.from_numpy(array).to(proxy.scene.means) for array in (areas, agreement))
+    return Evidence(proxy, torch.stack([view.camera.center for view in views]), *told)
+
+
+def of_proxy(sums: Float[Tensor, "_ c"], proxy: Proxy) -> Float[Tensor, "m c"]:
+    """Sums of the Gaussians of a proxy, from these or from those of the scene."""
+    return sums if len(sums) == len(proxy.scene) else proxy.summed(sums)
 
 
 def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
@@ -77,7 +82,6 @@ def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
 
 def support(
     evidence: Evidence,
-    means: Float[Tensor, "n 3"],
     sums: Float[Tensor, "n"],
     camera: Camera,
     config: SupportConfig = SupportConfig(),
@@ -87,16 +91,17 @@ def support(
 
     Args:
         evidence: What the photographs show of n Gaussians.
-        means: Where these are, in world coordinates.
         sums: The sum of the compositing weights of each over the image of `camera`.
         camera: Who asks.
         config: From how far aside a photograph still tells something.
     """
-    told = map(array_of, (evidence.centers, evidence.areas, evidence.agreement, means, sums))
+    proxy = evidence.proxy
+    seen = (proxy.scene.means, proxy.summed(sums))
+    told = map(array_of, (evidence.centers, evidence.areas, evidence.agreement, *seen))
     limits = np.float32(math.radians(config.max_turn)), np.float32(ENOUGH)
-    values = np.empty(len(sums), np.float32)
+    values = np.empty(len(proxy.scene), np.float32)
     share(kernels.support, len(values), *told, place_of(camera), *limits, values)
-    return torch.from_numpy(values).to(sums)
+    return proxy.spread(torch.from_numpy(values).to(sums))
 
 
 def place_of(camera: Camera) -> Place:
@@ -110,13 +115,12 @@ def array_of(values: Float[Tensor, "..."]) -> Float32[ndarray, "..."]:
     return values.detach().to("cpu", torch.float32).contiguous().numpy()
 
 
-def shown(
-    evidence: Evidence, means: Float[Tensor, "n 3"], sums: Float[Tensor, "n"], camera: Camera
-) -> Float[Tensor, "n"]:
+def shown(evidence: Evidence, sums: Float[Tensor, "n"], camera: Camera) -> Float[Tensor, "n"]:
     """How much of each Gaussian the photograph that shows most of it shows, as a share of what
     `camera` sees; large where it sees nothing. The arguments are those of `support`."""
-    needed = sums * pixel_areas(means, camera)
-    return evidence.areas.amax(dim=0) / needed.clamp_min(1e-20)
+    proxy = evidence.proxy
+    needed = proxy.summed(sums) * pixel_areas(proxy.scene.means, camera)
+    return proxy.spread(evidence.areas.amax(dim=0) / needed.clamp_min(1e-20))
 
 
 def weight_sums(frozen: FrozenView) -> Float[Tensor, "n"]:

@@ -1,0 +1,140 @@
+"""Runs of Gaussians that lie so close to each other that one may stand for all of a run.
+
+Every kernel works on a range (begin, end) of its elements and writes to its own part of the
+outputs.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+BLOCK = 4096
+"""Gaussians, one after the other, that are cut into runs by themselves."""
+OPAQUE = np.float32(0.9999)
+"""Opacity beyond which nothing gets more opaque; the logarithm of what is let through is finite."""
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def begin_runs(begin, end, means, scales, centers, focals, reach, largest, begins):
+    """Whether each Gaussian of the blocks begin..end begins a run.
+
+    A run goes on as long as what follows lies within `reach` pixels of its first Gaussian, and no
+    standard deviation exceeds `largest` pixels: of the camera in which a pixel covers least there.
+
+    means [n, 3], scales [n, 3], centers [k, 3], focals [k] float32. begins [n] bool is written.
+    """
+    for block in range(begin, end):
+        pixel, x, y, z = np.float32(-1), np.float32(0), np.float32(0), np.float32(0)
+        for i in range(block * BLOCK, min((block + 1) * BLOCK, len(means))):
+            dx, dy, dz = means[i, 0] - x, means[i, 1] - y, means[i, 2] - z
+            size = max(scales[i, 0], scales[i, 1], scales[i, 2])
+            apart = dx * dx + dy * dy + dz * dz
+            begins[i] = not (size <= largest * pixel and apart <= (reach * pixel) ** 2)
+            if begins[i]:
+                x, y, z = means[i, 0], means[i, 1], means[i, 2]
+                pixel = _pixel(x, y, z, centers, focals)
+                if size > largest * pixel:
+                    pixel = np.float32(-1)
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _pixel(x, y, z, centers, focals):
+    """What the smallest pixel of all cameras covers at a point, in scene units."""
+    smallest = np.float32(np.inf)
+    for k in range(len(centers)):
+        dx, dy, dz = x - centers[k, 0], y - centers[k, 1], z - centers[k, 2]
+        smallest = min(smallest, (dx * dx + dy * dy + dz * dz) / (focals[k] * focals[k]))
+    return math.sqrt(smallest)
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _cross_section(scales, i):
+    """Of Gaussian i, from its broad side."""
+    a, b, c = scales[i, 0], scales[i, 1], scales[i, 2]
+    return max(a * b, b * c, c * a)
+
+
+@njit(cache=True)
+def _fullness(thickness):
+    """The area of 1 - exp(-thickness g), as a share of that of a Gaussian g of the same peak."""
+    return np.float32(1) + np.float32(0.25) * min(thickness, np.float32(4.6))
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _rotation(quats, i):
+    """The rotated axes of Gaussian i as columns [3, 3]."""
+    w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+    inverse = np.float32(1) / math.sqrt(max(w * w + x * x + y * y + z * z, np.float32(1e-30)))
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    one, two = np.float32(1), np.float32(2)
+    return (
+        (one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)),
+        (two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)),
+        (two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)),
+    )
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def stand_for(begin, end, start, given, shares, found):
+    """One Gaussian for each of the runs begin..end, and the share of each Gaussian in its run.
+
+    It is as opaque as all of them together, lies where they lie in the mean, has the mean of their
+    colours, and their spread along the axes of the one that counts most.
+
+    start [m + 1] int64: where each run starts, and the end.
+    given: means [n, 3], quats [n, 4], scales [n, 3], opacities [n], sh [n, k, 3] float32.
+    shares [n] float32, and found, the same as `given` of [m], are written.
+    """
+    means, quats, scales, opacities, sh = given
+    to_means, to_quats, to_scales, to_opacities, to_sh = found
+    for run in range(begin, end):
+        first, last = start[run], start[run + 1]
+        total, most = np.float32(0), first
+        for i in range(first, last):
+            thickness = -math.log(np.float32(1) - min(opacities[i], OPAQUE))
+            shares[i] = thickness * _cross_section(scales, i)
+            total += shares[i]
+            if shares[i] > shares[most]:
+                most = i
+        for i in range(first, last):
+            even = np.float32(1) / np.float32(last - first)
+            shares[i] = shares[i] / total if total > np.float32(0) else even
+        to_quats[run] = quats[most]
+        if last - first == 1:
+            to_means[run], to_scales[run] = means[first], scales[first]
+            to_opacities[run], to_sh[run] = opacities[first], sh[first]
+            continue
+        x, y, z = np.float32(0), np.float32(0), np.float32(0)
+        to_sh[run] = np.float32(0)
+        for i in range(first, last):
+            x += shares[i] * (means[i, 0] - means[first, 0])
+            y += shares[i] * (means[i, 1] - means[first, 1])
+            z += shares[i] * (means[i, 2] - means[first, 2])
+            for band in range(sh.shape[1]):
+                for colour in range(3):
+                    to_sh[run, band, colour] += shares[i] * sh[i, band, colour]
+        to_means[run, 0] = means[first, 0] + x
+        to_means[run, 1] = means[first, 1] + y
+        to_means[run, 2] = means[first, 2] + z
+        axes = _rotation(quats, most)
+        for axis in range(3):
+            ax, ay, az = axes[0][axis], axes[1][axis], axes[2][axis]
+            variance = np.float32(0)
+            for i in range(first, last):
+                own = _rotation(quats, i)
+                dx = means[i, 0] - to_means[run, 0]
+                dy = means[i, 1] - to_means[run, 1]
+                dz = means[i, 2] - to_means[run, 2]
+                spread = (ax * dx + ay * dy + az * dz) ** 2
+                for k in range(3):
+                    along = (ax * own[0][k] + ay * own[1][k] + az * own[2][k]) * scales[i, k]
+                    spread += along * along
+                variance += shares[i] * spread
+            to_scales[run, axis] = math.sqrt(variance)
+        thickness = total / max(_cross_section(to_scales, run), np.float32(1e-30))
+        to_opacities[run] = min(-math.expm1(-thickness), OPAQUE)
+        own = np.float32(0)
+        for i in range(first, last):
+            own -= shares[i] * math.log(np.float32(1) - min(opacities[i], OPAQUE))
+        to_scales[run] *= math.sqrt(_fullness(thickness) / _fullness(own))
