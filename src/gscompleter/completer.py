@@ -573,10 +573,10 @@ class GSCompleter:
         views, rest = photographs_of(completion), completion.scene[~doubtful]
         seen = proxy_of(rest, [view.camera for view in views]).scene
         shown = [rest] * len(completion.views) + [seen] * len(completion.witnesses)
-        around = [
+        around = (
             self.renderer.freeze(scene, view.camera)
             for scene, view in zip(shown, views, strict=True)
-        ]
+        )
         gone = not_needed(completion.scene[doubtful], around, views)
         return doubtful.masked_scatter(doubtful, gone)
 

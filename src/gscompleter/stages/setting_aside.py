@@ -26,7 +26,7 @@ any it would not be drawn, and would tell nothing."""
 
 
 def not_needed(
-    doubtful: Gaussians, around: Sequence[FrozenView], views: Sequence[View]
+    doubtful: Gaussians, around: Iterable[FrozenView], views: Sequence[View]
 ) -> Bool[Tensor, "n"]:
     """Which of the `doubtful` Gaussians can go without any photograph being matched worse.
 
@@ -38,18 +38,21 @@ def not_needed(
         around: The scene without them, frozen at each photograph.
         views: The photographs.
     """
+    frozen, opacities = list(around), doubtful.opacities
     told = [
-        error_slope(image_of(frozen.plan(doubtful)), view, doubtful.opacities)
-        for frozen, view in zip(around, views, strict=True)
+        error_slope(image_of(view.plan(doubtful)), photograph, opacities)
+        for view, photograph in zip(frozen, views, strict=True)
     ]
-    missed = [-slope * doubtful.opacities > LITTLE * error for error, slope in told]
-    wanted = torch.stack(missed).any(dim=0)
-    if wanted.all():
-        return ~wanted
-    spare, kept = doubtful[~wanted], doubtful[wanted]
-    plans = [frozen.extended(kept).plan(spare) for frozen in around]
-    gone = all_gone(spare.opacities, lambda: plans, views, [error for error, _ in told])
-    return torch.zeros_like(wanted).masked_scatter(~wanted, gone)
+    missed = [-slope * opacities > LITTLE * error for error, slope in told]
+    spare = ~torch.stack(missed).any(dim=0)
+    if not spare.any():
+        return spare
+    candidates, kept = doubtful[spare], doubtful[~spare]
+    for k, view in enumerate(frozen):  # None is held twice: they take much memory.
+        frozen[k] = view.extended(kept)
+    plans = [view.plan(candidates) for view in frozen]
+    gone = all_gone(candidates.opacities, lambda: plans, views, [error for error, _ in told])
+    return spare.masked_scatter(spare, gone)
 
 
 def without_needed(
