@@ -20,12 +20,12 @@ BYTES_PER_PIXEL_OF_A_VIEW = 250
 Measured on eight photographs instead of two, at 256 x 256 and 480 x 480."""
 
 MAX_KEPT = 2 * 2**30
-"""Bytes of splats that frozen views of a scene that was brought may hold together. Where all its
-photographs need more, views of those that are no context hold names instead."""
-WAKING_BYTES = 300
-"""What each Gaussian takes while a view is frozen or woken."""
-BYTES_PER_SPLAT, BYTES_PER_NAME = 52, 7
-"""What each Gaussian takes in a frozen view, and in one that holds names."""
+"""Bytes of splats that frozen views of a scene that was brought may hold together; those that are
+no context are drawn with as few Gaussians as that takes."""
+FREEZING_BYTES = 300
+"""What each Gaussian takes while a view is frozen."""
+BYTES_PER_SPLAT = 52
+"""What each Gaussian takes in a frozen view."""
 BYTES_PER_PIXEL_OF_A_WITNESS = 850
 """What is fitted to a photograph of such a scene, for each of its pixels."""
 
@@ -92,16 +92,16 @@ def scene_bytes(count: int, numbers: int, contexts: int, photographs: Sequence[i
         photographs: Pixels of each of all of them, as small as they are looked at.
     """
     number = len(photographs)
-    awake = contexts if fill_memory(number, count) else number
-    views = awake * BYTES_PER_SPLAT + (number - awake) * BYTES_PER_NAME + WAKING_BYTES
-    told = 2 * 4 * number  # how much of each the photographs show, and how they agree
+    drawn = min(count, most_that_fit(number))
+    views = number * drawn * BYTES_PER_SPLAT + contexts * (count - drawn) * BYTES_PER_SPLAT
+    told = 2 * 4 * number * drawn  # how much of each the photographs show, and how they agree
     fitted = BYTES_PER_PIXEL_OF_A_WITNESS * sum(photographs)
-    return count * (2 * 4 * numbers + told + views) + fitted
+    return count * (2 * 4 * numbers + FREEZING_BYTES) + 2 * views + told + fitted
 
 
-def fill_memory(number: int, count: int) -> bool:
-    """Whether that many views of `count` Gaussians would hold more than `MAX_KEPT`."""
-    return number * count * BYTES_PER_SPLAT > MAX_KEPT
+def most_that_fit(number: int) -> int:
+    """Gaussians of which that many views hold `MAX_KEPT` at most."""
+    return MAX_KEPT // (number * BYTES_PER_SPLAT)
 
 
 def images_that_fit(pixels: int) -> int | None:

@@ -15,7 +15,7 @@ from gscompleter.interpolation import smoothed
 from gscompleter.kernels.compiled import note_compiled
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.stages.proxy import proxy_of
+from gscompleter.stages.proxy import run_by_run
 from gscompleter.stages.support import gather_evidence, support, weight_sums
 from gscompleter.types import Camera, Gaussians, Render, SceneContext, View, observed, sh_from_rgb
 
@@ -66,7 +66,7 @@ def doubt_brought(_: str) -> None:
     gaussians, view, config = some_gaussians(), photographs()[0], SupportConfig()
     looks = gaussians.opacities.clone().requires_grad_(), gaussians.sh.clone().requires_grad_()
     frozen = load_renderer("cpu").freeze(gaussians, view.camera)
-    proxy = proxy_of(gaussians, [view.camera], worth=0)
+    proxy = run_by_run(gaussians, [view.camera])
     evidence = gather_evidence(proxy, [view], [frozen], config)
     support(evidence, weight_sums(frozen), view.camera, config)
     frozen.plan_appearance(gaussians)(*looks).sum().backward()

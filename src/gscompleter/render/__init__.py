@@ -69,10 +69,6 @@ class FrozenView(Protocol):
     def extended(self, new: Gaussians) -> FrozenView:
         """The view of context and `new`, in that order, both frozen."""
 
-    def resting(self, context: Gaussians) -> FrozenView:
-        """The same in less memory, for a camera that is seldom drawn for; `context` is what was
-        frozen."""
-
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """For each Gaussian of the context, the sum over the image of each layer times the
         Gaussian's compositing weight."""

@@ -21,7 +21,7 @@ from gscompleter.errors import InputError
 from gscompleter.kernels import lists, rasterizer
 from gscompleter.kernels.rasterizer import TILE, Frame, GaussianArrays, Layer, Pinhole
 from gscompleter.kernels.sharing import ranges, run, share
-from gscompleter.render import ColourErrors, ColourSums, DepthRender, FrozenView, OpacityRender
+from gscompleter.render import ColourErrors, ColourSums, DepthRender, OpacityRender
 from gscompleter.render.folded import Folded, float32, folded
 from gscompleter.types import Camera, Gaussians, Render
 
@@ -99,18 +99,6 @@ class CpuView:
         rows = np.concatenate([self.rows[kept[0]], order[kept[1]] + np.int32(self.count)])
         frame = frame._replace(used=used)
         return CpuView(self.viewpoint, layer, frame, depth_limits, rows, count)
-
-    def resting(self, context: Gaussians) -> FrozenView:
-        from gscompleter.render.resting import RestingView
-
-        return RestingView(
-            self.viewpoint,
-            (replace(context, encoded=None),),
-            self.frame,
-            self.depth_limits,
-            self.layer.tile_start,
-            self.rows[self.layer.entries],
-        )
 
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """By the backward pass alone: the frame that is kept tells what every pixel let through."""

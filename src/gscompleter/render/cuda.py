@@ -170,10 +170,6 @@ class CudaView:
         count = self.count + len(new)
         return replace(self, scene=merge([self.seen, new]), rows=rows, count=count)
 
-    def resting(self, context: Gaussians) -> CudaView:
-        """Itself, which holds no more than what it sees."""
-        return self
-
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """By the slopes of what is seen."""
         sums = layers.new_zeros((self.count, 3))

@@ -73,9 +73,6 @@ class ReferenceView:
     def extended(self, new: Gaussians) -> ReferenceView:
         return replace(self, scene=merge([self.scene, new]))
 
-    def resting(self, context: Gaussians) -> ReferenceView:
-        return self
-
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         return sums_by_slopes(self._painted, self.scene, layers)
 

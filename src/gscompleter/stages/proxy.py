@@ -17,6 +17,8 @@ from numpy import ndarray
 
 from gscompleter.kernels import runs as kernels
 from gscompleter.kernels.sharing import share
+from gscompleter.memory import most_that_fit
+from gscompleter.render.folded import float32
 from gscompleter.types import Camera, Gaussians, Proxy
 
 WORTH = 500_000
@@ -26,38 +28,51 @@ REACH = 0.5
 LARGEST = 2.0
 """Standard deviations of a Gaussian that shares a run, in pixels, at most. Photographs and scene
 are compared over more than that."""
+MAX_GROWTH = 8.0
+"""By how much both grow at most where the proxy would be too large otherwise."""
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 """Of Gaussians, as the kernels want them."""
 
 
-def proxy_of(scene: Gaussians, cameras: Sequence[Camera], worth: int = WORTH) -> Proxy:
-    """What `cameras` see of `scene`, with fewer Gaussians where it has very many.
+def proxy_of(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
+    """What `cameras` see of `scene`, drawn with fewer Gaussians where it has very many.
 
-    Neighbours in the scene's order are asked whether they lie close to each other, so that one in
-    random order stays as it is. So does one on a GPU, which has no need of it.
+    One on a GPU stays as it is, which has no need of it.
     """
-    if len(scene) < worth or scene.means.is_cuda or not cameras:
+    if len(scene) < WORTH or scene.means.is_cuda:
         return Proxy(scene)
-    given = tuple(getattr(scene, name).float().contiguous().numpy() for name in FIELDS)
+    return run_by_run(scene, cameras)
+
+
+def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
+    """`scene` with one Gaussian for each run of neighbours in its order that lie close together.
+
+    There are as few runs as views of `cameras` have room for. In a random order there are none.
+    """
+    given = tuple(float32(getattr(scene, name)) for name in FIELDS)
     start = starts_of_runs(given[0], given[2], cameras)
     found = tuple(np.empty((len(start) - 1, *array.shape[1:]), np.float32) for array in given)
     shares = np.empty(len(scene), np.float32)
     share(kernels.stand_for, len(start) - 1, start, given, shares, found)
-    sizes = torch.from_numpy(np.diff(start))
     parts = dict(zip(FIELDS, map(torch.from_numpy, found), strict=True))
-    generated = scene.generated[torch.from_numpy(start[:-1])]
+    first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
-    return Proxy(Gaussians(**parts, generated=generated), run, torch.from_numpy(shares))
+    stand_ins = Gaussians(**parts, generated=scene.generated[first])
+    return Proxy(stand_ins, run, torch.from_numpy(shares))
 
 
 def starts_of_runs(
     means: Float32[ndarray, "n 3"], scales: Float32[ndarray, "n 3"], cameras: Sequence[Camera]
-) -> Int64[ndarray, "m+1"]:
-    """Where each run starts, and the end."""
-    centers = torch.stack([camera.center for camera in cameras]).float().numpy()
-    focals = torch.stack([camera.K[0, 0] for camera in cameras]).float().numpy()
+) -> Int64[ndarray, "bounds"]:
+    """Where each run starts, and the end [m + 1]."""
+    centers = float32(torch.stack([camera.center for camera in cameras]))
+    focals = float32(torch.stack([camera.K[0, 0] for camera in cameras]))
     begins = np.empty(len(means), np.bool_)
-    limits = np.float32(REACH), np.float32(LARGEST)
-    seen = (means, scales, centers, focals, *limits, begins)
-    share(kernels.begin_runs, -(-len(means) // kernels.BLOCK), *seen)
-    return np.append(np.flatnonzero(begins), len(means))
+    most, growth = most_that_fit(len(cameras)), 1.0
+    while True:
+        limits = np.float32(growth * REACH), np.float32(growth * LARGEST)
+        seen = (means, scales, centers, focals, *limits, begins)
+        share(kernels.begin_runs, -(-len(means) // kernels.BLOCK), *seen)
+        if np.count_nonzero(begins) <= most or growth >= MAX_GROWTH:
+            return np.append(np.flatnonzero(begins), len(means))
+        growth *= 2

@@ -15,8 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
-from numpy import ndarray
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -27,6 +26,7 @@ from gscompleter.kernels import evidence as kernels
 from gscompleter.kernels.evidence import Place
 from gscompleter.kernels.sharing import share, side_by_side
 from gscompleter.render import FrozenView
+from gscompleter.render.folded import float32
 from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import Camera, Evidence, Gaussians, Proxy, Render, View
 
@@ -57,12 +57,12 @@ def gather_evidence(
         differences = side_by_side(difference, [f.context for f in frozen], views)
     usual = torch.stack([d.median() for d in differences]).median().item()
     scale = config.max_difference * max(1.0, usual / EXACT)
-    means = array_of(proxy.scene.means)
+    means = float32(proxy.scene.means)
     areas, agreement = np.empty((2, len(views), len(means)), np.float32)
     for k, (view, different) in enumerate(zip(views, differences, strict=True)):
         agrees = torch.exp(-((different / scale) ** 2))
         layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
-        sums = array_of(of_proxy(frozen[k].sums(layers), proxy))
+        sums = float32(of_proxy(frozen[k].sums(layers), proxy))
         share(kernels.tell, len(means), sums, means, place_of(view.camera), areas[k], agreement[k])
     told = (torch.from_numpy(array).to(proxy.scene.means) for array in (areas, agreement))
     return Evidence(proxy, torch.stack([view.camera.center for view in views]), *told)
@@ -97,7 +97,7 @@ def support(
     """
     proxy = evidence.proxy
     seen = (proxy.scene.means, proxy.summed(sums))
-    told = map(array_of, (evidence.centers, evidence.areas, evidence.agreement, *seen))
+    told = map(float32, (evidence.centers, evidence.areas, evidence.agreement, *seen))
     limits = np.float32(math.radians(config.max_turn)), np.float32(ENOUGH)
     values = np.empty(len(proxy.scene), np.float32)
     share(kernels.support, len(values), *told, place_of(camera), *limits, values)
@@ -107,12 +107,7 @@ def support(
 def place_of(camera: Camera) -> Place:
     """Where a camera stands, as the kernels want it."""
     focal = (camera.K[0, 0] * camera.K[1, 1]).item()
-    return Place(array_of(camera.center), array_of(camera.forward), np.float32(focal))
-
-
-def array_of(values: Float[Tensor, "..."]) -> Float32[ndarray, "..."]:
-    """The values of a tensor as the kernels want them, not copied where they are so already."""
-    return values.detach().to("cpu", torch.float32).contiguous().numpy()
+    return Place(float32(camera.center), float32(camera.forward), np.float32(focal))
 
 
 def shown(evidence: Evidence, sums: Float[Tensor, "n"], camera: Camera) -> Float[Tensor, "n"]:
