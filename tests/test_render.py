@@ -1,14 +1,11 @@
 """The renderers agree with each other and with what can be worked out by hand."""
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
@@ -200,54 +197,6 @@ def test_an_extended_view_is_the_frozen_view_of_both(renderer):
     ):
         for name in DRAWN:
             assert torch.equal(getattr(ours, name), getattr(truth, name)), name
-
-
-def local(n: int, seed: int) -> Gaussians:
-    """Gaussians in a corner of the image, so that not all tiles are met."""
-    found = random_gaussians(n, seed)
-    return replace(found, means=0.1 * found.means + torch.tensor([-0.3, -0.3, 1.0]))
-
-
-@pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
-def test_a_view_at_rest_draws_what_it_drew(renderer):
-    context, _ = context_and_new()
-    view = renderer.freeze(context, CAMERA)
-    resting = view.resting(context)
-    for new in (local(40, 1), random_gaussians(50, seed=6), local(40, 1)[:0]):
-        assert_same_drawing(resting.context, view.context)
-        assert_same_drawing(resting.composite(new), view.composite(new))
-        assert_same_drawing(resting.plan(new)(new.opacities), view.plan(new)(new.opacities))
-        plans = (resting.plan_appearance(new), view.plan_appearance(new))
-        assert torch.equal(*(plan(new.opacities, new.sh) for plan in plans))
-        colours, photograph = torch.rand(len(new), 3), torch.rand(48, 48, 3)
-        missed = (resting.plan_colours(new), view.plan_colours(new))
-        assert_equal_all(*(errors(colours, photograph) for errors in missed))
-        everywhere, depths = torch.ones(48, 48, dtype=torch.bool), new.means[:, 2] * 1.01
-        slid = (resting.plan_depths(new, everywhere), view.plan_depths(new, everywhere))
-        assert_same_drawing(*(draw(depths) for draw in slid))
-        layers, painted = torch.rand(48, 48, 3), torch.rand(len(context), 3)
-        assert torch.equal(resting.sums(layers), view.sums(layers))
-        assert torch.equal(resting.repainted(painted), view.repainted(painted))
-        context = merge([context, new])
-        resting, view = resting.extended(new).resting(context), view.extended(new)
-
-
-def assert_equal_all(found: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
-    for ours, truth in zip(found, expected, strict=True):
-        assert torch.equal(ours, truth)
-
-
-def test_a_view_at_rest_wakes_only_where_something_new_meets_it():
-    context, _ = context_and_new()
-    view, new = CPU.freeze(context, CAMERA), local(40, 1)
-    resting = view.resting(context)
-    where = resting.met_by(new)
-    assert 0 < where.sum() < len(where)
-    woken = resting.around(new)
-    assert np.array_equal(np.diff(woken.layer.tile_start) > 0, where)
-    assert len(woken.rows) < len(view.rows)
-    held = [array.nbytes for array in (resting.names, resting.tile_start, *resting.frame)]
-    assert sum(held) < sum(array.nbytes for array in (*view.layer, *view.frame))
 
 
 def test_a_frozen_view_keeps_no_splat_that_no_tile_draws():

@@ -577,6 +577,8 @@ class GSCompleter:
             self.renderer.freeze(scene, view.camera)
             for scene, view in zip(shown, views, strict=True)
         )
+        for kept in (self.frozen, self.witnessing):  # A scene without `doubtful` is to come.
+            kept.forget()
         gone = not_needed(completion.scene[doubtful], around, views)
         return doubtful.masked_scatter(doubtful, gone)
 

@@ -96,7 +96,7 @@ def scene_bytes(count: int, numbers: int, contexts: int, photographs: Sequence[i
     views = number * drawn * BYTES_PER_SPLAT + contexts * (count - drawn) * BYTES_PER_SPLAT
     told = 2 * 4 * number * drawn  # how much of each the photographs show, and how they agree
     fitted = BYTES_PER_PIXEL_OF_A_WITNESS * sum(photographs)
-    return count * (2 * 4 * numbers + FREEZING_BYTES) + 2 * views + told + fitted
+    return count * (2 * 4 * numbers + FREEZING_BYTES) + views + told + fitted
 
 
 def most_that_fit(number: int) -> int:

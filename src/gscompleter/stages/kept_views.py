@@ -56,6 +56,10 @@ class KeptViews:
             views[key] = len(completion.scene), view
         return tuple(views[key][1] for key in keys)
 
+    def forget(self) -> None:
+        """Let go of all views, whose memory is needed."""
+        self._scene, self._views, self._parts = None, {}, {}
+
     def grown(self, before: Gaussians, after: Gaussians) -> None:
         """Be told that the scene `after` is `before`, and something that was added to it."""
         if self._scene is not None and self._scene() is before:

@@ -1,0 +1,180 @@
+"""A proxy of a large scene: fewer Gaussians that its photographs do not tell from all of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter.benchmark.crowding import crowded
+from gscompleter.completer import GSCompleter
+from gscompleter.config import SupportConfig
+from gscompleter.frames.thinning import thinned
+from gscompleter.memory import BYTES_PER_SPLAT
+from gscompleter.metrics.image import psnr
+from gscompleter.render import load_renderer
+from gscompleter.splats.order import order_nearby
+from gscompleter.stages import proxy as proxies
+from gscompleter.stages.exploration import thinned_evidence
+from gscompleter.stages.proxy import LARGEST, REACH, proxy_of, run_by_run
+from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
+from gscompleter.types import Evidence, Gaussians, Proxy, merge
+from scenes import Room, camera_at, gaussians_of, random_gaussians, reconstruction_of, view_of
+
+RENDERER = load_renderer("cpu")
+SIZE, COPIES = 64, 10
+CAMERAS = [camera_at(x, size=SIZE) for x in (-0.3, 0.0, 0.3)]
+TARGET = camera_at(0.5, yaw=25, size=SIZE)
+VIEWS = [view_of(Room(), camera) for camera in CAMERAS]
+ROOM = merge([gaussians_of(view) for view in (VIEWS[0], VIEWS[2])])
+
+
+def in_order(scene: Gaussians) -> Gaussians:
+    return scene[order_nearby(scene)]
+
+
+CROWD = in_order(crowded(ROOM, COPIES * len(ROOM)))
+PROXY = run_by_run(CROWD, CAMERAS)
+
+
+def pixel_at(scene: Gaussians) -> torch.Tensor:
+    """What the smallest pixel of the cameras covers at each Gaussian."""
+    apart = [(scene.means - camera.center).norm(dim=1) / camera.K[0, 0] for camera in CAMERAS]
+    return torch.stack(apart).amin(0)
+
+
+def test_a_small_scene_is_its_own_proxy():
+    proxy = proxy_of(ROOM, CAMERAS)
+    assert proxy.scene is ROOM
+    values = torch.rand(len(ROOM))
+    assert proxy.summed(values) is values
+    assert proxy.spread(values) is values
+
+
+def test_a_crowd_is_drawn_with_few_and_looks_alike():
+    assert len(PROXY.scene) < 2 * len(CROWD) / COPIES
+    for camera in (*CAMERAS, TARGET):
+        drawn = (thinned(CROWD, len(PROXY.scene)), PROXY.scene, CROWD)
+        thin, ours, truth = (RENDERER.render(scene, camera) for scene in drawn)
+        assert psnr(ours.image, truth.image) > psnr(thin.image, truth.image) + 3
+        assert (ours.alpha - truth.alpha).abs().mean() < 0.01
+
+
+def test_runs_lie_within_half_a_pixel():
+    assert (PROXY.run.diff() >= 0).all()
+    first = torch.cat([torch.tensor([0]), 1 + PROXY.run.diff().nonzero()[:, 0]])
+    apart = (CROWD.means - CROWD.means[first][PROXY.run]).norm(dim=1)
+    pixel = pixel_at(CROWD[first])[PROXY.run]
+    assert (apart <= 1.001 * REACH * pixel).all()
+    shared = torch.bincount(PROXY.run)[PROXY.run] > 1
+    assert (CROWD.scales.amax(dim=1) <= 1.001 * LARGEST * pixel)[shared].all()
+
+
+def test_what_is_large_or_alone_stays_to_the_bit():
+    scene = in_order(random_gaussians(500, sh_degree=1))
+    huge = replace(scene, scales=scene.scales + 100 * LARGEST * pixel_at(scene)[:, None])
+    for given in (huge, scene[::25]):
+        proxy = run_by_run(given, CAMERAS)
+        assert len(proxy.scene) == len(given)
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            assert torch.equal(getattr(proxy.scene, name), getattr(given, name)), name
+
+
+def test_values_are_shared_out_and_add_up():
+    together = PROXY.summed(PROXY.shares)
+    assert torch.allclose(together, torch.ones_like(together), atol=1e-5)
+    values = torch.rand(len(CROWD), 3, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(PROXY.summed(values).sum(0), values.sum(0), rtol=1e-4)
+    numbers = torch.arange(len(PROXY.scene)).float()
+    assert torch.equal(PROXY.spread(numbers), PROXY.run.float())
+
+
+def test_of_what_lies_at_one_place_the_mean_is_drawn_as_opaque_as_all():
+    one = gaussians_of(VIEWS[0])[:1]
+    pair = replace(merge([one, one]), opacities=torch.tensor([0.3, 0.6]))
+    pair = replace(pair, sh=torch.tensor([[[0.0, 0.0, 0.0]], [[1.0, 1.0, 1.0]]]))
+    (found,) = (run_by_run(pair, CAMERAS).scene,)
+    assert len(found) == 1
+    assert torch.allclose(found.means, one.means)
+    assert found.opacities.item() == pytest.approx(1 - 0.7 * 0.4, abs=1e-4)
+    assert 0.5 < found.sh[0, 0, 0] < 1.0
+    assert (found.scales >= one.scales).all()
+
+
+def test_what_lies_aside_widens_it():
+    one = gaussians_of(VIEWS[0])[:1]
+    step = 0.4 * pixel_at(one)
+    other = replace(one, means=one.means + torch.tensor([1.0, 0.0, 0.0]) * step)
+    found = run_by_run(merge([one, other]), CAMERAS).scene
+    assert len(found) == 1
+    assert torch.allclose(found.means, (one.means + other.means) / 2)
+    width, height, depth = (found.scales / one.scales)[0].tolist()
+    assert width > 1.02 * height
+    assert height == pytest.approx(depth, rel=1e-4)
+
+
+def test_where_there_is_little_room_fewer_are_drawn(monkeypatch):
+    room = len(CAMERAS) * BYTES_PER_SPLAT * len(PROXY.scene) // 2
+    monkeypatch.setattr("gscompleter.memory.MAX_KEPT", room)
+    assert len(run_by_run(CROWD, CAMERAS).scene) <= len(PROXY.scene) // 2
+
+
+def test_the_same_runs_on_any_number_of_threads(monkeypatch):
+    monkeypatch.setattr("numba.config.NUMBA_NUM_THREADS", 1)
+    again = run_by_run(CROWD, CAMERAS)
+    assert torch.equal(again.run, PROXY.run)
+    assert torch.equal(again.scene.scales, PROXY.scene.scales)
+
+
+def evidence_of(proxy: Proxy) -> Evidence:
+    frozen = [RENDERER.freeze(proxy.scene, camera) for camera in CAMERAS]
+    return gather_evidence(proxy, VIEWS, frozen, SupportConfig())
+
+
+def test_what_is_told_of_a_proxy_holds_for_the_scene():
+    frozen = RENDERER.freeze(CROWD, TARGET)
+    told = (support(evidence_of(p), weight_sums(frozen), TARGET) for p in (PROXY, Proxy(CROWD)))
+    ours, truth = (believed_alpha(frozen, values) for values in told)
+    assert truth.std() > 0.2
+    assert (ours - truth).abs().mean() < 0.05
+
+
+def test_evidence_of_the_scene_and_of_its_proxy_is_the_same():
+    """Frozen views of the context are of the scene itself."""
+    frozen = [RENDERER.freeze(CROWD, camera) for camera in CAMERAS]
+    evidence = gather_evidence(PROXY, VIEWS, frozen, SupportConfig())
+    ours, truth = evidence.areas.sum(), evidence_of(PROXY).areas.sum()
+    assert ours.item() == pytest.approx(truth.item(), rel=0.02)
+
+
+def test_evidence_is_thinned_with_the_scene():
+    rows = torch.arange(0, len(CROWD), COPIES)
+    growth = torch.full((len(rows),), COPIES**0.5)
+    whole = evidence_of(PROXY)
+    thin = thinned_evidence(whole, CROWD[rows], rows, growth)
+    assert thin.areas.shape == (len(VIEWS), len(rows))
+    assert thin.areas.sum().item() == pytest.approx(whole.areas.sum().item(), rel=0.1)
+
+
+class KnowingReconstructor:
+    def __call__(self, views):
+        return reconstruction_of(views, [view_of(Room(), view.camera).depth for view in views])
+
+
+def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
+    paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
+    asked = (VIEWS[::2], TARGET, CROWD, VIEWS[1:2])
+    whole = GSCompleter(KnowingReconstructor(), paint)(*asked)
+    monkeypatch.setattr(proxies, "WORTH", 0)
+    found = GSCompleter(KnowingReconstructor(), paint)(*asked)
+    assert len(found.proxy) < 0.5 * len(CROWD)
+    kept = CROWD if found.set_aside is None else CROWD[~found.set_aside]
+    assert torch.equal(found.scene.means[: found.num_kept], kept.means)
+    truth = view_of(Room(), TARGET).image
+    ours, theirs = (psnr(c.targets[0].after.image, truth) for c in (found, whole))
+    assert ours > psnr(found.targets[0].before.image, truth) + 3
+    assert abs(ours - theirs) < 0.5
+    for view in VIEWS:
+        before = psnr(RENDERER.render(CROWD, view.camera).image, view.image)
+        assert psnr(RENDERER.render(found.scene, view.camera).image, view.image) > before - 0.05
