@@ -17,8 +17,10 @@ from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gscompleter.kernels import lists
 from gscompleter.kernels import rasterizer as kernels
 from gscompleter.kernels.rasterizer import Fragments
+from gscompleter.kernels.sharing import share
 
 if TYPE_CHECKING:
     from gscompleter.render.cpu import Binned, CpuView, Viewpoint
@@ -163,22 +165,21 @@ def packed(
 ) -> Fragments:
     """The fragments that were found, without the room between them."""
     ends = np.concatenate([np.zeros((1, 2), np.int64), counts.cumsum(axis=0)])
-    parts = [
-        [slice(start, start + size) for start, size in zip(room[:, i], counts[:, i], strict=False)]
-        for i in range(2)
-    ]
-    shifts = (ends - room)[:-1, 1]
-    moved = [found.start[part] + shift for part, shift in zip(parts[0], shifts, strict=True)]
-    start = np.concatenate([*moved, ends[-1:, 1]])
-    entries = {name: joined(getattr(found, name), parts[0]) for name in ("names", "slots")}
-    names = ("pixels", "falloffs", "before")
-    pixels = {name: joined(getattr(found, name), parts[1]) for name in names}
-    return found._replace(entry_start=ends[:, 0].copy(), start=start, **entries, **pixels)
-
-
-def joined(array: ndarray, parts: list[slice]) -> ndarray:
-    """These parts of an array, one after the other."""
-    return np.concatenate([array[:0], *(array[part] for part in parts)])
+    entries, count = ends[-1]
+    left = Fragments(
+        found.tiles,
+        ends[:, 0].copy(),
+        np.empty(entries, np.int32),
+        np.empty(entries, np.int32),
+        np.empty(entries + 1, np.int64),
+        np.empty(count, np.uint8),
+        np.empty(count, np.float32),
+        np.empty((count, 4), np.float32),
+        found.behind,
+    )
+    left.start[-1] = count
+    share(lists.pack_fragments, len(found.tiles), room, ends, found, left)
+    return left
 
 
 def float32(values: Tensor) -> Float32[ndarray, "..."]:
