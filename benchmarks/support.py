@@ -32,7 +32,7 @@ from gscompleter.stages.support import (
     support,
     weight_sums,
 )
-from gscompleter.types import Evidence, Gaussians, View
+from gscompleter.types import Evidence, Gaussians, Proxy, View
 
 LONG_SIDE = 320
 WRONG = 0.1
@@ -63,7 +63,7 @@ def find(scene: Gaussians, views: Sequence[View], trained: Sequence[int]) -> Non
     """How well support finds wrong pixels."""
     renderer, config = load_renderer("cpu"), SupportConfig()
     frozen_views = [renderer.freeze(scene, view.camera) for view in views]
-    evidence = gather_evidence(scene, views, frozen_views, config)
+    evidence = gather_evidence(Proxy(scene), views, frozen_views, config)
     for frame in sorted(set(range(len(views))) - set(trained)):
         view = views[frame]
         frozen = frozen_views[frame]
@@ -71,7 +71,7 @@ def find(scene: Gaussians, views: Sequence[View], trained: Sequence[int]) -> Non
         areas = []
         for told in ([n for n in range(len(views)) if n != frame], list(trained)):
             told_of = chosen(evidence, told)
-            known = support(told_of, scene.means, sums, view.camera, config)
+            known = support(told_of, sums, view.camera, config)
             areas.append(roc(believed_alpha(frozen, known), wrong))
         share = wrong.float().mean().item()
         print(f"{frame}: wrong {share:.3f}, by all others {areas[0]:.3f}, trained {areas[1]:.3f}")
@@ -79,7 +79,8 @@ def find(scene: Gaussians, views: Sequence[View], trained: Sequence[int]) -> Non
 
 def chosen(evidence: Evidence, told: list[int]) -> Evidence:
     """What some of the photographs say."""
-    return Evidence(evidence.centers[told], evidence.areas[told], evidence.agreement[told])
+    parts = (evidence.centers, evidence.areas, evidence.agreement)
+    return Evidence(evidence.proxy, *(part[told] for part in parts))
 
 
 def roc(believed: Tensor, wrong: Tensor) -> float:
