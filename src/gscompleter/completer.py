@@ -441,7 +441,7 @@ class GSCompleter:
     ) -> tuple[Gaussians, tuple[float, ...]]:
         """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
-        watching, allowed = photographs_of(completion), completion.allowed_errors
+        watching, allowed = completion.photographs, completion.allowed_errors
         frozen = self.watching(completion)
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
@@ -541,7 +541,7 @@ class GSCompleter:
     def doubted(self, completion: Completion) -> Completion:
         """`completion` of a scene that was brought, before any target, and what the photographs
         show of it where it is doubted."""
-        views, config = photographs_of(completion), self.config.support
+        views, config = completion.photographs, self.config.support
         proxy = proxy_of(completion.scene, [view.camera for view in views])
         completion = replace(completion, proxy=proxy.scene)
         if not config.doubts:
@@ -570,7 +570,7 @@ class GSCompleter:
 
     def not_needed(self, completion: Completion, doubtful: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """The `doubtful` Gaussians of the scene as it stands that no photograph needs."""
-        views, rest = photographs_of(completion), completion.scene[~doubtful]
+        views, rest = completion.photographs, completion.scene[~doubtful]
         seen = proxy_of(rest, [view.camera for view in views]).scene
         shown = [rest] * len(completion.views) + [seen] * len(completion.witnesses)
         around = (
@@ -622,7 +622,7 @@ class GSCompleter:
     def allowed_errors(self, completion: Completion) -> tuple[float, ...]:
         """Largest mean squared error that each photograph may have once all is done."""
         tolerance = 0.0 if completion.evidence is not None else self.config.harm.tolerance or 0.0
-        watching = photographs_of(completion)
+        watching = completion.photographs
         return tuple(
             error_with_loss(
                 squared_error(v.compared(r.image), v.image).item(), max(tolerance, ROUNDING)
@@ -658,13 +658,8 @@ def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:
     rows = rows_in_context(completion, taken[: completion.num_kept].nonzero()[:, 0])
     aside, scene = aside.index_fill(0, rows, True), completion.scene[~taken]
     completion = replace(completion, scene=scene, set_aside=aside)
-    cameras = [view.camera for view in photographs_of(completion)]
+    cameras = [view.camera for view in completion.photographs]
     return replace(completion, proxy=proxy_of(scene[: completion.num_kept], cameras).scene)
-
-
-def photographs_of(completion: Completion) -> tuple[View, ...]:
-    """All that are compared with the scene."""
-    return (*completion.views, *completion.witnesses)
 
 
 def in_context(completion: Completion, values: Float[Tensor, "kept"]) -> Float[Tensor, "n"]:

@@ -83,7 +83,7 @@ def _refuse_beyond_memory(
 
 def scene_bytes(count: int, numbers: int, contexts: int, photographs: Sequence[int]) -> int:
     """About how much memory a scene that was brought takes besides, at most. Measured with 30
-    photographs: 4.6 GB in all for a million Gaussians, 5.2 for 4 and 10.4 for 10 million.
+    photographs: 2.7 GB in all for a million Gaussians, 4.1 for 4 and 7.4 for 10 million.
 
     Args:
         count: Its Gaussians.

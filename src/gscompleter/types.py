@@ -454,6 +454,11 @@ class Completion:
     without them; None for none."""
 
     @property
+    def photographs(self) -> tuple[View, ...]:
+        """All that the scene is compared with: `views`, then `witnesses`."""
+        return (*self.views, *self.witnesses)
+
+    @property
     def num_kept(self) -> int:
         """How many Gaussians of the context the scene begins with."""
         return len(self.context) - (0 if self.set_aside is None else int(self.set_aside.sum()))

@@ -13,6 +13,10 @@ BLOCK = 4096
 """Gaussians, one after the other, that are cut into runs by themselves."""
 OPAQUE = np.float32(0.9999)
 """Opacity beyond which nothing gets more opaque; the logarithm of what is let through is finite."""
+MOST_FULL = np.float32(4.6)
+"""Thickness beyond which something hardly gets wider: its opacity is 0.99."""
+NONE = np.float32(1e-30)
+"""What is divided by instead of 0."""
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -55,17 +59,23 @@ def _cross_section(scales, i):
     return max(a * b, b * c, c * a)
 
 
+@njit(cache=True, fastmath={"contract"})
+def _thickness(opacity):
+    """The t of which exp(-t) is let through."""
+    return -math.log(np.float32(1) - min(opacity, OPAQUE))
+
+
 @njit(cache=True)
 def _fullness(thickness):
     """The area of 1 - exp(-thickness g), as a share of that of a Gaussian g of the same peak."""
-    return np.float32(1) + np.float32(0.25) * min(thickness, np.float32(4.6))
+    return np.float32(1) + np.float32(0.25) * min(thickness, MOST_FULL)
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _rotation(quats, i):
-    """The rotated axes of Gaussian i as columns [3, 3]."""
+    """The rotated axes of Gaussian i as columns [3][3]."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
-    inverse = np.float32(1) / math.sqrt(max(w * w + x * x + y * y + z * z, np.float32(1e-30)))
+    inverse = np.float32(1) / math.sqrt(max(w * w + x * x + y * y + z * z, NONE))
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     one, two = np.float32(1), np.float32(2)
     return (
@@ -75,66 +85,80 @@ def _rotation(quats, i):
     )
 
 
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _share_out(first, last, scales, opacities, shares):
+    """How much each Gaussian of first..last is of them, by what it lets through and covers; which
+    is most, and what all of them are together."""
+    total, most = np.float32(0), first
+    for i in range(first, last):
+        shares[i] = _thickness(opacities[i]) * _cross_section(scales, i)
+        total += shares[i]
+        if shares[i] > shares[most]:
+            most = i
+    for i in range(first, last):
+        alike = np.float32(1) / np.float32(last - first)
+        shares[i] = shares[i] / total if total > np.float32(0) else alike
+    return most, total
+
+
+@njit(cache=True, fastmath={"contract"})
+def _mean(first, last, shares, values, mean):
+    """Write the mean of values[first:last] by shares; it is told from the first of them."""
+    for column in range(len(mean)):
+        begun = values[first, column]
+        away = np.float32(0)
+        for i in range(first, last):
+            away += shares[i] * (values[i, column] - begun)
+        mean[column] = begun + away
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _variance(first, last, shares, means, quats, scales, mean, axis):
+    """Of Gaussians first..last together about `mean` along a unit `axis`."""
+    ax, ay, az = axis
+    variance = np.float32(0)
+    for i in range(first, last):
+        dx, dy, dz = means[i, 0] - mean[0], means[i, 1] - mean[1], means[i, 2] - mean[2]
+        squares = (ax * dx + ay * dy + az * dz) ** 2
+        own = _rotation(quats, i)
+        for k in range(3):
+            along = (ax * own[0][k] + ay * own[1][k] + az * own[2][k]) * scales[i, k]
+            squares += along * along
+        variance += shares[i] * squares
+    return variance
+
+
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def stand_for(begin, end, start, given, shares, found):
     """One Gaussian for each of the runs begin..end, and the share of each Gaussian in its run.
 
-    It is as opaque as all of them together, lies where they lie in the mean, has the mean of their
-    colours, and their spread along the axes of the one that counts most.
+    It lets through what all of them let through together, lies where they lie in the mean, has the
+    mean of their colours, and their spread along the axes of the one that counts most. What is
+    thicker is wider, too: 1 - exp(-t g) falls more slowly than g.
 
     start [m + 1] int64: where each run starts, and the end.
-    given: means [n, 3], quats [n, 4], scales [n, 3], opacities [n], sh [n, k, 3] float32.
+    given: means [n, 3], quats [n, 4], scales [n, 3], opacities [n], sh [n, 3 k] float32.
     shares [n] float32, and found, the same as `given` of [m], are written.
     """
     means, quats, scales, opacities, sh = given
     to_means, to_quats, to_scales, to_opacities, to_sh = found
     for run in range(begin, end):
         first, last = start[run], start[run + 1]
-        total, most = np.float32(0), first
-        for i in range(first, last):
-            thickness = -math.log(np.float32(1) - min(opacities[i], OPAQUE))
-            shares[i] = thickness * _cross_section(scales, i)
-            total += shares[i]
-            if shares[i] > shares[most]:
-                most = i
-        for i in range(first, last):
-            even = np.float32(1) / np.float32(last - first)
-            shares[i] = shares[i] / total if total > np.float32(0) else even
+        most, total = _share_out(first, last, scales, opacities, shares)
+        _mean(first, last, shares, means, to_means[run])
+        _mean(first, last, shares, sh, to_sh[run])
         to_quats[run] = quats[most]
         if last - first == 1:
-            to_means[run], to_scales[run] = means[first], scales[first]
-            to_opacities[run], to_sh[run] = opacities[first], sh[first]
+            to_scales[run], to_opacities[run] = scales[first], opacities[first]
             continue
-        x, y, z = np.float32(0), np.float32(0), np.float32(0)
-        to_sh[run] = np.float32(0)
-        for i in range(first, last):
-            x += shares[i] * (means[i, 0] - means[first, 0])
-            y += shares[i] * (means[i, 1] - means[first, 1])
-            z += shares[i] * (means[i, 2] - means[first, 2])
-            for band in range(sh.shape[1]):
-                for colour in range(3):
-                    to_sh[run, band, colour] += shares[i] * sh[i, band, colour]
-        to_means[run, 0] = means[first, 0] + x
-        to_means[run, 1] = means[first, 1] + y
-        to_means[run, 2] = means[first, 2] + z
         axes = _rotation(quats, most)
-        for axis in range(3):
-            ax, ay, az = axes[0][axis], axes[1][axis], axes[2][axis]
-            variance = np.float32(0)
-            for i in range(first, last):
-                own = _rotation(quats, i)
-                dx = means[i, 0] - to_means[run, 0]
-                dy = means[i, 1] - to_means[run, 1]
-                dz = means[i, 2] - to_means[run, 2]
-                spread = (ax * dx + ay * dy + az * dz) ** 2
-                for k in range(3):
-                    along = (ax * own[0][k] + ay * own[1][k] + az * own[2][k]) * scales[i, k]
-                    spread += along * along
-                variance += shares[i] * spread
-            to_scales[run, axis] = math.sqrt(variance)
-        thickness = total / max(_cross_section(to_scales, run), np.float32(1e-30))
-        to_opacities[run] = min(-math.expm1(-thickness), OPAQUE)
-        own = np.float32(0)
+        for k in range(3):
+            axis = axes[0][k], axes[1][k], axes[2][k]
+            seen = (means, quats, scales, to_means[run], axis)
+            to_scales[run, k] = math.sqrt(_variance(first, last, shares, *seen))
+        thickness = total / max(_cross_section(to_scales, run), NONE)
+        before = np.float32(0)
         for i in range(first, last):
-            own -= shares[i] * math.log(np.float32(1) - min(opacities[i], OPAQUE))
-        to_scales[run] *= math.sqrt(_fullness(thickness) / _fullness(own))
+            before += shares[i] * _thickness(opacities[i])
+        to_scales[run] *= math.sqrt(_fullness(thickness) / _fullness(before))
+        to_opacities[run] = min(-math.expm1(-thickness), OPAQUE)

@@ -30,8 +30,8 @@ LARGEST = 2.0
 are compared over more than that."""
 MAX_GROWTH = 8.0
 """By how much both grow at most where the proxy would be too large otherwise."""
-FIELDS = ("means", "quats", "scales", "opacities", "sh")
-"""Of Gaussians, as the kernels want them."""
+FIELDS = ("means", "quats", "scales", "opacities")
+"""Of Gaussians, what the kernels want as it is."""
 
 
 def proxy_of(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
@@ -49,16 +49,16 @@ def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
 
     There are as few runs as views of `cameras` have room for. In a random order there are none.
     """
-    given = tuple(float32(getattr(scene, name)) for name in FIELDS)
+    given = (*(float32(getattr(scene, name)) for name in FIELDS), float32(scene.sh.flatten(1)))
     start = starts_of_runs(given[0], given[2], cameras)
     found = tuple(np.empty((len(start) - 1, *array.shape[1:]), np.float32) for array in given)
     shares = np.empty(len(scene), np.float32)
     share(kernels.stand_for, len(start) - 1, start, given, shares, found)
-    parts = dict(zip(FIELDS, map(torch.from_numpy, found), strict=True))
+    means, quats, scales, opacities, sh = map(torch.from_numpy, found)
     first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
-    stand_ins = Gaussians(**parts, generated=scene.generated[first])
-    return Proxy(stand_ins, run, torch.from_numpy(shares))
+    looks = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
+    return Proxy(Gaussians(means, quats, scales, *looks), run, torch.from_numpy(shares))
 
 
 def starts_of_runs(
