@@ -139,12 +139,11 @@ def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
     Relief is a promise of first order. Where it cannot be enough, the worst go first and the rest
     are judged anew without them.
     """
-    order = relief.argsort(descending=True, stable=True)
-    positive = relief[order].clamp_min(0)
-    enough = min(needed, positive.sum().item() / 2)
-    chosen = torch.zeros_like(relief, dtype=torch.bool)
-    chosen[order] = (positive.cumsum(0) - positive < enough) & (positive > 0)
-    return chosen
+    helpful = (relief > 0).nonzero()[:, 0]
+    most_first, order = relief[helpful].sort(descending=True, stable=True)
+    enough = min(needed, most_first.sum().item() / 2)
+    taken = helpful[order[most_first.cumsum(0) - most_first < enough]]
+    return torch.zeros_like(relief, dtype=torch.bool).index_fill(0, taken, True)
 
 
 def error_slope(
