@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
@@ -172,8 +172,17 @@ def _begins_with(scene: Gaussians, context: ndarray) -> bool:
 
 def _fill(rows: ndarray, values: ndarray) -> None:
     """Set those columns of `rows` that `values` has, too."""
+    if values.dtype.descr == rows.dtype.descr[: len(values.dtype.descr)]:
+        # A column at a time takes ten times as long where there are many.
+        _as_bytes(rows)[:, : values.dtype.itemsize] = _as_bytes(np.ascontiguousarray(values))
+        return
     for name in set(rows.dtype.names or ()) & set(values.dtype.names or ()):
         rows[name] = values[name]
+
+
+def _as_bytes(rows: ndarray) -> UInt8[ndarray, "n bytes"]:
+    """The bytes of each row, where they lie."""
+    return rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)
 
 
 def _labelled_header(layout: Layout) -> bytes:

@@ -49,7 +49,8 @@ def curve_order(
     code = np.zeros(len(cells), np.uint64)
     for axis in range(3):
         code |= spread(cells[:, axis]) << np.uint64(axis)
-    return torch.from_numpy(code.argsort(kind="stable"))
+    # torch sorts in a third of the time. The codes have 63 bits, which leaves the sign.
+    return torch.from_numpy(code.view(np.int64)).argsort(stable=True)
 
 
 def spread(numbers: UInt64[ndarray, "n"]) -> UInt64[ndarray, "n"]:
