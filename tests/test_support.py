@@ -10,7 +10,13 @@ import torch
 
 from command import run
 from gscompleter.completer import GSCompleter
-from gscompleter.config import CompleterConfig, ReconcileConfig, SupportConfig
+from gscompleter.config import (
+    AffineConfig,
+    CompleterConfig,
+    ReconcileConfig,
+    RegistrationConfig,
+    SupportConfig,
+)
 from gscompleter.geometry import inside, project
 from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.memory import needed_bytes
@@ -136,6 +142,38 @@ def test_shreds_give_way_to_what_belongs_there():
         before = psnr(RENDERER.render(SCENE, view.camera).image, view.image)
         after = psnr(RENDERER.render(completion.scene, view.camera).image, view.image)
         assert after > before - 0.05
+
+
+class NearReconstructor:
+    """All that it makes stands a fifth too near."""
+
+    def __call__(self, views):
+        depths = [0.8 * view_of(Room(), view.camera).depth for view in views]
+        return reconstruction_of(views, depths)
+
+
+def test_closing_a_hole_makes_up_for_nothing_that_was_good():
+    """Half of the room is missing at every photograph, too, which all gain by what is added."""
+    half = SURFACES[SURFACES.means[:, 0] < 0.3]
+    paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
+    unmended = RegistrationConfig(affine=AffineConfig(bridge="none"), iterations=0)
+    config = CompleterConfig(registration=unmended)
+    completer = GSCompleter(NearReconstructor(), paint, config=config)
+    completion = completer(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
+    assert len(completion.targets[0].added) > 0
+    gained = []
+    for view, judge in zip(completion.photographs, completion.judges, strict=True):
+        before, after = (RENDERER.render(g, view.camera) for g in (half, completion.scene))
+        holes = before.alpha < 0.5
+        assert holes.float().mean() > 0.05
+        assert torch.equal(judge.ignored, holes)
+        errors = [
+            (render.image.clamp(0, 1) - view.image).square().mean(dim=-1)
+            for render in (before, after)
+        ]
+        assert errors[1][~holes].sum() <= errors[0][~holes].sum() * 1.001
+        gained.append((errors[0] - errors[1])[holes].sum().item())
+    assert max(gained) > 0
 
 
 def test_without_its_photographs_a_scene_is_taken_as_it_is():

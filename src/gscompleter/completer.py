@@ -229,8 +229,8 @@ class GSCompleter:
                 completion = self.wary_of_what_moved(completion)
             if scene is not None and witnesses is not None:
                 completion = self.doubted(completion)
-            allowed = self.allowed_errors(completion)
-        return replace(completion, allowed_errors=allowed, seconds=clock.seconds)
+            completion = self.judged(completion)
+        return replace(completion, seconds=clock.seconds)
 
     def advance(
         self, completion: Completion, target: Camera, reference: Synthesized | None = None
@@ -441,7 +441,7 @@ class GSCompleter:
     ) -> tuple[Gaussians, tuple[float, ...]]:
         """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
-        watching, allowed = completion.photographs, completion.allowed_errors
+        judges, allowed = completion.judges, completion.allowed_errors
         frozen = self.watching(completion)
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
@@ -458,10 +458,10 @@ class GSCompleter:
             settings = config.reconcile.at_most(degree)
             plans = [view.plan_appearance(kept) for view in frozen]
             refined, losses = reconcile(
-                kept, sight.frozen, reference, holes, plans, watching, allowed, settings
+                kept, sight.frozen, reference, holes, plans, judges, allowed, settings
             )
             drawings = [in_colours(plan, refined.sh) for plan in plans]
-        return do_no_harm(refined, frozen, watching, allowed, config.harm, drawings), losses
+        return do_no_harm(refined, frozen, judges, allowed, config.harm, drawings), losses
 
     def sight(self, completion: Completion, target: Camera, wide: Camera | None = None) -> Sight:
         """The scene as it stands, frozen at the target's wider camera, and the target's anchor.
@@ -619,16 +619,19 @@ class GSCompleter:
             ),
         )
 
-    def allowed_errors(self, completion: Completion) -> tuple[float, ...]:
-        """Largest mean squared error that each photograph may have once all is done."""
+    def judged(self, completion: Completion) -> Completion:
+        """`completion` before any target, with what its photographs ask of whatever is added."""
         tolerance = 0.0 if completion.evidence is not None else self.config.harm.tolerance or 0.0
-        watching = completion.photographs
-        return tuple(
-            error_with_loss(
-                squared_error(v.compared(r.image), v.image).item(), max(tolerance, ROUNDING)
-            )
-            for r, v in zip(contexts_of(self.watching(completion)), watching, strict=True)
+        drawn, loss = contexts_of(self.watching(completion)), max(tolerance, ROUNDING)
+        judges = tuple(
+            ignoring(view, hole_mask(render.alpha, self.config.holes))
+            for view, render in zip(completion.photographs, drawn, strict=True)
         )
+        allowed = tuple(
+            error_with_loss(squared_error(v.compared(r.image), v.image).item(), loss)
+            for r, v in zip(drawn, judges, strict=True)
+        )
+        return replace(completion, judges=judges, allowed_errors=allowed)
 
     def at(self, completion: Completion, views: Sequence[View]) -> tuple[FrozenView, ...]:
         """The scene as it stands, frozen at the cameras of photographs."""
@@ -648,6 +651,13 @@ class GSCompleter:
 def ranged(view: View, near: float, far: float) -> View:
     """`view` with a depth range."""
     return replace(view, camera=replace(view.camera, near=near, far=far))
+
+
+def ignoring(view: View, where: Bool[Tensor, "h w"]) -> View:
+    """`view`, which is ignored `where` it is told, too."""
+    if not where.any():
+        return view
+    return replace(view, ignored=where if view.ignored is None else view.ignored | where)
 
 
 def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:

@@ -431,8 +431,7 @@ class Completion:
     """The photographs, with the depth range that the completion works in, in the exposure of the
     context where Ψ evened theirs out."""
     allowed_errors: tuple[float, ...]
-    """Largest mean squared error that each photograph may have, whatever is added: of `views`, then
-    of `witnesses`."""
+    """Largest mean squared error that each of `judges` may have, whatever is added."""
     targets: tuple[TargetCompletion, ...]
     """What happened so far, in the order of the targets."""
     seconds: Mapping[str, float]
@@ -445,6 +444,9 @@ class Completion:
     gains: Float[Tensor, "v 3"] | None = None
     """By how much each photograph, as it was taken, is brighter than in `views`, by channel; None
     where exposures were not evened out."""
+    judges: tuple[View, ...] = ()
+    """`views`, then `witnesses`, as they are held against the scene whatever is added: where this
+    has a hole at first they are ignored, so that nothing makes up for what was good."""
     proxy: Gaussians | None = None
     """What of the context the scene begins with, as `witnesses` see it; None for itself."""
     evidence: Evidence | None = None
