@@ -495,8 +495,9 @@ def test_a_frozen_view_tells_what_it_shows_of_each_gaussian(name, freeze):
     ours, truth = view.sums(layers), plain.sums(layers)
     assert (ours - truth).abs().max() <= ROUNDING * truth.abs().max()
     assert truth.count_nonzero() > 0
-    colours = torch.rand((len(truth), 3), generator=torch.Generator().manual_seed(1))
-    ours, truth = view.repainted(colours), plain.repainted(colours)
+    values = torch.rand(len(truth), generator=torch.Generator().manual_seed(1))
+    ours, truth = view.blended(values), plain.blended(values)
+    assert ours.shape == (CAMERA.height, CAMERA.width)
     assert (ours - truth).abs().max() <= ROUNDING * truth.abs().max()
 
 

@@ -73,8 +73,9 @@ class FrozenView(Protocol):
         """For each Gaussian of the context, the sum over the image of each layer times the
         Gaussian's compositing weight."""
 
-    def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-        """The image of the context in other colours, from 0 up."""
+    def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+        """The sum over the Gaussians of the context of compositing weight times value, from 0
+        up."""
 
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; differentiable in `new`."""

@@ -114,12 +114,12 @@ class CpuView:
         run(lists.sum_by_name, calls, self.viewpoint.threads)
         return torch.from_numpy(totals)
 
-    def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-        """The lists that are kept, drawn once more."""
+    def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+        """The lists that are kept, drawn once more with the values for red."""
         splats = self.layer.splats.copy()
-        splats[:, rasterizer.RED :] = np.maximum(float32(colours)[self.rows], 0)
+        splats[:, rasterizer.RED] = np.maximum(float32(values)[self.rows], 0)
         frame = self.viewpoint.composite(self.viewpoint.empty(), self.layer._replace(splats=splats))
-        return torch.from_numpy(frame.image)
+        return torch.from_numpy(frame.image[..., 0].copy())
 
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; only `new` is projected, sorted and binned."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from gscompleter.errors import InputError
 from gscompleter.geometry import at_depths
 from gscompleter.render import AppearanceRender, ColourErrors, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import errors_by_slopes, looking, painted, sums_by_slopes
+from gscompleter.render.painting import errors_by_slopes, grey, looking, painted, sums_by_slopes
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -177,9 +177,9 @@ class CudaView:
             0, self.rows[self.reaching], sums_by_slopes(self._painted, self.seen, layers)
         )
 
-    def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+    def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """What is seen, drawn once more."""
-        return self._painted(colours[self.rows[self.reaching]])
+        return self._painted(grey(values[self.rows[self.reaching]]))[..., 0]
 
     def _painted(self, colours: Float[Tensor, "seen 3"]) -> Float[Tensor, "h w 3"]:
         return self.drawing.render(painted(self.seen, colours), self.camera).image

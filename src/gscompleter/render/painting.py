@@ -18,6 +18,11 @@ def painted(gaussians: Gaussians, colours: Float[Tensor, "n 3"]) -> Gaussians:
     return replace(gaussians, sh=sh_from_rgb(colours), encoded=None)
 
 
+def grey(values: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+    """Colours that have each value in all three channels."""
+    return values[:, None].expand(-1, 3)
+
+
 def looking(
     gaussians: Gaussians, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
 ) -> Gaussians:

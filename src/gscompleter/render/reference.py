@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gscompleter.geometry import at_depths, rotations_from
 from gscompleter.render import AppearanceRender, ColourErrors, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import errors_by_slopes, looking, painted, sums_by_slopes
+from gscompleter.render.painting import errors_by_slopes, grey, looking, painted, sums_by_slopes
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -76,8 +76,8 @@ class ReferenceView:
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         return sums_by_slopes(self._painted, self.scene, layers)
 
-    def repainted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-        return self._painted(colours)
+    def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+        return self._painted(grey(values))[..., 0]
 
     def _painted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
         return self.renderer.render(painted(self.scene, colours), self.camera).image

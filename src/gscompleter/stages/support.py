@@ -125,7 +125,7 @@ def weight_sums(frozen: FrozenView) -> Float[Tensor, "n"]:
 
 def believed_alpha(frozen: FrozenView, support: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
     """Alpha of a scene from a camera, each of its n Gaussians counted by its support."""
-    return torch.minimum(blurred(composited(support, frozen)), frozen.context.alpha)
+    return torch.minimum(blurred(frozen.blended(support)), frozen.context.alpha)
 
 
 def front(scene: Gaussians, frozen: FrozenView, camera: Camera) -> Float[Tensor, "h w"]:
@@ -141,15 +141,10 @@ def front(scene: Gaussians, frozen: FrozenView, camera: Camera) -> Float[Tensor,
     """
     drawn, z = frozen.context, z_depths(scene.means, camera).clamp_min(0.0)
     unit = drawn.depth.max().clamp_min(1e-12)
-    squares = composited((z / unit).clamp_max(2.0) ** 2, frozen)
+    squares = frozen.blended((z / unit).clamp_max(2.0) ** 2)
     mean = drawn.depth / unit
     spread = (squares / drawn.alpha.clamp_min(1e-6) - mean**2).clamp_min(0.0).sqrt()
     return unit * (mean - STANDOFF * spread).clamp_min(0.1 * mean)
-
-
-def composited(values: Float[Tensor, "n"], frozen: FrozenView) -> Float[Tensor, "h w"]:
-    """The sum over the Gaussians of compositing weight times value, from 0 up."""
-    return frozen.repainted(values[:, None].expand(-1, 3))[..., 0]
 
 
 def pixel_areas(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n"]:
