@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig, RegistrationConfig
@@ -532,10 +532,11 @@ class GSCompleter:
     ) -> Float[Tensor, "n"]:
         """Support of the scene as it stands, as `camera` sees it. What was added has it all, and so
         has what it does not see."""
-        sums, aside = weight_sums(frozen), completion.set_aside
-        values, seen = torch.ones_like(sums), in_context(completion, sums[: completion.num_kept])
+        sums, kept = weight_sums(frozen), completion.num_kept
+        seen = in_context(completion, sums[:kept])
         found = support(evidence, seen, camera, self.config.support)
-        values[: completion.num_kept] = found if aside is None else found[~aside]
+        values = torch.ones_like(sums)
+        values[:kept] = of_kept(completion, found)
         return values
 
     def doubted(self, completion: Completion) -> Completion:
@@ -592,9 +593,7 @@ class GSCompleter:
         of_context = (covering > MIN_COVER) & (scene.generated == 0)
         kept = completion.num_kept
         seen = shown(evidence, in_context(completion, sums[:kept]), camera)
-        aside = completion.set_aside
-        unseen = (seen if aside is None else seen[~aside]) < UNSEEN
-        of_context[:kept] &= unseen
+        of_context[:kept] &= of_kept(completion, seen) < UNSEEN
         of_context[kept:] = False
         return of_context
 
@@ -662,17 +661,14 @@ def ignoring(view: View, where: Bool[Tensor, "h w"]) -> View:
 
 def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:
     """`completion` with more of its context set aside: `taken` of the Gaussians of its scene."""
-    aside = completion.set_aside
-    if aside is None:
-        aside = torch.zeros(len(completion.context), dtype=torch.bool, device=taken.device)
-    rows = rows_in_context(completion, taken[: completion.num_kept].nonzero()[:, 0])
-    aside, scene = aside.index_fill(0, rows, True), completion.scene[~taken]
+    before, gone = completion.set_aside, in_context(completion, taken[: completion.num_kept])
+    aside, scene = gone if before is None else before | gone, completion.scene[~taken]
     completion = replace(completion, scene=scene, set_aside=aside)
     cameras = [view.camera for view in completion.photographs]
     return replace(completion, proxy=proxy_of(scene[: completion.num_kept], cameras).scene)
 
 
-def in_context(completion: Completion, values: Float[Tensor, "kept"]) -> Float[Tensor, "n"]:
+def in_context(completion: Completion, values: Shaped[Tensor, "kept"]) -> Shaped[Tensor, "n"]:
     """Values of what the scene keeps of its context, as values of all of this; 0 of the others."""
     aside = completion.set_aside
     if aside is None:
@@ -680,10 +676,10 @@ def in_context(completion: Completion, values: Float[Tensor, "kept"]) -> Float[T
     return values.new_zeros(len(aside)).masked_scatter(~aside, values)
 
 
-def rows_in_context(completion: Completion, rows: Int64[Tensor, "m"]) -> Int64[Tensor, "m"]:
-    """Which Gaussians of the context some are that the scene as it stands begins with."""
+def of_kept(completion: Completion, values: Shaped[Tensor, "n"]) -> Shaped[Tensor, "kept"]:
+    """Values of all of the context, as values of what the scene keeps of it."""
     aside = completion.set_aside
-    return rows if aside is None else (~aside).nonzero()[:, 0][rows]
+    return values if aside is None else values[~aside]
 
 
 def check_numbers(scene: Gaussians | None, num_targets: int) -> None:

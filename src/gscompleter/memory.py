@@ -93,7 +93,7 @@ def scene_bytes(count: int, numbers: int, contexts: int, photographs: Sequence[i
     """
     number = len(photographs)
     drawn = min(count, most_that_fit(number))
-    views = number * drawn * BYTES_PER_SPLAT + contexts * (count - drawn) * BYTES_PER_SPLAT
+    views = (number * drawn + contexts * (count - drawn)) * BYTES_PER_SPLAT
     told = 2 * 4 * number * drawn  # how much of each the photographs show, and how they agree
     fitted = BYTES_PER_PIXEL_OF_A_WITNESS * sum(photographs)
     return count * (2 * 4 * numbers + FREEZING_BYTES) + views + told + fitted

@@ -137,8 +137,8 @@ def stand_for(begin, end, start, given, shares, found):
     thicker is wider, too: 1 - exp(-t g) falls more slowly than g.
 
     start [m + 1] int64: where each run starts, and the end.
-    given: means [n, 3], quats [n, 4], scales [n, 3], opacities [n], sh [n, 3 k] float32.
-    shares [n] float32, and found, the same as `given` of [m], are written.
+    given: GaussianArrays of n, with sh [n, 3 k].
+    shares [n] float32, and found, the same as `given` of m, are written.
     """
     means, quats, scales, opacities, sh = given
     to_means, to_quats, to_scales, to_opacities, to_sh = found

@@ -20,7 +20,6 @@ from torch.autograd.function import once_differentiable
 from gscompleter.kernels import lists
 from gscompleter.kernels import rasterizer as kernels
 from gscompleter.kernels.rasterizer import Fragments
-from gscompleter.kernels.sharing import share
 
 if TYPE_CHECKING:
     from gscompleter.render.cpu import Binned, CpuView, Viewpoint
@@ -145,7 +144,7 @@ def folded(view: CpuView, binned: Binned, means: Float32[ndarray, "n 3"]) -> Fol
     counts = np.empty((len(tiles), 2), np.int64)
     known = (context, new, binned.slots, room)
     viewpoint.share(kernels.find_fragments, len(tiles), *known, found, counts)
-    fragments, solid = with_solid(packed(found, room, counts), context.splats)
+    fragments, solid = with_solid(packed(viewpoint, found, room, counts), context.splats)
     return Folded(viewpoint, view.frame.image, binned, means, fragments, solid)
 
 
@@ -161,7 +160,10 @@ def with_solid(
 
 
 def packed(
-    found: Fragments, room: Int64[ndarray, "bounds 2"], counts: Int64[ndarray, "tiles 2"]
+    viewpoint: Viewpoint,
+    found: Fragments,
+    room: Int64[ndarray, "bounds 2"],
+    counts: Int64[ndarray, "tiles 2"],
 ) -> Fragments:
     """The fragments that were found, without the room between them."""
     ends = np.concatenate([np.zeros((1, 2), np.int64), counts.cumsum(axis=0)])
@@ -178,7 +180,7 @@ def packed(
         found.behind,
     )
     left.start[-1] = count
-    share(lists.pack_fragments, len(found.tiles), room, ends, found, left)
+    viewpoint.share(lists.pack_fragments, len(found.tiles), room, ends, found, left)
     return left
 
 

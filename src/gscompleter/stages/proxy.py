@@ -16,13 +16,14 @@ from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gscompleter.kernels import runs as kernels
+from gscompleter.kernels.rasterizer import GaussianArrays
 from gscompleter.kernels.sharing import share
 from gscompleter.memory import most_that_fit
+from gscompleter.render.cpu import arrays_of
 from gscompleter.render.folded import float32
+from gscompleter.splats.order import WORTH
 from gscompleter.types import Camera, Gaussians, Proxy
 
-WORTH = 500_000
-"""Gaussians from which on a proxy saves more than it takes to make."""
 REACH = 0.5
 """Pixels from the first Gaussian of a run to any other."""
 LARGEST = 2.0
@@ -30,12 +31,11 @@ LARGEST = 2.0
 are compared over more than that."""
 MAX_GROWTH = 8.0
 """By how much both grow at most where the proxy would be too large otherwise."""
-FIELDS = ("means", "quats", "scales", "opacities")
-"""Of Gaussians, what the kernels want as it is."""
 
 
 def proxy_of(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
-    """What `cameras` see of `scene`, drawn with fewer Gaussians where it has very many.
+    """What `cameras` see of `scene`, drawn with fewer Gaussians where it has so many that it lies
+    in order.
 
     One on a GPU stays as it is, which has no need of it.
     """
@@ -49,11 +49,12 @@ def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
 
     There are as few runs as views of `cameras` have room for. In a random order there are none.
     """
-    given = (*(float32(getattr(scene, name)) for name in FIELDS), float32(scene.sh.flatten(1)))
-    start = starts_of_runs(given[0], given[2], cameras)
-    found = tuple(np.empty((len(start) - 1, *array.shape[1:]), np.float32) for array in given)
+    given = arrays_of(scene)
+    given = given._replace(sh=given.sh.reshape(len(scene), -1))
+    start = starts_of_runs(given.means, given.scales, cameras)
+    found = [np.empty((len(start) - 1, *array.shape[1:]), np.float32) for array in given]
     shares = np.empty(len(scene), np.float32)
-    share(kernels.stand_for, len(start) - 1, start, given, shares, found)
+    share(kernels.stand_for, len(start) - 1, start, given, shares, GaussianArrays(*found))
     means, quats, scales, opacities, sh = map(torch.from_numpy, found)
     first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
