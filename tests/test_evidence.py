@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -13,20 +11,19 @@ from gscompleter.geometry import z_depths
 from gscompleter.kernels.evidence import BLOCK, LEAST
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.stages.support import ENOUGH, gather_evidence, support
-from gscompleter.types import Evidence, Proxy, View
+from gscompleter.types import Evidence, View
 from scenes import camera_at, random_gaussians
 
 
 def some_evidence(n: int, k: int) -> tuple[Evidence, torch.Tensor, torch.Tensor]:
     """Of n Gaussians and k photographs, with the means and what a camera sees; a third of each is
     nothing."""
-    random, scene = torch.Generator().manual_seed(0), random_gaussians(n)
+    random = torch.Generator().manual_seed(0)
     centers, means = torch.randn(k, 3, generator=random), torch.randn(n, 3, generator=random)
     areas, agreement = torch.rand(2, k, n, generator=random)
     areas = (areas - 0.3).clamp_min(0.0)
     sums = (torch.rand(n, generator=random) - 0.3).clamp_min(0.0)
-    proxy = Proxy(replace(scene, means=means))
-    return Evidence(proxy, centers, areas, agreement * (areas > 0)), means, sums
+    return Evidence(means, centers, areas, agreement * (areas > 0)), means, sums
 
 
 def expected_support(evidence, means, sums, camera, config):
@@ -63,7 +60,7 @@ def test_evidence_is_what_the_slopes_of_a_drawing_say():
     scene, camera = random_gaussians(60, sh_degree=0), camera_at(size=40)
     frozen = CpuRenderer().freeze(scene, camera)
     view = View(torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(1)), camera)
-    evidence = gather_evidence(Proxy(scene), [view], [frozen], SupportConfig())
+    evidence = gather_evidence(scene, [view], [frozen], SupportConfig())
     sums = frozen.sums(torch.ones(40, 40, 3))[:, 0]
     z = z_depths(scene.means, camera).clamp_min(0.0)
     areas = sums * z**2 / (camera.K[0, 0] * camera.K[1, 1])

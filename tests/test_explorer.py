@@ -121,7 +121,7 @@ def test_stand_ins_close_the_hole_and_hide_nothing():
 
 def test_a_miniature_covers_what_the_scene_covers(begun):
     small = miniature(begun, 3000)
-    assert len(small.scene) <= 3000 < len(begun.scene)
+    assert len(small.drawn) <= 3000 < len(begun.drawn)
     renderer = load_renderer("cpu")
     aside = held_out_cameras(cameras(), seed=3, count=8)
     shares = [

@@ -19,7 +19,7 @@ from gscompleter.stages import proxy as proxies
 from gscompleter.stages.exploration import thinned_evidence
 from gscompleter.stages.proxy import LARGEST, REACH, proxy_of, run_by_run
 from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
-from gscompleter.types import Evidence, Gaussians, Proxy, merge
+from gscompleter.types import Evidence, Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, reconstruction_of, view_of
 
 RENDERER = load_renderer("cpu")
@@ -45,11 +45,10 @@ def pixel_at(scene: Gaussians) -> torch.Tensor:
 
 
 def test_a_small_scene_is_its_own_proxy():
-    proxy = proxy_of(ROOM, CAMERAS)
-    assert proxy.scene is ROOM
-    values = torch.rand(len(ROOM))
-    assert proxy.summed(values) is values
-    assert proxy.spread(values) is values
+    assert proxy_of(ROOM, CAMERAS) is None
+    completion = GSCompleter(KnowingReconstructor()).begin(VIEWS[::2], ROOM, VIEWS[1:2])
+    assert completion.proxy is None
+    assert completion.drawn is completion.scene is completion.context is ROOM
 
 
 def test_a_crowd_is_drawn_with_few_and_looks_alike():
@@ -81,13 +80,14 @@ def test_what_is_large_or_alone_stays_to_the_bit():
             assert torch.equal(getattr(proxy.scene, name), getattr(given, name)), name
 
 
-def test_values_are_shared_out_and_add_up():
-    together = PROXY.summed(PROXY.shares)
-    assert torch.allclose(together, torch.ones_like(together), atol=1e-5)
-    values = torch.rand(len(CROWD), 3, generator=torch.Generator().manual_seed(0))
-    assert torch.allclose(PROXY.summed(values).sum(0), values.sum(0), rtol=1e-4)
-    numbers = torch.arange(len(PROXY.scene)).float()
-    assert torch.equal(PROXY.spread(numbers), PROXY.run.float())
+def test_a_run_is_of_one_provenance():
+    mixed = replace(CROWD, generated=(torch.arange(len(CROWD)) % 2).to(torch.uint8))
+    found = run_by_run(mixed, CAMERAS)
+    assert torch.equal(found.scene.generated[found.run], mixed.generated)
+    halves = replace(CROWD, generated=(torch.arange(len(CROWD)) > 2000).to(torch.uint8))
+    found = run_by_run(halves, CAMERAS)
+    assert torch.equal(found.scene.generated[found.run], halves.generated)
+    assert len(found.scene) <= len(PROXY.scene) + 1
 
 
 def test_of_what_lies_at_one_place_the_mean_is_drawn_as_opaque_as_all():
@@ -127,32 +127,32 @@ def test_the_same_runs_on_any_number_of_threads(monkeypatch):
     assert torch.equal(again.scene.scales, PROXY.scene.scales)
 
 
-def evidence_of(proxy: Proxy) -> Evidence:
-    frozen = [RENDERER.freeze(proxy.scene, camera) for camera in CAMERAS]
-    return gather_evidence(proxy, VIEWS, frozen, SupportConfig())
+def evidence_of(drawn: Gaussians) -> Evidence:
+    frozen = [RENDERER.freeze(drawn, camera) for camera in CAMERAS]
+    return gather_evidence(drawn, VIEWS, frozen, SupportConfig())
 
 
-def test_what_is_told_of_a_proxy_holds_for_the_scene():
-    frozen = RENDERER.freeze(CROWD, TARGET)
-    told = (support(evidence_of(p), weight_sums(frozen), TARGET) for p in (PROXY, Proxy(CROWD)))
-    ours, truth = (believed_alpha(frozen, values) for values in told)
+def believed(drawn: Gaussians) -> torch.Tensor:
+    frozen = RENDERER.freeze(drawn, TARGET)
+    return believed_alpha(frozen, support(evidence_of(drawn), weight_sums(frozen), TARGET))
+
+
+def test_of_a_proxy_as_much_is_believed_as_of_the_scene():
+    ours, truth = believed(PROXY.scene), believed(CROWD)
     assert truth.std() > 0.2
     assert (ours - truth).abs().mean() < 0.05
 
 
 def test_evidence_of_the_scene_and_of_its_proxy_is_the_same():
-    """Frozen views of the context are of the scene itself."""
-    frozen = [RENDERER.freeze(CROWD, camera) for camera in CAMERAS]
-    evidence = gather_evidence(PROXY, VIEWS, frozen, SupportConfig())
-    ours, truth = evidence.areas.sum(), evidence_of(PROXY).areas.sum()
+    ours, truth = evidence_of(PROXY.scene).areas.sum(), evidence_of(CROWD).areas.sum()
     assert ours.item() == pytest.approx(truth.item(), rel=0.02)
 
 
 def test_evidence_is_thinned_with_the_scene():
     rows = torch.arange(0, len(CROWD), COPIES)
     growth = torch.full((len(rows),), COPIES**0.5)
-    whole = evidence_of(PROXY)
-    thin = thinned_evidence(whole, CROWD[rows], rows, growth)
+    whole = evidence_of(CROWD)
+    thin = thinned_evidence(whole, rows, growth)
     assert thin.areas.shape == (len(VIEWS), len(rows))
     assert thin.areas.sum().item() == pytest.approx(whole.areas.sum().item(), rel=0.1)
 
@@ -168,13 +168,23 @@ def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
     whole = GSCompleter(KnowingReconstructor(), paint)(*asked)
     monkeypatch.setattr(proxies, "WORTH", 0)
     found = GSCompleter(KnowingReconstructor(), paint)(*asked)
-    assert len(found.proxy) < 0.5 * len(CROWD)
-    kept = CROWD if found.set_aside is None else CROWD[~found.set_aside]
-    assert torch.equal(found.scene.means[: found.num_kept], kept.means)
+    assert found.proxy is not None
+    assert len(found.drawn_context) < 0.5 * len(CROWD)
+    kept = CROWD if found.removed is None else CROWD[~found.removed]
+    assert torch.equal(found.scene.means, torch.cat([kept.means, found.added.means]))
     truth = view_of(Room(), TARGET).image
-    ours, theirs = (psnr(c.targets[0].after.image, truth) for c in (found, whole))
-    assert ours > psnr(found.targets[0].before.image, truth) + 3
+    ours, theirs = (psnr(RENDERER.render(c.scene, TARGET).image, truth) for c in (found, whole))
+    assert ours > psnr(RENDERER.render(CROWD, TARGET).image, truth) + 3
     assert abs(ours - theirs) < 0.5
     for view in VIEWS:
         before = psnr(RENDERER.render(CROWD, view.camera).image, view.image)
         assert psnr(RENDERER.render(found.scene, view.camera).image, view.image) > before - 0.05
+
+
+def test_a_scene_is_drawn_as_finely_as_the_targets_that_are_known(monkeypatch):
+    monkeypatch.setattr(proxies, "WORTH", 0)
+    completer = GSCompleter(KnowingReconstructor())
+    near = replace(TARGET, K=TARGET.K * torch.tensor([[4.0], [4.0], [1.0]]))
+    coarse = completer.begin(VIEWS[::2], CROWD)
+    fine = completer.begin(VIEWS[::2], CROWD, targets=[near])
+    assert len(coarse.drawn) < len(fine.drawn) <= len(CROWD)

@@ -29,7 +29,7 @@ from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.stereo import corrected, stereo_among
 from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
-from gscompleter.types import Proxy, SceneContext, merge, sh_from_rgb
+from gscompleter.types import SceneContext, merge, sh_from_rgb
 from scenes import (
     Room,
     camera_at,
@@ -83,7 +83,7 @@ def knowing(config=CompleterConfig()):
 
 
 def test_surfaces_are_supported_and_shreds_are_not():
-    evidence = gather_evidence(Proxy(SCENE), VIEWS, frozen_at(VIEWS), SupportConfig())
+    evidence = gather_evidence(SCENE, VIEWS, frozen_at(VIEWS), SupportConfig())
     sums = weight_sums(AT_TARGET)
     found, drawn = support(evidence, sums, TARGET), sums > 0.1
     assert found[drawn & ~ARE_SHREDS].median() > 0.8
@@ -94,7 +94,7 @@ def test_surfaces_are_supported_and_shreds_are_not():
 @pytest.mark.parametrize("exposure", [0.8, 1.25])
 def test_another_exposure_is_no_contradiction(exposure):
     views = [replace(VIEWS[0], image=(exposure * VIEWS[0].image).clamp(0, 1)), VIEWS[1], VIEWS[2]]
-    evidence = gather_evidence(Proxy(SCENE), views, frozen_at(views), SupportConfig())
+    evidence = gather_evidence(SCENE, views, frozen_at(views), SupportConfig())
     assert evidence.agreement[0, evidence.areas[0] > 0].median() > 0.8
 
 
@@ -102,7 +102,7 @@ def test_a_photograph_of_something_else_contradicts():
     image = VIEWS[1].image.clone()
     image[:, : SIZE // 4] = 0.0
     views = [VIEWS[0], replace(VIEWS[1], image=image), VIEWS[2]]
-    evidence = gather_evidence(Proxy(SCENE), views, frozen_at(views), SupportConfig())
+    evidence = gather_evidence(SCENE, views, frozen_at(views), SupportConfig())
     pixels, z = project(SCENE.means, PHOTOGRAPHS[1])
     shown = (evidence.areas[1] > 0) & inside(pixels, z, PHOTOGRAPHS[1])
     left = pixels[:, 0] < SIZE // 4 - 4
@@ -231,7 +231,7 @@ def test_what_photographs_show_by_themselves_takes_the_place_of_what_is_doubted(
     scene = merge([SURFACES, replace(in_the_way, sh=black)])
     frozen, config = RENDERER.freeze(scene, camera), SupportConfig(max_difference=0.03)
     evidence, drawn = (
-        gather_evidence(Proxy(scene), VIEWS, frozen_at(VIEWS, scene), config),
+        gather_evidence(scene, VIEWS, frozen_at(VIEWS, scene), config),
         frozen.context,
     )
     found = support(evidence, weight_sums(frozen), camera)

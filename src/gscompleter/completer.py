@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 
 import torch
 from jaxtyping import Bool, Float, Shaped
@@ -149,22 +149,7 @@ class GSCompleter:
     @cached_property
     def small(self) -> KeptViews:
         """The same at cameras of small images, about."""
-        return KeptViews(
-            self.renderer,
-            lambda completion, start, stop: thinned(completion.scene[start:stop], MAX_GAUSSIANS),
-        )
-
-    @cached_property
-    def witnessing(self) -> KeptViews:
-        """The same at the cameras of witnesses, which see a proxy of its context."""
-        return KeptViews(
-            self.renderer,
-            lambda completion, start, stop: (
-                completion.scene[start:stop]
-                if start or completion.proxy is None
-                else completion.proxy
-            ),
-        )
+        return KeptViews(self.renderer, partial(thinned, most=MAX_GAUSSIANS))
 
     def __call__(
         self,
@@ -192,7 +177,7 @@ class GSCompleter:
         if not targets:
             raise InputError("No target camera was given; name at least one view to complete.")
         check_numbers(scene, len(targets))
-        completion = self.begin(views, scene, witnesses)
+        completion = self.begin(views, scene, witnesses, targets)
         at_once = as_generator(self.generator).at_once
         counted_as = "target" if at_once == 1 else "group of targets"
         for start in track(range(0, len(targets), at_once), counted_as):
@@ -204,8 +189,16 @@ class GSCompleter:
         views: Sequence[View],
         scene: Gaussians | None = None,
         witnesses: Sequence[View] | None = None,
+        targets: Sequence[Camera] = (),
     ) -> Completion:
-        """Stage 1: the scene and its photographs before any target, the arguments as in a call.
+        """Stage 1: the scene and its photographs before any target.
+
+        Args:
+            views: As in a call.
+            scene: As in a call.
+            witnesses: As in a call.
+            targets: Those that are known in advance. A large scene is drawn as finely as they and
+                the photographs can tell.
 
         Raises:
             InputError: too few views, no baseline, a scene nobody sees.
@@ -217,17 +210,23 @@ class GSCompleter:
             )
         clock = Clock()
         with clock("context"):
-            near, far = working_range(views, scene, self.renderer)
+            cameras = [*targets, *(view.camera for view in (*views, *(witnesses or ())))]
+            proxy = None if scene is None else proxy_of(scene, cameras)
+            drawn = scene if proxy is None else proxy.scene
+            near, far = working_range(views, drawn, self.renderer)
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
-            context, gains = scene, None
-            if context is None:
-                context, gains = init_context(self.reconstructor, views)
+            gains = None
+            if scene is None or drawn is None:
+                drawn, gains = init_context(self.reconstructor, views)
                 views = exposed_alike(views, gains)
-            completion = Completion(context, context, views, (), (), {}, others, gains=gains)
+            context = drawn if scene is None else scene
+            completion = Completion(
+                drawn, context, views, (), (), {}, others, gains=gains, proxy=proxy
+            )
             if scene is None:
                 completion = self.wary_of_what_moved(completion)
-            if scene is not None and witnesses is not None:
+            elif witnesses is not None and self.config.support.doubts:
                 completion = self.doubted(completion)
             completion = self.judged(completion)
         return replace(completion, seconds=clock.seconds)
@@ -260,8 +259,8 @@ class GSCompleter:
         result = self.completed(sight, result, reference, clock)
         reached = sight.completion if len(result.added) else completion
         advanced = followed_by(reached, result, clock.seconds)
-        for kept in (self.frozen, self.small, self.witnessing):
-            kept.grown(reached.scene, advanced.scene)
+        for kept in (self.frozen, self.small):
+            kept.grown(reached.drawn, advanced.drawn)
         return advanced
 
     def completed(
@@ -428,12 +427,12 @@ class GSCompleter:
         """`kept` before what is doubted at the target and stays, since photographs need it."""
         if sight.believed is None or len(kept) == 0:
             return kept
-        camera, scene = sight.window.wide, sight.completion.scene
-        nearest = front(scene, sight.frozen, camera)
+        camera, drawn = sight.window.wide, sight.completion.drawn
+        nearest = front(drawn, sight.frozen, camera)
         pixels, z = project(kept.means, camera)
         limit = sample(nearest[..., None], pixels, "nearest")[:, 0]
-        drawn = sample(sight.frozen.context.alpha[..., None], pixels, "nearest")[:, 0] > 0.1
-        ratio = torch.where(drawn & (limit > 0), (limit / z).clamp_max(1.0), 1.0)
+        covered = sample(sight.frozen.context.alpha[..., None], pixels, "nearest")[:, 0] > 0.1
+        ratio = torch.where(covered & (limit > 0), (limit / z).clamp_max(1.0), 1.0)
         return slide(kept, camera, ratio, self.config.registration.footprint)
 
     def refine(
@@ -442,7 +441,7 @@ class GSCompleter:
         """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
         judges, allowed = completion.judges, completion.allowed_errors
-        frozen = self.watching(completion)
+        frozen = self.at(completion, completion.photographs)
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
             near_views = [completion.views[i] for i in nearest]
@@ -480,7 +479,7 @@ class GSCompleter:
 
     def without_stereo(self, completion: Completion, window: Window) -> Sight:
         """The same through a window, without what stereo among the photographs shows there."""
-        frozen = self.renderer.freeze(completion.scene, window.wide)
+        frozen = self.renderer.freeze(completion.drawn, window.wide)
         anchor = self.anchor(completion, window.target)
         return Sight(
             completion, window, frozen, anchor, self.believed(completion, frozen, window.wide)
@@ -541,13 +540,10 @@ class GSCompleter:
 
     def doubted(self, completion: Completion) -> Completion:
         """`completion` of a scene that was brought, before any target, and what the photographs
-        show of it where it is doubted."""
-        views, config = completion.photographs, self.config.support
-        proxy = proxy_of(completion.scene, [view.camera for view in views])
-        completion = replace(completion, proxy=proxy.scene)
-        if not config.doubts:
-            return completion
-        evidence = gather_evidence(proxy, views, self.watching(completion), config)
+        show of it."""
+        views, drawn = completion.photographs, completion.drawn
+        frozen_views = self.at(completion, views)
+        evidence = gather_evidence(drawn, views, frozen_views, self.config.support)
         return replace(completion, evidence=evidence)
 
     def without_unsupported(self, sight: Sight) -> Sight:
@@ -571,26 +567,20 @@ class GSCompleter:
 
     def not_needed(self, completion: Completion, doubtful: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """The `doubtful` Gaussians of the scene as it stands that no photograph needs."""
-        views, rest = completion.photographs, completion.scene[~doubtful]
-        seen = proxy_of(rest, [view.camera for view in views]).scene
-        shown = [rest] * len(completion.views) + [seen] * len(completion.witnesses)
-        around = (
-            self.renderer.freeze(scene, view.camera)
-            for scene, view in zip(shown, views, strict=True)
-        )
-        for kept in (self.frozen, self.witnessing):  # A scene without `doubtful` is to come.
-            kept.forget()
-        gone = not_needed(completion.scene[doubtful], around, views)
+        views, rest = completion.photographs, completion.drawn[~doubtful]
+        around = (self.renderer.freeze(rest, view.camera) for view in views)
+        self.frozen.forget()  # A scene without `doubtful` is to come.
+        gone = not_needed(completion.drawn[doubtful], around, views)
         return doubtful.masked_scatter(doubtful, gone)
 
     def unseen_in_holes(self, sight: Sight, evidence: Evidence) -> Bool[Tensor, "n"]:
         """Which Gaussians of the scene as it stands cover holes and are shown by no photograph."""
         completion, camera = sight.completion, sight.window.wide
-        scene, holes = completion.scene, self.holes(sight)
+        drawn, holes = completion.drawn, self.holes(sight)
         everywhere = torch.ones_like(sight.alpha)
         layers = torch.stack([everywhere, holes.to(everywhere), 0 * everywhere], dim=-1)
         sums, covering, _ = sight.frozen.sums(layers).unbind(-1)
-        of_context = (covering > MIN_COVER) & (scene.generated == 0)
+        of_context = (covering > MIN_COVER) & (drawn.generated == 0)
         kept = completion.num_kept
         seen = shown(evidence, in_context(completion, sums[:kept]), camera)
         of_context[:kept] &= of_kept(completion, seen) < UNSEEN
@@ -621,7 +611,8 @@ class GSCompleter:
     def judged(self, completion: Completion) -> Completion:
         """`completion` before any target, with what its photographs ask of whatever is added."""
         tolerance = 0.0 if completion.evidence is not None else self.config.harm.tolerance or 0.0
-        drawn, loss = contexts_of(self.watching(completion)), max(tolerance, ROUNDING)
+        drawn = contexts_of(self.at(completion, completion.photographs))
+        loss = max(tolerance, ROUNDING)
         judges = tuple(
             ignoring(view, hole_mask(render.alpha, self.config.holes))
             for view, render in zip(completion.photographs, drawn, strict=True)
@@ -635,12 +626,6 @@ class GSCompleter:
     def at(self, completion: Completion, views: Sequence[View]) -> tuple[FrozenView, ...]:
         """The scene as it stands, frozen at the cameras of photographs."""
         return self.frozen.of(completion, [view.camera for view in views])
-
-    def watching(self, completion: Completion) -> tuple[FrozenView, ...]:
-        """The scene as it stands, frozen at every photograph of the context, then its proxy at
-        those of witnesses."""
-        witnesses = self.witnessing.of(completion, [v.camera for v in completion.witnesses])
-        return (*self.at(completion, completion.views), *witnesses)
 
     def small_renders(self, completion: Completion, cameras: Sequence[Camera]) -> Sequence[Render]:
         """What cameras of small images see of the scene as it stands, about."""
@@ -660,15 +645,13 @@ def ignoring(view: View, where: Bool[Tensor, "h w"]) -> View:
 
 
 def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:
-    """`completion` with more of its context set aside: `taken` of the Gaussians of its scene."""
+    """`completion` with more of its context set aside: `taken` of what is drawn of it."""
     before, gone = completion.set_aside, in_context(completion, taken[: completion.num_kept])
-    aside, scene = gone if before is None else before | gone, completion.scene[~taken]
-    completion = replace(completion, scene=scene, set_aside=aside)
-    cameras = [view.camera for view in completion.photographs]
-    return replace(completion, proxy=proxy_of(scene[: completion.num_kept], cameras).scene)
+    aside = gone if before is None else before | gone
+    return replace(completion, drawn=completion.drawn[~taken], set_aside=aside)
 
 
-def in_context(completion: Completion, values: Shaped[Tensor, "kept"]) -> Shaped[Tensor, "n"]:
+def in_context(completion: Completion, values: Shaped[Tensor, "kept"]) -> Shaped[Tensor, "m"]:
     """Values of what the scene keeps of its context, as values of all of this; 0 of the others."""
     aside = completion.set_aside
     if aside is None:
@@ -676,7 +659,7 @@ def in_context(completion: Completion, values: Shaped[Tensor, "kept"]) -> Shaped
     return values.new_zeros(len(aside)).masked_scatter(~aside, values)
 
 
-def of_kept(completion: Completion, values: Shaped[Tensor, "n"]) -> Shaped[Tensor, "kept"]:
+def of_kept(completion: Completion, values: Shaped[Tensor, "m"]) -> Shaped[Tensor, "kept"]:
     """Values of all of the context, as values of what the scene keeps of it."""
     aside = completion.set_aside
     return values if aside is None else values[~aside]
@@ -707,7 +690,7 @@ def nothing_added(sight: Sight, holes: Bool[Tensor, "h w"]) -> TargetCompletion:
         anchor=sight.anchor.index,
         anchor_fallback=sight.anchor.fallback,
         affine=DepthAffine(),
-        added=sight.completion.scene[:0],
+        added=sight.completion.drawn[:0],
         support=None if sight.believed is None else sight.window.crop(sight.believed),
     )
 
@@ -728,7 +711,7 @@ def followed_by(
     added = result.added
     return replace(
         completion,
-        scene=merge([completion.scene, added]) if len(added) else completion.scene,
+        drawn=merge([completion.drawn, added]) if len(added) else completion.drawn,
         targets=(*completion.targets, result),
         seconds=total(completion.seconds, seconds),
     )

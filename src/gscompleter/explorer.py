@@ -130,7 +130,7 @@ class Explorer:
         """What there is to gain at each of `offers`, in the scene as it stands."""
         small = miniature(completion)
         anchors = [self.look(small, view.camera) for view in small.views]
-        each = map if small.scene.means.is_cuda else many_at_once
+        each = map if small.drawn.means.is_cuda else many_at_once
         choices = each(lambda offer: self.choice(small, anchors, offer), offers)
         counted = zip(track(offers, "finding targets"), choices, strict=True)
         return [choice for _, choice in counted]
@@ -153,7 +153,7 @@ class Explorer:
     def look(self, completion: Completion, camera: Camera) -> Look:
         """What a camera sees of a scene, in a small image."""
         camera = shrunk(completion.ranged(camera), self.config.side)
-        frozen = self.completer.renderer.freeze(completion.scene, camera)
+        frozen = self.completer.renderer.freeze(completion.drawn, camera)
         render, believed = frozen.context, self.completer.believed(completion, frozen, camera)
         alpha = render.alpha if believed is None else believed
         return Look(camera, render, hole_mask(alpha, self.completer.config.holes))
@@ -162,7 +162,7 @@ class Explorer:
         """`completion` with stand-ins in the holes that it has at a camera."""
         look = self.look(completion, self.completer.window(completion, camera).wide)
         added = stand_ins(look.render, look.holes, look.camera)
-        return replace(completion, scene=merge([completion.scene, added]))
+        return replace(completion, drawn=merge([completion.drawn, added]))
 
 
 def with_bystanders(completion: Completion, cameras: Sequence[Camera]) -> Completion:

@@ -66,8 +66,8 @@ def doubt_brought(_: str) -> None:
     gaussians, view, config = some_gaussians(), photographs()[0], SupportConfig()
     looks = gaussians.opacities.clone().requires_grad_(), gaussians.sh.clone().requires_grad_()
     frozen = load_renderer("cpu").freeze(gaussians, view.camera)
-    proxy = run_by_run(gaussians, [view.camera])
-    evidence = gather_evidence(proxy, [view], [frozen], config)
+    run_by_run(gaussians, [view.camera])
+    evidence = gather_evidence(gaussians, [view], [frozen], config)
     support(evidence, weight_sums(frozen), view.camera, config)
     frozen.plan_appearance(gaussians)(*looks).sum().backward()
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal, TypeVar
 
 import torch
@@ -383,21 +384,8 @@ class Proxy:
 
     scene: Gaussians
     """The m Gaussians."""
-    run: Int64[Tensor, "n"] | None = None
-    """Which of them stands for each of the n; None where they are the same."""
-    shares: Float[Tensor, "n"] | None = None
-    """How much of that each of the n is; None where they are the same."""
-
-    def summed(self, values: Float[Tensor, "n *c"]) -> Float[Tensor, "m *c"]:
-        """Values of the n, added up for each of the m."""
-        if self.run is None:
-            return values
-        nothing = values.new_zeros((len(self.scene), *values.shape[1:]))
-        return nothing.index_add_(0, self.run, values)
-
-    def spread(self, values: Float[Tensor, "m"]) -> Float[Tensor, "n"]:
-        """To each of the n the value of what stands for it."""
-        return values if self.run is None else values[self.run]
+    run: Int64[Tensor, "n"]
+    """Which of them stands for each of the n."""
 
 
 @dataclass(frozen=True)
@@ -405,8 +393,8 @@ class Evidence:
     """What k photographs show of each of the m Gaussians that a scene that was brought is drawn
     with."""
 
-    proxy: Proxy
-    """How the n Gaussians of the scene are drawn."""
+    means: Float[Tensor, "m 3"]
+    """Where the Gaussians lie, in world coordinates."""
     centers: Float[Tensor, "k 3"]
     """Where the photographs were taken, in world coordinates."""
     areas: Float[Tensor, "k m"]
@@ -422,9 +410,9 @@ class Completion:
     A step gives a new value and leaves this one as it is, so that undo is to go on from the former.
     """
 
-    scene: Gaussians
-    """The context, bit for bit as it was, without what was set aside, followed by everything that
-    was added."""
+    drawn: Gaussians
+    """The scene as the stages see it: what the context is drawn with, without what was set aside,
+    followed by everything that was added."""
     context: Gaussians
     """The scene before its first target."""
     views: tuple[View, ...]
@@ -447,13 +435,13 @@ class Completion:
     judges: tuple[View, ...] = ()
     """`views`, then `witnesses`, as they are held against the scene whatever is added: where this
     has a hole at first they are ignored, so that nothing makes up for what was good."""
-    proxy: Gaussians | None = None
-    """What of the context the scene begins with, as `witnesses` see it; None for itself."""
+    proxy: Proxy | None = None
+    """What a large context is drawn with; None where it is drawn itself."""
     evidence: Evidence | None = None
     """What `views` and `witnesses` show of the context; None where a context is not doubted."""
-    set_aside: Bool[Tensor, "n"] | None = None
-    """Which Gaussians of the context nothing supports and nothing needs, so that the scene is
-    without them; None for none."""
+    set_aside: Bool[Tensor, "m"] | None = None
+    """Which Gaussians that the context is drawn with nothing supports and nothing needs, so that
+    the scene is without them; None for none."""
 
     @property
     def photographs(self) -> tuple[View, ...]:
@@ -461,14 +449,39 @@ class Completion:
         return (*self.views, *self.witnesses)
 
     @property
+    def drawn_context(self) -> Gaussians:
+        """The m Gaussians that the context is drawn with."""
+        return self.context if self.proxy is None else self.proxy.scene
+
+    @property
     def num_kept(self) -> int:
-        """How many Gaussians of the context the scene begins with."""
-        return len(self.context) - (0 if self.set_aside is None else int(self.set_aside.sum()))
+        """How many Gaussians of the context `drawn` begins with."""
+        aside = 0 if self.set_aside is None else int(self.set_aside.sum())
+        return len(self.drawn_context) - aside
 
     @property
     def added(self) -> Gaussians:
         """The generated Gaussians of all targets."""
-        return self.scene[self.num_kept :]
+        return self.drawn[self.num_kept :]
+
+    @property
+    def removed(self) -> Bool[Tensor, "n"] | None:
+        """Which Gaussians of the context were set aside; None for none."""
+        aside = self.set_aside
+        return aside if aside is None or self.proxy is None else aside[self.proxy.run]
+
+    @property
+    def observed(self) -> Gaussians:
+        """The context, bit for bit as it was, without what was set aside."""
+        return self.context if self.removed is None else self.context[~self.removed]
+
+    @cached_property
+    def scene(self) -> Gaussians:
+        """The context, bit for bit as it was, without what was set aside, followed by everything
+        that was added."""
+        if self.proxy is None:
+            return self.drawn
+        return merge([self.observed, self.added]) if len(self.added) else self.observed
 
     @property
     def next_number(self) -> int:

@@ -20,23 +20,27 @@ NONE = np.float32(1e-30)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def begin_runs(begin, end, means, scales, centers, focals, reach, largest, begins):
+def begin_runs(begin, end, means, scales, generated, centers, focals, reach, largest, begins):
     """Whether each Gaussian of the blocks begin..end begins a run.
 
-    A run goes on as long as what follows lies within `reach` pixels of its first Gaussian, and no
-    standard deviation exceeds `largest` pixels: of the camera in which a pixel covers least there.
+    A run goes on as long as what follows is of one provenance with its first Gaussian and lies
+    within `reach` pixels of it, and no standard deviation exceeds `largest` pixels: of the camera
+    in which a pixel covers least there.
 
-    means [n, 3], scales [n, 3], centers [k, 3], focals [k] float32. begins [n] bool is written.
+    means [n, 3], scales [n, 3] float32, generated [n] uint8, centers [k, 3], focals [k]
+        float32. begins [n] bool is written.
     """
     for block in range(begin, end):
         pixel, x, y, z = np.float32(-1), np.float32(0), np.float32(0), np.float32(0)
+        origin = generated[block * BLOCK]
         for i in range(block * BLOCK, min((block + 1) * BLOCK, len(means))):
             dx, dy, dz = means[i, 0] - x, means[i, 1] - y, means[i, 2] - z
             size = max(scales[i, 0], scales[i, 1], scales[i, 2])
             apart = dx * dx + dy * dy + dz * dz
-            begins[i] = not (size <= largest * pixel and apart <= (reach * pixel) ** 2)
+            near = size <= largest * pixel and apart <= (reach * pixel) ** 2
+            begins[i] = not (near and generated[i] == origin)
             if begins[i]:
-                x, y, z = means[i, 0], means[i, 1], means[i, 2]
+                x, y, z, origin = means[i, 0], means[i, 1], means[i, 2], generated[i]
                 pixel = _pixel(x, y, z, centers, focals)
                 if size > largest * pixel:
                     pixel = np.float32(-1)

@@ -205,7 +205,7 @@ class Page:
         with self.server.atomic():
             now = self.session.now
             if before.now.num_kept != now.num_kept:
-                self._show("/observed", now.scene[: now.num_kept], tinted=False)
+                self._show("/observed", now.observed, tinted=False)
             self._show_generated()
             for frustum in self._targets:
                 frustum.remove()

@@ -53,8 +53,9 @@ class Look:
 
 def looks_of(completion: Completion, cameras: Sequence[Camera], renderer: Renderer) -> list[Look]:
     """What `cameras` see of the scene in small images, about."""
-    begun, aside = thinned(completion.context, MAX_GAUSSIANS), completion.set_aside is not None
-    kept = thinned(completion.scene[: completion.num_kept], MAX_GAUSSIANS) if aside else begun
+    begun = thinned(completion.drawn_context, MAX_GAUSSIANS)
+    aside = completion.set_aside is not None
+    kept = thinned(completion.drawn[: completion.num_kept], MAX_GAUSSIANS) if aside else begun
     added = [thinned(result.added, MAX_GAUSSIANS) for result in completion.targets]
     new = merge([begun[:0], *added])
 

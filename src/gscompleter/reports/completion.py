@@ -93,7 +93,7 @@ def compare(
     """The context and the completed scene as `camera` sees them."""
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
-        if completion.num_kept == len(completion.context):
+        if completion.set_aside is None:
             after = frozen.composite(completion.added)
         else:  # some of the context was set aside
             after = renderer.render(completion.scene, camera)
@@ -170,10 +170,11 @@ def contradicted_share(view: View) -> float:
 
 def counts(completion: Completion) -> dict[str, int]:
     """How many Gaussians were given and added and, of a scene that was doubted, set aside."""
-    given = len(completion.context)
-    found = {"context": given, "added": len(completion.added)}
-    doubted = completion.evidence is not None
-    return found | ({"removed": given - completion.num_kept} if doubted else {})
+    found = {"context": len(completion.context), "added": len(completion.added)}
+    if completion.evidence is None:
+        return found
+    removed = completion.removed
+    return found | {"removed": 0 if removed is None else int(removed.sum())}
 
 
 def write_report(
@@ -228,7 +229,7 @@ def write_scenes(folder: Path, completion: Completion, brought: Brought | None) 
     if brought is None:
         save_own(folder, completion)
         return
-    found = as_in_file(completion.context, completion.scene, completion.set_aside, brought)
+    found = as_in_file(completion.context, completion.scene, completion.removed, brought)
     save_ply(folder / CONTEXT, found[0])
     save_brought(folder, *found, brought)
     save_ply(folder / GENERATED, completion.added, provenance=True)

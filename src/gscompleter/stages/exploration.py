@@ -33,7 +33,6 @@ from gscompleter.types import (
     Completion,
     Evidence,
     Gaussians,
-    Proxy,
     Render,
     merge,
     observed,
@@ -144,25 +143,20 @@ def stand_ins(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gau
 def miniature(completion: Completion, most: int = MAX_GAUSSIANS) -> Completion:
     """`completion` with fewer Gaussians, which look the same in small images, and the evidence on
     them."""
-    context, evidence, aside = completion.context, completion.evidence, completion.set_aside
+    context, evidence, aside = completion.drawn_context, completion.evidence, completion.set_aside
     rows, growth = thinning(context, most)
     context = thinned(context, most)
-    evidence = None if evidence is None else thinned_evidence(evidence, context, rows, growth)
+    evidence = None if evidence is None else thinned_evidence(evidence, rows, growth)
     aside = None if aside is None else aside[rows]
     kept = context if aside is None else context[~aside]
-    scene = merge([kept, thinned(completion.added, most)])
+    drawn = merge([kept, thinned(completion.added, most)])
     completion = replace(completion, proxy=None, evidence=evidence, set_aside=aside)
-    return replace(completion, scene=scene, context=context)
+    return replace(completion, drawn=drawn, context=context)
 
 
 def thinned_evidence(
-    evidence: Evidence,
-    thin: Gaussians,
-    rows: Int64[Tensor, "r"],
-    growth: Float[Tensor, "r"],
+    evidence: Evidence, rows: Int64[Tensor, "r"], growth: Float[Tensor, "r"]
 ) -> Evidence:
-    """Evidence on a scene of which these rows stay, each grown so many times; `thin` is those."""
-    proxy, runs = evidence.proxy, rows if evidence.proxy.run is None else evidence.proxy.run[rows]
-    shares = growth**2 if proxy.shares is None else growth**2 * proxy.shares[rows]
-    areas, agreement = evidence.areas[:, runs] * shares, evidence.agreement[:, runs]
-    return Evidence(Proxy(thin), evidence.centers, areas, agreement)
+    """Evidence on those rows of Gaussians that stay, each grown so many times."""
+    areas, agreement = evidence.areas[:, rows] * growth**2, evidence.agreement[:, rows]
+    return Evidence(evidence.means[rows], evidence.centers, areas, agreement)

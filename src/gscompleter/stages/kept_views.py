@@ -16,9 +16,8 @@ from gscompleter.types import Camera, Completion, Gaussians, merge
 Views = dict[Hashable, tuple[int, FrozenView]]
 """By camera, how many Gaussians of the scene are frozen in a view, and the view."""
 
-Drawn = Callable[[Completion, int, int], Gaussians]
-"""What is drawn of the Gaussians start..stop of a scene: of its context, or of what a target
-added."""
+Drawn = Callable[[Gaussians], Gaussians]
+"""What is drawn in place of some of a scene: of its context, or of what a target added."""
 
 
 class KeptViews:
@@ -42,8 +41,8 @@ class KeptViews:
 
     def of(self, completion: Completion, cameras: Sequence[Camera]) -> tuple[FrozenView, ...]:
         """The scene as it stands, frozen at each of `cameras`."""
-        if self._scene is None or self._scene() is not completion.scene:
-            self._scene, self._views, self._parts = weakref.ref(completion.scene), {}, {}
+        if self._scene is None or self._scene() is not completion.drawn:
+            self._scene, self._views, self._parts = weakref.ref(completion.drawn), {}, {}
         views, keys = self._views, [key_of(camera) for camera in cameras]
         behind = {views[key][0] if key in views else 0 for key in keys}
         missing = {count: self._since(completion, count) for count in behind}
@@ -51,9 +50,9 @@ class KeptViews:
             count, view = views.get(key, (0, None))
             if view is None:
                 view = self._renderer.freeze(missing[0], camera)
-            elif count < len(completion.scene):
+            elif count < len(completion.drawn):
                 view = view.extended(missing[count])
-            views[key] = len(completion.scene), view
+            views[key] = len(completion.drawn), view
         return tuple(views[key][1] for key in keys)
 
     def forget(self) -> None:
@@ -68,15 +67,15 @@ class KeptViews:
     def _since(self, completion: Completion, count: int) -> Gaussians:
         """What is drawn of a scene behind its first `count` Gaussians, as many as it had once."""
         if self._drawn is None:
-            return completion.scene[count:]
+            return completion.drawn[count:]
         added = [len(result.added) for result in completion.targets]
         bounds = [0, *accumulate(added, initial=completion.num_kept)]
         wanted = [part for part in pairwise(bounds) if part[0] >= count]
         for part in wanted:
             if part not in self._parts:
-                self._parts[part] = self._drawn(completion, *part)
+                self._parts[part] = self._drawn(completion.drawn[slice(*part)])
         parts = [self._parts[part] for part in wanted]
-        return parts[0] if len(parts) == 1 else merge([completion.scene[:0], *parts])
+        return parts[0] if len(parts) == 1 else merge([completion.drawn[:0], *parts])
 
 
 def key_of(camera: Camera) -> Hashable:

@@ -1,9 +1,8 @@
-"""A proxy of a large scene: what its photographs, which are looked at small, can see of it.
+"""A proxy of a large scene: what cameras can see of it, in images of the size that is worked at.
 
-Where millions of Gaussians were brought, several share a pixel of each photograph. Those that lie
-within half a pixel of each other, however close a photograph was taken, are drawn as one. Only
-photographs that bear witness are compared with the proxy; the context, targets and all that is
-written are of the scene itself.
+Where millions of Gaussians were brought, several share a pixel of each image. Those that lie within
+half a pixel of each other, however close a camera is, are drawn as one. A scene is completed by
+what is seen of its proxy; all that is written, and the pictures of it, are of the scene itself.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int64, UInt8
 from numpy import ndarray
 
 from gscompleter.kernels import runs as kernels
@@ -33,25 +32,23 @@ MAX_GROWTH = 8.0
 """By how much both grow at most where the proxy would be too large otherwise."""
 
 
-def proxy_of(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
+def proxy_of(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy | None:
     """What `cameras` see of `scene`, drawn with fewer Gaussians where it has so many that it lies
-    in order.
-
-    One on a GPU stays as it is, which has no need of it.
-    """
+    in order; None where it is drawn itself, as on a GPU, which has no need of a proxy."""
     if len(scene) < WORTH or scene.means.is_cuda:
-        return Proxy(scene)
+        return None
     return run_by_run(scene, cameras)
 
 
 def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
-    """`scene` with one Gaussian for each run of neighbours in its order that lie close together.
+    """`scene` with one Gaussian for each run of neighbours in its order that lie close together and
+    are of one provenance.
 
     There are as few runs as views of `cameras` have room for. In a random order there are none.
     """
     given = arrays_of(scene)
     given = given._replace(sh=given.sh.reshape(len(scene), -1))
-    start = starts_of_runs(given.means, given.scales, cameras)
+    start = starts_of_runs(given.means, given.scales, scene.generated.numpy(), cameras)
     found = [np.empty((len(start) - 1, *array.shape[1:]), np.float32) for array in given]
     shares = np.empty(len(scene), np.float32)
     share(kernels.stand_for, len(start) - 1, start, given, shares, GaussianArrays(*found))
@@ -59,11 +56,14 @@ def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
     first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
     looks = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
-    return Proxy(Gaussians(means, quats, scales, *looks), run, torch.from_numpy(shares))
+    return Proxy(Gaussians(means, quats, scales, *looks), run)
 
 
 def starts_of_runs(
-    means: Float32[ndarray, "n 3"], scales: Float32[ndarray, "n 3"], cameras: Sequence[Camera]
+    means: Float32[ndarray, "n 3"],
+    scales: Float32[ndarray, "n 3"],
+    generated: UInt8[ndarray, "n"],
+    cameras: Sequence[Camera],
 ) -> Int64[ndarray, "bounds"]:
     """Where each run starts, and the end [m + 1]."""
     centers = float32(torch.stack([camera.center for camera in cameras]))
@@ -72,7 +72,7 @@ def starts_of_runs(
     most, growth = most_that_fit(len(cameras)), 1.0
     while True:
         limits = np.float32(growth * REACH), np.float32(growth * LARGEST)
-        seen = (means, scales, centers, focals, *limits, begins)
+        seen = (means, scales, generated, centers, focals, *limits, begins)
         share(kernels.begin_runs, -(-len(means) // kernels.BLOCK), *seen)
         if np.count_nonzero(begins) <= most or growth >= MAX_GROWTH:
             return np.append(np.flatnonzero(begins), len(means))

@@ -22,7 +22,7 @@ from gscompleter.render import Renderer
 from gscompleter.stages.context import init_context
 from gscompleter.stages.selection import select_context
 from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
-from gscompleter.types import Camera, Proxy, Render, SceneContext, View
+from gscompleter.types import Camera, Render, SceneContext, View
 
 NUM_VIEWS = 3
 """Photographs that stereo is made of: its time grows with their number."""
@@ -71,7 +71,7 @@ def stereo_among(
     except InputError:
         return None
     frozen_views = [renderer.freeze(scene, view.camera) for view in views]
-    evidence = gather_evidence(Proxy(scene), views, frozen_views, config)
+    evidence = gather_evidence(scene, views, frozen_views, config)
     frozen = renderer.freeze(scene, camera)
     values = support(evidence, weight_sums(frozen), camera, config)
     return Stereo(frozen.context, believed_alpha(frozen, values))

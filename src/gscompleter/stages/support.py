@@ -28,7 +28,7 @@ from gscompleter.kernels.sharing import share, side_by_side
 from gscompleter.render import FrozenView
 from gscompleter.render.folded import float32
 from gscompleter.threads import torch_on_one_thread
-from gscompleter.types import Camera, Evidence, Gaussians, Proxy, Render, View
+from gscompleter.types import Camera, Evidence, Gaussians, Render, View
 
 BLUR = 0.01
 """Radius over which differences of colour, and support, are averaged, of the longer side of an
@@ -43,34 +43,29 @@ and has to stay."""
 
 
 def gather_evidence(
-    proxy: Proxy, views: Sequence[View], frozen: Sequence[FrozenView], config: SupportConfig
+    drawn: Gaussians, views: Sequence[View], frozen: Sequence[FrozenView], config: SupportConfig
 ) -> Evidence:
     """What photographs show of each Gaussian, and how far the scene looks like them there.
 
     Args:
-        proxy: How the scene is drawn.
+        drawn: The m Gaussians that the scene is drawn with.
         views: The k photographs, whose cameras know the depth range.
-        frozen: The scene, or its proxy, frozen at each of them.
+        frozen: The same Gaussians, frozen at each of them.
         config: How different is too different.
     """
     with torch_on_one_thread():
         differences = side_by_side(difference, [f.context for f in frozen], views)
     usual = torch.stack([d.median() for d in differences]).median().item()
     scale = config.max_difference * max(1.0, usual / EXACT)
-    means = float32(proxy.scene.means)
+    means = float32(drawn.means)
     areas, agreement = np.empty((2, len(views), len(means)), np.float32)
     for k, (view, different) in enumerate(zip(views, differences, strict=True)):
         agrees = torch.exp(-((different / scale) ** 2))
         layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
-        sums = float32(of_proxy(frozen[k].sums(layers), proxy))
+        sums = float32(frozen[k].sums(layers))
         share(kernels.tell, len(means), sums, means, place_of(view.camera), areas[k], agreement[k])
-    told = (torch.from_numpy(array).to(proxy.scene.means) for array in (areas, agreement))
-    return Evidence(proxy, torch.stack([view.camera.center for view in views]), *told)
-
-
-def of_proxy(sums: Float[Tensor, "_ c"], proxy: Proxy) -> Float[Tensor, "m c"]:
-    """Sums of the Gaussians of a proxy, from these or from those of the scene."""
-    return sums if len(sums) == len(proxy.scene) else proxy.summed(sums)
+    told = (torch.from_numpy(array).to(drawn.means) for array in (areas, agreement))
+    return Evidence(drawn.means, torch.stack([view.camera.center for view in views]), *told)
 
 
 def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
@@ -82,26 +77,25 @@ def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
 
 def support(
     evidence: Evidence,
-    sums: Float[Tensor, "n"],
+    sums: Float[Tensor, "m"],
     camera: Camera,
     config: SupportConfig = SupportConfig(),
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, "m"]:
     """How far the photographs support each Gaussian as `camera` sees it, in [0, 1]; 1 where it sees
     nothing.
 
     Args:
-        evidence: What the photographs show of n Gaussians.
+        evidence: What the photographs show of m Gaussians.
         sums: The sum of the compositing weights of each over the image of `camera`.
         camera: Who asks.
         config: From how far aside a photograph still tells something.
     """
-    proxy = evidence.proxy
-    seen = (proxy.scene.means, proxy.summed(sums))
-    told = map(float32, (evidence.centers, evidence.areas, evidence.agreement, *seen))
+    seen = (evidence.areas, evidence.agreement, evidence.means, sums)
+    told = map(float32, (evidence.centers, *seen))
     limits = np.float32(math.radians(config.max_turn)), np.float32(ENOUGH)
-    values = np.empty(len(proxy.scene), np.float32)
+    values = np.empty(len(sums), np.float32)
     share(kernels.support, len(values), *told, place_of(camera), *limits, values)
-    return proxy.spread(torch.from_numpy(values).to(sums))
+    return torch.from_numpy(values).to(sums)
 
 
 def place_of(camera: Camera) -> Place:
@@ -110,12 +104,11 @@ def place_of(camera: Camera) -> Place:
     return Place(float32(camera.center), float32(camera.forward), np.float32(focal))
 
 
-def shown(evidence: Evidence, sums: Float[Tensor, "n"], camera: Camera) -> Float[Tensor, "n"]:
+def shown(evidence: Evidence, sums: Float[Tensor, "m"], camera: Camera) -> Float[Tensor, "m"]:
     """How much of each Gaussian the photograph that shows most of it shows, as a share of what
     `camera` sees; large where it sees nothing. The arguments are those of `support`."""
-    proxy = evidence.proxy
-    needed = proxy.summed(sums) * pixel_areas(proxy.scene.means, camera)
-    return proxy.spread(evidence.areas.amax(dim=0) / needed.clamp_min(1e-20))
+    needed = sums * pixel_areas(evidence.means, camera)
+    return evidence.areas.amax(dim=0) / needed.clamp_min(1e-20)
 
 
 def weight_sums(frozen: FrozenView) -> Float[Tensor, "n"]:
