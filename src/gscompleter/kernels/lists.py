@@ -173,29 +173,6 @@ def take_splats(begin, end, rows, splats, opacities, boxes, taken):
             to_boxes[place, side] = boxes[i, side]
 
 
-@njit(cache=True, nogil=True)
-def pack_fragments(begin, end, room, ends, found, packed):
-    """Copy the fragments of the tiles begin..end to where they lie without room between them.
-
-    room [t + 1, 2] int64: where entries and fragments of each tile start in `found`.
-    ends [t + 1, 2] int64: where they start in `packed`. Both are Fragments.
-    """
-    _, _, names, slots, start, pixels, falloffs, before, _ = found
-    _, _, to_names, to_slots, to_start, to_pixels, to_falloffs, to_before, _ = packed
-    for tile in range(begin, end):
-        first, place = room[tile]
-        to_first, to_place = ends[tile]
-        for k in range(ends[tile + 1, 0] - to_first):
-            to_names[to_first + k] = names[first + k]
-            to_slots[to_first + k] = slots[first + k]
-            to_start[to_first + k] = start[first + k] - place + to_place
-        for k in range(ends[tile + 1, 1] - to_place):
-            to_pixels[to_place + k] = pixels[place + k]
-            to_falloffs[to_place + k] = falloffs[place + k]
-            for column in range(4):
-                to_before[to_place + k, column] = before[place + k, column]
-
-
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def sum_entries(begin, end, slot_start, gradients, written, totals):
     """Sums of the gradients of the entries of each of the Gaussians begin..end.

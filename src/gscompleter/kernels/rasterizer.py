@@ -10,9 +10,9 @@ Two lists are walked at once, merged by depth: `context`, which is frozen and ge
 `new`, which does. Drawing a single scene leaves the context empty. Where new splats keep their
 place and change but their looks, the context is folded into their pixels once (`Fragments`).
 
-Every kernel works on a range (begin, end) of its elements, writes to its own part of the outputs
-and releases the interpreter lock: the caller shares ranges among threads, and the result does not
-depend on how.
+Every kernel works on a range (begin, end) of its elements, or on the fragments of one, writes to
+its own part of the outputs and releases the interpreter lock: the caller shares ranges among
+threads, and the result does not depend on how.
 
 A splat's falloff is `alpha = opacity * exp(-(s² + t²))` with whitened coordinates
 `s = u dx + v dy`, `t = w dy` of the offset (dx, dy) from its centre. `U = [[u, v], [0, w]]` obeys
@@ -43,6 +43,9 @@ MIN_TRANSMITTANCE = np.float32(1e-4)
 SOLID = np.float32(0.5)
 """Alpha above which a frozen splat is not folded with others. Where a pixel is closed among what is
 folded, its colour is off by at most `MIN_TRANSMITTANCE / SOLID`."""
+
+FARTHER = np.float32(0.01)
+"""By how much farther, in units of the exponent, a splat is looked at than it is visible."""
 
 X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
 """Columns of the splats."""
@@ -1229,31 +1232,35 @@ def project_backward(
 
 
 class Fragments(NamedTuple):
-    """The pixels of new splats, tile by tile and in each front to back.
+    """The pixels of new splats, tile by tile, pixel by pixel, and in each front to back.
 
     All that is frozen between two fragments of a pixel is folded into one transmittance and one
-    colour. Frozen splats that are `SOLID` have fragments of their own where anything new is before
-    them, so that a pixel is closed at the very splat at which `composite` closes it.
+    colour; mostly it is nothing. Frozen splats that are `SOLID` have fragments of their own where
+    anything new is before them, so that a pixel is closed at the very splat at which `composite`
+    closes it.
     """
 
     tiles: np.ndarray
-    """The tiles that have any [t] int64."""
+    """The tiles that have any, and maybe others [t] int64."""
     entry_start: np.ndarray
     """Where the entries of each of these start [t + 1] int64."""
     names: np.ndarray
-    """Which new splat each entry is, or the complement of which frozen one [e] int32."""
+    """Which new splat each entry is, or the complement of which of `solid` [e] int32."""
     slots: np.ndarray
     """Where the gradient of each entry goes; -1 for a frozen one [e] int32."""
-    start: np.ndarray
-    """Where the fragments of each entry start [e + 1] int64."""
-    pixels: np.ndarray
-    """Pixel of each fragment within its tile, row by row [f] uint8."""
+    pixel_start: np.ndarray
+    """Where the fragments of each pixel start, row by row, and the end [t, TILE² + 1] int64."""
+    entries: np.ndarray
+    """Which entry of its tile each fragment is of, or the complement of which of `folds` lies there
+    [f] int32."""
     falloffs: np.ndarray
     """Its alpha at opacity 1, of a frozen one its alpha [f] float32."""
-    before: np.ndarray
-    """Transmittance, and colour, of what is folded between it and the one before [f, 4] float32."""
+    folds: np.ndarray
+    """Transmittance, and colour, of what is folded [g, 4] float32."""
+    solid: np.ndarray
+    """Colours of the frozen splats that have entries [s, 3] float32."""
     behind: np.ndarray
-    """Colour of what is folded behind the last one of each pixel [h, w, 3] float32."""
+    """Colour of what is folded behind the last fragment of each pixel [h, w, 3] float32."""
 
 
 @njit(cache=True, fastmath={"contract"})
@@ -1268,28 +1275,22 @@ def _within(boxes, i, left, top):
     )
 
 
-@njit(cache=True, nogil=True)
-def bound_fragments(begin, end, tiles, tiles_x, context, new, bounds):
-    """The most entries and fragments that each of tiles[begin:end] can have.
-
-    context, new: Layer. bounds [t, 2] int64 is written.
-    """
+@njit(cache=True)
+def _most_fragments(tile, left, top, context, new):
+    """The most entries and fragments that a tile can have."""
     _, c_opacities, c_boxes, c_start, c_entries = context
     _, _, n_boxes, n_start, n_entries = new
-    for index in range(begin, end):
-        tile = tiles[index]
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        entries = fragments = 0
-        for place in range(n_start[tile], n_start[tile + 1]):
-            x_from, x_to, y_from, y_to = _within(n_boxes, n_entries[place], left, top)
+    entries = fragments = 0
+    for place in range(n_start[tile], n_start[tile + 1]):
+        x_from, x_to, y_from, y_to = _within(n_boxes, n_entries[place], left, top)
+        entries += 1
+        fragments += (x_to - x_from) * (y_to - y_from)
+    for place in range(c_start[tile], c_start[tile + 1]):
+        if c_opacities[c_entries[place]] > SOLID:
+            x_from, x_to, y_from, y_to = _within(c_boxes, c_entries[place], left, top)
             entries += 1
             fragments += (x_to - x_from) * (y_to - y_from)
-        for place in range(c_start[tile], c_start[tile + 1]):
-            if c_opacities[c_entries[place]] > SOLID:
-                x_from, x_to, y_from, y_to = _within(c_boxes, c_entries[place], left, top)
-                entries += 1
-                fragments += (x_to - x_from) * (y_to - y_from)
-        bounds[index, 0], bounds[index, 1] = entries, fragments
+    return entries, fragments
 
 
 @njit(cache=True, fastmath={"contract"})
@@ -1304,17 +1305,34 @@ def _covered(pixel, alpha, red, green, blue):
     return after, pixel[1] + weight * red, pixel[2] + weight * green, pixel[3] + weight * blue
 
 
+@njit(cache=True)
+def _by_pixel(pixels, entries, falloffs, count, begin, pixel_start, to_entries, to_falloffs):
+    """Write the `count` fragments of a tile behind `begin` others, those of a pixel together and in
+    their order; pixel_start [TILE² + 1] tells where."""
+    pixel_start[:] = 0
+    for k in range(count):
+        pixel_start[pixels[k]] += 1
+    place = begin
+    for pixel in range(TILE * TILE):
+        place, pixel_start[pixel] = place + pixel_start[pixel], place
+    for k in range(count):
+        place = pixel_start[pixels[k]]
+        to_entries[place], to_falloffs[place] = entries[k], falloffs[k]
+        pixel_start[pixels[k]] = place + 1
+    for pixel in range(TILE * TILE, 0, -1):  # Each has come to where the next one starts.
+        pixel_start[pixel] = pixel_start[pixel - 1]
+    pixel_start[0] = begin
+
+
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def find_fragments(begin, end, context, new, new_slots, room, found, counts):
-    """Find the fragments in tiles[begin:end] of two layers, and fold what is frozen.
+def find_fragments(begin, end, tiles, context, new, new_slots, behind):
+    """The Fragments of tiles[begin:end] of two layers, where what is frozen is folded.
 
     context, new: Layer; the opacities of `new` are 1. new_slots [entries] int32: their slots.
-    room [t + 1, 2] int64: where each tile has room in `found` for entries and fragments.
-    found: Fragments, which are written there. counts [t, 2] int64: how many each tile has.
+    behind [h, w, 3] float32 is written in these tiles.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
-    tiles, _, names, slots, starts, pixels, falloffs, before, behind = found
     height, width, _ = behind.shape
     tiles_x = (width + TILE - 1) // TILE
     state = _aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
@@ -1324,6 +1342,25 @@ def find_fragments(begin, end, context, new, new_slots, room, found, counts):
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
     infinity, one, position = np.float32(np.inf), np.float32(1), np.int32(0)
+
+    most = most_entries = most_at_once = 0
+    for index in range(begin, end):
+        tile = tiles[index]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        bounds = _most_fragments(tile, left, top, context, new)
+        most_entries, most = most_entries + bounds[0], most + bounds[1]
+        most_at_once = max(most_at_once, bounds[1])
+    # Only what is written of them takes memory.
+    pixels = np.empty(2 * most_at_once, np.uint8)
+    at_entries = np.empty(2 * most_at_once, np.int32)
+    at_falloffs = np.empty(2 * most_at_once, np.float32)
+    entry_start = np.zeros(end - begin + 1, np.int64)
+    names, slots = np.empty(most_entries, np.int32), np.empty(most_entries, np.int32)
+    pixel_start = np.empty((end - begin, TILE * TILE + 1), np.int64)
+    entries, falloffs = np.empty(2 * most, np.int32), np.empty(2 * most, np.float32)
+    folds, solid = np.empty((most, 4), np.float32), np.empty((most_entries, 3), np.float32)
+    entry = place = fold = row_of_solid = np.int64(0)
+
     for index in range(begin, end):
         tile = tiles[index]
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -1337,7 +1374,7 @@ def find_fragments(begin, end, context, new, new_slots, room, found, counts):
         row_limit[:] = np.iinfo(np.int32).max
         open_rows = rows
 
-        entry, place = room[index]
+        first_entry, count = entry, np.int64(0)
         c_begin, c_end = c_start[tile], c_start[tile + 1]
         n_begin, n_end = n_start[tile], n_start[tile + 1]
         c, n = c_begin, n_begin
@@ -1354,7 +1391,7 @@ def find_fragments(begin, end, context, new, new_slots, room, found, counts):
                 if c_opacities[i] <= SOLID:
                     open_rows -= _draw_rows(first, stop, position, state, last, row_limit, splat)
                     continue
-                names[entry], slots[entry] = ~i, -1
+                names[entry], slots[entry] = ~row_of_solid, -1
             else:
                 i = n_entries[n]
                 _, _, splat = _placed(n_splats, n_opacities, n_boxes, i, left, top)
@@ -1363,120 +1400,151 @@ def find_fragments(begin, end, context, new, new_slots, room, found, counts):
                 n += 1
                 n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
 
-            begun = place
+            begun = count
             x, y, u, v, w, opacity, red, green, blue, _ = splat
+            # A little more than where the falloff is MIN_ALPHA: exp takes longer than all the rest
+            farthest = math.log(opacity / MIN_ALPHA) + FARTHER
             for row in range(y_from, y_to):
                 if row_limit[row] < 0:
                     continue
                 dy = np.float32(row) - y
                 t = w * dy
                 for column in range(x_from, x_to):
-                    if state[row, 0, column] < 0:
-                        continue
                     s = u * (np.float32(column) - x) + v * dy
-                    falloff = opacity * math.exp(-(s * s + t * t))
+                    sigma = s * s + t * t
                     # Written so that NaN fails it.
+                    if not sigma <= farthest or state[row, 0, column] < 0:
+                        continue
+                    falloff = opacity * math.exp(-sigma)
                     if not falloff >= MIN_ALPHA:
                         continue
                     alpha = min(falloff, MAX_ALPHA)
                     own = not frozen or (alpha > SOLID and veiled[row, column])
                     if own:
                         veiled[row, column] = True
-                        inverse = one / known[row, 0, column]
-                        pixels[place] = np.uint8(row * TILE + column)
-                        falloffs[place] = falloff
-                        before[place, 0] = state[row, 0, column] * inverse
-                        for channel in range(1, 4):
-                            rest = state[row, channel, column] - known[row, channel, column]
-                            before[place, channel] = rest * inverse
-                        place += 1
+                        pixel = np.uint8(row * TILE + column)
+                        changed = False
+                        for channel in range(4):
+                            changed |= state[row, channel, column] != known[row, channel, column]
+                        if changed:
+                            inverse = one / known[row, 0, column]
+                            folds[fold, 0] = state[row, 0, column] * inverse
+                            for channel in range(1, 4):
+                                rest = state[row, channel, column] - known[row, channel, column]
+                                folds[fold, channel] = rest * inverse
+                            pixels[count], at_entries[count] = pixel, ~fold
+                            fold, count = fold + 1, count + 1
+                        pixels[count], at_falloffs[count] = pixel, falloff
+                        at_entries[count] = entry - first_entry
+                        count += 1
                     if frozen:
-                        pixel = (
+                        before = (
                             state[row, 0, column],
                             state[row, 1, column],
                             state[row, 2, column],
                             state[row, 3, column],
                         )
-                        pixel = _covered(pixel, alpha, red, green, blue)
+                        after = _covered(before, alpha, red, green, blue)
                         for channel in range(4):
-                            state[row, channel, column] = pixel[channel]
+                            state[row, channel, column] = after[channel]
                     if own:
                         known[row, 0, column] = abs(state[row, 0, column])
                         for channel in range(1, 4):
                             known[row, channel, column] = state[row, channel, column]
-            if place > begun:
-                starts[entry] = begun
+            if count > begun:
+                if frozen:
+                    solid[row_of_solid, 0], solid[row_of_solid, 1] = red, green
+                    solid[row_of_solid, 2] = blue
+                    row_of_solid += 1
                 entry += 1
 
-        counts[index, 0], counts[index, 1] = entry - room[index, 0], place - room[index, 1]
+        entry_start[index - begin + 1] = entry
+        starts = pixel_start[index - begin]
+        _by_pixel(pixels, at_entries, at_falloffs, count, place, starts, entries, falloffs)
+        place += count
         for row in range(rows):
             for column in range(columns):
                 inverse = one / known[row, 0, column]
                 for channel in range(3):
                     rest = state[row, 1 + channel, column] - known[row, 1 + channel, column]
                     behind[top + row, left + column, channel] = rest * inverse
+    return Fragments(
+        tiles[begin:end],
+        entry_start,
+        names[:entry],
+        slots[:entry],
+        pixel_start,
+        entries[:place],
+        falloffs[:place],
+        folds[:fold],
+        solid[:row_of_solid],
+        behind,
+    )
 
 
-@njit(cache=True, fastmath={"contract"})
-def _looks(name, opacities, colours, frozen):
-    """Opacity and colour of an entry of `Fragments`; of a frozen one falloffs are alphas."""
-    if name >= 0:
-        return opacities[name], colours[name, 0], colours[name, 1], colours[name, 2]
-    return np.float32(1), frozen[~name, RED], frozen[~name, GREEN], frozen[~name, BLUE]
+@njit(cache=True)
+def _looks(fragments, index, opacities, colours):
+    """Opacity and colour of each entry of a tile [entries, 4]; of a frozen one falloffs are
+    alphas."""
+    first = fragments.entry_start[index]
+    looks = np.empty((fragments.entry_start[index + 1] - first, 4), np.float32)
+    for k in range(len(looks)):
+        name = fragments.names[first + k]
+        if name >= 0:
+            looks[k, 0] = opacities[name]
+            for channel in range(3):
+                looks[k, 1 + channel] = colours[name, channel]
+        else:
+            looks[k, 0] = np.float32(1)
+            for channel in range(3):
+                looks[k, 1 + channel] = fragments.solid[~name, channel]
+    return looks
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def draw_fragments(begin, end, fragments, frozen, opacities, colours, image):
-    """Draw the tiles begin..end of those that have fragments.
+def draw_fragments(fragments, opacities, colours, image):
+    """Draw the pixels that have fragments.
 
-    fragments: Fragments. frozen: splats of the context. opacities [n], colours [n, 3] float32: of
-        the new splats. image [h, w, 3] float32 is written in these tiles.
+    opacities [n], colours [n, 3] float32: of the new splats. image [h, w, 3] float32 is written.
     """
-    tiles, entry_start, names, _, starts, pixels, falloffs, before, behind = fragments
-    height, width, _ = behind.shape
-    tiles_x = (width + TILE - 1) // TILE
-    # Transmittance, 0 where nothing more passes, and colour
-    state = np.empty((TILE * TILE, 4), np.float32)
+    tiles, _, _, _, starts, entries, falloffs, folds, _, behind = fragments
+    tiles_x = (behind.shape[1] + TILE - 1) // TILE
     zero, one = np.float32(0), np.float32(1)
-    for index in range(begin, end):
-        tile = tiles[index]
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        state[:] = 0
-        state[:, 0] = 1
-        for entry in range(entry_start[index], entry_start[index + 1]):
-            opacity, red, green, blue = _looks(names[entry], opacities, colours, frozen)
-            for place in range(starts[entry], starts[entry + 1]):
-                pixel = pixels[place]
-                transmittance = state[pixel, 0]
-                if transmittance <= zero:
+    for index in range(len(tiles)):
+        left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
+        looks = _looks(fragments, index, opacities, colours)
+        for pixel in range(TILE * TILE):
+            begin, end = starts[index, pixel], starts[index, pixel + 1]
+            if begin == end:
+                continue
+            transmittance, red, green, blue = one, zero, zero, zero
+            for place in range(begin, end):
+                entry = entries[place]
+                if entry < 0:
+                    red += transmittance * folds[~entry, 1]
+                    green += transmittance * folds[~entry, 2]
+                    blue += transmittance * folds[~entry, 3]
+                    transmittance *= folds[~entry, 0]
                     continue
-                for channel in range(1, 4):
-                    state[pixel, channel] += transmittance * before[place, channel]
-                transmittance *= before[place, 0]
-                raw = opacity * falloffs[place]
+                raw = looks[entry, 0] * falloffs[place]
                 alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
                 after = transmittance * (one - alpha)
                 if after <= MIN_TRANSMITTANCE:
-                    state[pixel, 0] = zero
-                    continue
-                weight = transmittance * alpha
-                state[pixel, 0] = after
-                state[pixel, 1] += weight * red
-                state[pixel, 2] += weight * green
-                state[pixel, 3] += weight * blue
-        for row in range(min(TILE, height - top)):
-            for column in range(min(TILE, width - left)):
-                y, x, pixel = top + row, left + column, row * TILE + column
-                for channel in range(3):
-                    rest = state[pixel, 0] * behind[y, x, channel]
-                    image[y, x, channel] = state[pixel, 1 + channel] + rest
+                    transmittance = zero
+                    break
+                weight, transmittance = transmittance * alpha, after
+                red += weight * looks[entry, 1]
+                green += weight * looks[entry, 2]
+                blue += weight * looks[entry, 3]
+            y, x = top + pixel // TILE, left + pixel % TILE
+            image[y, x, 0] = red + transmittance * behind[y, x, 0]
+            image[y, x, 1] = green + transmittance * behind[y, x, 1]
+            image[y, x, 2] = blue + transmittance * behind[y, x, 2]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def draw_fragments_backward(
-    begin, end, fragments, frozen, opacities, colours, image, d_image, gradients, written
-):
-    """Gradients of the new entries in the tiles begin..end from those of the image [h, w, 3].
+def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradients, written):
+    """Gradients of the new entries from those of the image [h, w, 3].
 
     It walks front to back like `draw_fragments`, whose arguments and image it takes: what is behind
     a fragment is the image less what is before.
@@ -1484,56 +1552,55 @@ def draw_fragments_backward(
     gradients [slots, 4] float32: of opacity, red, green and blue. written [slots] bool: set for the
         slots, and only those, that receive a gradient.
     """
-    tiles, entry_start, names, slots, starts, pixels, falloffs, before, behind = fragments
-    height, width, _ = behind.shape
-    tiles_x = (width + TILE - 1) // TILE
-    # Transmittance, colour times slope of what is behind, and the slopes of the three colours
-    state = np.empty((TILE * TILE, 5), np.float32)
+    tiles, entry_start, _, slots, starts, entries, falloffs, folds, _, behind = fragments
+    tiles_x = (behind.shape[1] + TILE - 1) // TILE
     zero, one = np.float32(0), np.float32(1)
-    for index in range(begin, end):
-        tile = tiles[index]
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        for row in range(min(TILE, height - top)):
-            for column in range(min(TILE, width - left)):
-                y, x, pixel = top + row, left + column, row * TILE + column
-                state[pixel, 0], state[pixel, 1] = one, zero
-                for channel in range(3):
-                    state[pixel, 1] += d_image[y, x, channel] * image[y, x, channel]
-                    state[pixel, 2 + channel] = d_image[y, x, channel]
-        for entry in range(entry_start[index], entry_start[index + 1]):
-            opacity, red, green, blue = _looks(names[entry], opacities, colours, frozen)
-            d_opacity = d_red = d_green = d_blue = zero
-            for place in range(starts[entry], starts[entry + 1]):
-                pixel = pixels[place]
-                transmittance = state[pixel, 0]
-                if transmittance <= zero:
+    for index in range(len(tiles)):
+        left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
+        looks = _looks(fragments, index, opacities, colours)
+        slopes = np.zeros(looks.shape, np.float32)
+        for pixel in range(TILE * TILE):
+            begin, end = starts[index, pixel], starts[index, pixel + 1]
+            if begin == end:
+                continue
+            y, x = top + pixel // TILE, left + pixel % TILE
+            d_red, d_green, d_blue = d_image[y, x, 0], d_image[y, x, 1], d_image[y, x, 2]
+            if d_red == zero and d_green == zero and d_blue == zero:
+                continue
+            # Colour times slope of what is behind
+            rest = d_red * image[y, x, 0] + d_green * image[y, x, 1] + d_blue * image[y, x, 2]
+            transmittance = one
+            for place in range(begin, end):
+                entry = entries[place]
+                if entry < 0:
+                    folded = folds[~entry, 1] * d_red + folds[~entry, 2] * d_green
+                    folded += folds[~entry, 3] * d_blue
+                    rest -= transmittance * folded
+                    transmittance *= folds[~entry, 0]
                     continue
-                slope_red, slope_green = state[pixel, 2], state[pixel, 3]
-                slope_blue = state[pixel, 4]
-                folded = before[place, 1] * slope_red + before[place, 2] * slope_green
-                folded += before[place, 3] * slope_blue
-                rest = state[pixel, 1] - transmittance * folded
-                transmittance *= before[place, 0]
-                raw = opacity * falloffs[place]
+                raw = looks[entry, 0] * falloffs[place]
                 alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
                 after = transmittance * (one - alpha)
                 if after <= MIN_TRANSMITTANCE:
-                    state[pixel, 0] = zero
-                    continue
+                    break
                 weight = transmittance * alpha
-                value = red * slope_red + green * slope_green + blue * slope_blue
+                value = looks[entry, 1] * d_red + looks[entry, 2] * d_green
+                value += looks[entry, 3] * d_blue
                 rest -= weight * value
-                state[pixel, 0], state[pixel, 1] = after, rest
-                d_red += weight * slope_red
-                d_green += weight * slope_green
-                d_blue += weight * slope_blue
+                slopes[entry, 1] += weight * d_red
+                slopes[entry, 2] += weight * d_green
+                slopes[entry, 3] += weight * d_blue
                 if alpha == raw:
-                    d_opacity += falloffs[place] * (transmittance * value - rest / (one - alpha))
-            if slots[entry] >= 0:
-                slot = slots[entry]
+                    more = transmittance * value - rest / (one - alpha)
+                    slopes[entry, 0] += falloffs[place] * more
+                transmittance = after
+        first = entry_start[index]
+        for k in range(len(slopes)):
+            slot = slots[first + k]
+            if slot >= 0:
                 written[slot] = True
-                gradients[slot, 0], gradients[slot, 1] = d_opacity, d_red
-                gradients[slot, 2], gradients[slot, 3] = d_green, d_blue
+                for column in range(4):
+                    gradients[slot, column] = slopes[k, column]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

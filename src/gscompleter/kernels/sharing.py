@@ -44,20 +44,21 @@ def share(kernel, count, *arguments, threads=None):
     out: as many as there are usable cores where that is not set.
     """
     threads = _sharing(threads)
-    pieces = ranges(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
-    run(kernel, [(*piece, *arguments) for piece in pieces], threads)
+    run(kernel, [(*piece, *arguments) for piece in pieces_of(count, threads)], threads)
+
+
+def pieces_of(count, threads):
+    """range(count) cut into pieces that `threads` take in turns."""
+    return ranges(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
 
 
 def run(kernel, calls, threads=None):
-    """Call a kernel, which releases the interpreter lock, with each of `calls`."""
+    """What a kernel, which releases the interpreter lock, returns of each of `calls`."""
     threads = _sharing(threads)
     if threads == 1 or len(calls) == 1:
-        for arguments in calls:
-            kernel(*arguments)
-        return
+        return [kernel(*arguments) for arguments in calls]
     pool = thread_pool(threads, os.getpid())
-    for future in [pool.submit(kernel, *arguments) for arguments in calls]:
-        future.result()
+    return [future.result() for future in [pool.submit(kernel, *call) for call in calls]]
 
 
 def side_by_side(function, *arguments):

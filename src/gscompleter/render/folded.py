@@ -6,6 +6,7 @@ transmittance of all that is frozen there. So a drawing costs what is new, howev
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -17,9 +18,9 @@ from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gscompleter.kernels import lists
 from gscompleter.kernels import rasterizer as kernels
 from gscompleter.kernels.rasterizer import Fragments
+from gscompleter.kernels.sharing import pieces_of, run
 
 if TYPE_CHECKING:
     from gscompleter.render.cpu import Binned, CpuView, Viewpoint
@@ -34,9 +35,8 @@ class Folded:
     """The frozen scene alone."""
     binned: Binned
     means: Float32[ndarray, "n 3"]
-    fragments: Fragments
-    solid: Float32[ndarray, "solid 9"]
-    """The frozen splats that have fragments, as `Layer` has them."""
+    fragments: Sequence[Fragments]
+    """Of some tiles each."""
 
     def __call__(
         self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
@@ -49,7 +49,8 @@ class Folded:
     def shown(self) -> Int64[ndarray, "shown"]:
         """Which of the Gaussians have fragments."""
         named = np.zeros(len(self.means), np.bool_)
-        named[self.fragments.names[self.fragments.names >= 0]] = True
+        for piece in self.fragments:
+            named[piece.names[piece.names >= 0]] = True
         return np.flatnonzero(named)
 
     def colours(self, sh: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n 3"]:
@@ -64,9 +65,8 @@ class Folded:
     ) -> Float32[ndarray, "h w 3"]:
         """The frozen image, drawn anew where it has fragments."""
         image = self.image.copy()
-        drawn = (self.fragments, self.solid, opacities, colours, image)
-        count = len(self.fragments.tiles)
-        self.viewpoint.share(kernels.draw_fragments, count, *drawn)
+        drawn = [(piece, opacities, colours, image) for piece in self.fragments]
+        run(kernels.draw_fragments, drawn, self.viewpoint.threads)
         return image
 
     def slopes(
@@ -79,11 +79,10 @@ class Folded:
         """Of opacities and colours, from those of the image."""
         values = np.empty((len(self.binned.slots), 4), np.float32)
         written = np.zeros(len(values), np.bool_)
-        drawn = (self.fragments, self.solid, opacities, colours, image, d_image)
-        count = len(self.fragments.tiles)
-        received = (values, written)
-        self.viewpoint.share(kernels.draw_fragments_backward, count, *drawn, *received)
-        return self.viewpoint.sums(self.binned, received)
+        drawn = (opacities, colours, image, d_image, values, written)
+        pieces = [(piece, *drawn) for piece in self.fragments]
+        run(kernels.draw_fragments_backward, pieces, self.viewpoint.threads)
+        return self.viewpoint.sums(self.binned, (values, written))
 
     def slopes_of_sh(
         self, colours: Float32[ndarray, "n 3"], slopes: Float32[ndarray, "n 3"], bands: int
@@ -124,64 +123,11 @@ def folded(view: CpuView, binned: Binned, means: Float32[ndarray, "n 3"]) -> Fol
     """The fragments of splats of opacity 1, and what is frozen between them."""
     viewpoint, context, new = view.viewpoint, view.layer, binned.layer
     tiles = np.flatnonzero(np.diff(new.tile_start))
-    bounds = np.zeros((len(tiles), 2), np.int64)
-    viewpoint.share(
-        kernels.bound_fragments, len(tiles), tiles, viewpoint.tiles_x, context, new, bounds
-    )
-    room = np.concatenate([np.zeros((1, 2), np.int64), bounds.cumsum(axis=0)])
-    entries, count = room[-1]
-    found = Fragments(
-        tiles,
-        room[:, 0].copy(),
-        np.empty(entries, np.int32),
-        np.empty(entries, np.int32),
-        np.empty(entries, np.int64),
-        np.empty(count, np.uint8),
-        np.empty(count, np.float32),
-        np.empty((count, 4), np.float32),
-        np.zeros_like(view.frame.image),
-    )
-    counts = np.empty((len(tiles), 2), np.int64)
-    known = (context, new, binned.slots, room)
-    viewpoint.share(kernels.find_fragments, len(tiles), *known, found, counts)
-    fragments, solid = with_solid(packed(viewpoint, found, room, counts), context.splats)
-    return Folded(viewpoint, view.frame.image, binned, means, fragments, solid)
-
-
-def with_solid(
-    fragments: Fragments, splats: Float32[ndarray, "splats 9"]
-) -> tuple[Fragments, Float32[ndarray, "solid 9"]]:
-    """The fragments, and those of the frozen splats that they name, numbered anew: most of a scene
-    has none, and need not be kept."""
-    frozen, names = fragments.names < 0, fragments.names.copy()
-    named, names[frozen] = np.unique(~names[frozen], return_inverse=True)
-    names[frozen] = ~names[frozen]
-    return fragments._replace(names=names), splats[named]
-
-
-def packed(
-    viewpoint: Viewpoint,
-    found: Fragments,
-    room: Int64[ndarray, "bounds 2"],
-    counts: Int64[ndarray, "tiles 2"],
-) -> Fragments:
-    """The fragments that were found, without the room between them."""
-    ends = np.concatenate([np.zeros((1, 2), np.int64), counts.cumsum(axis=0)])
-    entries, count = ends[-1]
-    left = Fragments(
-        found.tiles,
-        ends[:, 0].copy(),
-        np.empty(entries, np.int32),
-        np.empty(entries, np.int32),
-        np.empty(entries + 1, np.int64),
-        np.empty(count, np.uint8),
-        np.empty(count, np.float32),
-        np.empty((count, 4), np.float32),
-        found.behind,
-    )
-    left.start[-1] = count
-    viewpoint.share(lists.pack_fragments, len(found.tiles), room, ends, found, left)
-    return left
+    behind = np.zeros_like(view.frame.image)
+    known = (tiles, context, new, binned.slots, behind)
+    pieces = [(*piece, *known) for piece in pieces_of(len(tiles), viewpoint.threads)]
+    fragments = run(kernels.find_fragments, pieces, viewpoint.threads)
+    return Folded(viewpoint, view.frame.image, binned, means, fragments)
 
 
 def float32(values: Tensor) -> Float32[ndarray, "..."]:
