@@ -1251,10 +1251,12 @@ class Fragments(NamedTuple):
     pixel_start: np.ndarray
     """Where the fragments of each pixel start, row by row, and the end [t, TILE² + 1] int64."""
     entries: np.ndarray
-    """Which entry of its tile each fragment is of, or the complement of which of `folds` lies there
-    [f] int32."""
+    """Which entry of its tile each fragment is of; behind the entries of a tile its folds are
+    counted [f] int32."""
     falloffs: np.ndarray
-    """Its alpha at opacity 1, of a frozen one its alpha [f] float32."""
+    """Its alpha at opacity 1, of a frozen one its alpha, of a fold nothing [f] float32."""
+    fold_start: np.ndarray
+    """Where the folds of each tile start [t + 1] int64."""
     folds: np.ndarray
     """Transmittance, and colour, of what is folded [g, 4] float32."""
     solid: np.ndarray
@@ -1306,22 +1308,28 @@ def _covered(pixel, alpha, red, green, blue):
 
 
 @njit(cache=True)
-def _by_pixel(pixels, entries, falloffs, count, begin, pixel_start, to_entries, to_falloffs):
-    """Write the `count` fragments of a tile behind `begin` others, those of a pixel together and in
-    their order; pixel_start [TILE² + 1] tells where."""
-    pixel_start[:] = 0
+def _by_pixel(
+    pixels, entries, falloffs, count, first_fold, behind, begin, starts, to_entries, to_falloffs
+):
+    """Write the `count` fragments of a tile from `begin` on, those of a pixel together and in their
+    order; starts [TILE² + 1] tells where. Folds, from `first_fold` on, are counted from `behind`.
+    """
+    starts[:] = 0
     for k in range(count):
-        pixel_start[pixels[k]] += 1
+        starts[pixels[k]] += 1
     place = begin
     for pixel in range(TILE * TILE):
-        place, pixel_start[pixel] = place + pixel_start[pixel], place
+        place, starts[pixel] = place + starts[pixel], place
     for k in range(count):
-        place = pixel_start[pixels[k]]
-        to_entries[place], to_falloffs[place] = entries[k], falloffs[k]
-        pixel_start[pixels[k]] = place + 1
+        place = starts[pixels[k]]
+        entry = entries[k]
+        if entry < 0:
+            entry, falloffs[k] = behind + ~entry - first_fold, 0
+        to_entries[place], to_falloffs[place] = entry, falloffs[k]
+        starts[pixels[k]] = place + 1
     for pixel in range(TILE * TILE, 0, -1):  # Each has come to where the next one starts.
-        pixel_start[pixel] = pixel_start[pixel - 1]
-    pixel_start[0] = begin
+        starts[pixel] = starts[pixel - 1]
+    starts[0] = begin
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -1341,7 +1349,8 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
     veiled = np.empty((TILE, TILE), np.bool_)
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
-    infinity, one, position = np.float32(np.inf), np.float32(1), np.int32(0)
+    infinity, zero, one = np.float32(np.inf), np.float32(0), np.float32(1)
+    position = np.int32(0)
 
     most = most_entries = most_at_once = 0
     for index in range(begin, end):
@@ -1358,6 +1367,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
     names, slots = np.empty(most_entries, np.int32), np.empty(most_entries, np.int32)
     pixel_start = np.empty((end - begin, TILE * TILE + 1), np.int64)
     entries, falloffs = np.empty(2 * most, np.int32), np.empty(2 * most, np.float32)
+    fold_start = np.zeros(end - begin + 1, np.int64)
     folds, solid = np.empty((most, 4), np.float32), np.empty((most_entries, 3), np.float32)
     entry = place = fold = row_of_solid = np.int64(0)
 
@@ -1374,7 +1384,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
         row_limit[:] = np.iinfo(np.int32).max
         open_rows = rows
 
-        first_entry, count = entry, np.int64(0)
+        first_entry, first_fold, count = entry, fold, np.int64(0)
         c_begin, c_end = c_start[tile], c_start[tile + 1]
         n_begin, n_end = n_start[tile], n_start[tile + 1]
         c, n = c_begin, n_begin
@@ -1404,18 +1414,23 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
             x, y, u, v, w, opacity, red, green, blue, _ = splat
             # A little more than where the falloff is MIN_ALPHA: exp takes longer than all the rest
             farthest = math.log(opacity / MIN_ALPHA) + FARTHER
+            inverse_u, shear = one / u, v / u
             for row in range(y_from, y_to):
                 if row_limit[row] < 0:
                     continue
                 dy = np.float32(row) - y
                 t = w * dy
-                for column in range(x_from, x_to):
-                    s = u * (np.float32(column) - x) + v * dy
-                    sigma = s * s + t * t
-                    # Written so that NaN fails it.
-                    if not sigma <= farthest or state[row, 0, column] < 0:
+                reach, middle = inverse_u * math.sqrt(max(farthest - t * t, zero)), x - shear * dy
+                from_x = max(middle - reach, np.float32(x_from))
+                to_x = min(middle + reach, np.float32(x_to - 1))
+                # Written so that NaN fails it, here and below.
+                if not (t * t <= farthest and from_x <= to_x):
+                    continue
+                for column in range(math.ceil(from_x), int(to_x) + 1):
+                    if state[row, 0, column] < 0:
                         continue
-                    falloff = opacity * math.exp(-sigma)
+                    s = u * (np.float32(column) - x) + v * dy
+                    falloff = opacity * math.exp(-(s * s + t * t))
                     if not falloff >= MIN_ALPHA:
                         continue
                     alpha = min(falloff, MAX_ALPHA)
@@ -1423,15 +1438,15 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
                     if own:
                         veiled[row, column] = True
                         pixel = np.uint8(row * TILE + column)
-                        changed = False
-                        for channel in range(4):
-                            changed |= state[row, channel, column] != known[row, channel, column]
-                        if changed:
+                        # Whatever is frozen lets less pass.
+                        if state[row, 0, column] != known[row, 0, column]:
                             inverse = one / known[row, 0, column]
                             folds[fold, 0] = state[row, 0, column] * inverse
                             for channel in range(1, 4):
                                 rest = state[row, channel, column] - known[row, channel, column]
                                 folds[fold, channel] = rest * inverse
+                            for channel in range(4):
+                                known[row, channel, column] = state[row, channel, column]
                             pixels[count], at_entries[count] = pixel, ~fold
                             fold, count = fold + 1, count + 1
                         pixels[count], at_falloffs[count] = pixel, falloff
@@ -1447,10 +1462,8 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
                         after = _covered(before, alpha, red, green, blue)
                         for channel in range(4):
                             state[row, channel, column] = after[channel]
-                    if own:
-                        known[row, 0, column] = abs(state[row, 0, column])
-                        for channel in range(1, 4):
-                            known[row, channel, column] = state[row, channel, column]
+                            if own:
+                                known[row, channel, column] = abs(after[channel])
             if count > begun:
                 if frozen:
                     solid[row_of_solid, 0], solid[row_of_solid, 1] = red, green
@@ -1458,9 +1471,9 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
                     row_of_solid += 1
                 entry += 1
 
-        entry_start[index - begin + 1] = entry
-        starts = pixel_start[index - begin]
-        _by_pixel(pixels, at_entries, at_falloffs, count, place, starts, entries, falloffs)
+        entry_start[index - begin + 1], fold_start[index - begin + 1] = entry, fold
+        found = pixels, at_entries, at_falloffs, count, first_fold, entry - first_entry
+        _by_pixel(*found, place, pixel_start[index - begin], entries, falloffs)
         place += count
         for row in range(rows):
             for column in range(columns):
@@ -1476,6 +1489,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
         pixel_start,
         entries[:place],
         falloffs[:place],
+        fold_start,
         folds[:fold],
         solid[:row_of_solid],
         behind,
@@ -1484,11 +1498,13 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
 
 @njit(cache=True)
 def _looks(fragments, index, opacities, colours):
-    """Opacity and colour of each entry of a tile [entries, 4]; of a frozen one falloffs are
-    alphas."""
-    first = fragments.entry_start[index]
-    looks = np.empty((fragments.entry_start[index + 1] - first, 4), np.float32)
-    for k in range(len(looks)):
+    """Opacity and colour of each entry of a tile, of a frozen one 1 and its colour, and behind them
+    the folds [entries + folds, 4]; and the number of entries."""
+    first, first_fold = fragments.entry_start[index], fragments.fold_start[index]
+    count = fragments.entry_start[index + 1] - first
+    folds = fragments.fold_start[index + 1] - first_fold
+    looks = np.empty((count + folds, 4), np.float32)
+    for k in range(count):
         name = fragments.names[first + k]
         if name >= 0:
             looks[k, 0] = opacities[name]
@@ -1498,21 +1514,26 @@ def _looks(fragments, index, opacities, colours):
             looks[k, 0] = np.float32(1)
             for channel in range(3):
                 looks[k, 1 + channel] = fragments.solid[~name, channel]
-    return looks
+    for k in range(folds):
+        for column in range(4):
+            looks[count + k, column] = fragments.folds[first_fold + k, column]
+    return looks, count
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def draw_fragments(fragments, opacities, colours, image):
     """Draw the pixels that have fragments.
 
+    Whether one is a fold is no branch: processors cannot foretell it.
+
     opacities [n], colours [n, 3] float32: of the new splats. image [h, w, 3] float32 is written.
     """
-    tiles, _, _, _, starts, entries, falloffs, folds, _, behind = fragments
+    tiles, _, _, _, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
     zero, one = np.float32(0), np.float32(1)
     for index in range(len(tiles)):
         left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
-        looks = _looks(fragments, index, opacities, colours)
+        looks, count = _looks(fragments, index, opacities, colours)
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
             if begin == end:
@@ -1520,19 +1541,14 @@ def draw_fragments(fragments, opacities, colours, image):
             transmittance, red, green, blue = one, zero, zero, zero
             for place in range(begin, end):
                 entry = entries[place]
-                if entry < 0:
-                    red += transmittance * folds[~entry, 1]
-                    green += transmittance * folds[~entry, 2]
-                    blue += transmittance * folds[~entry, 3]
-                    transmittance *= folds[~entry, 0]
-                    continue
-                raw = looks[entry, 0] * falloffs[place]
+                own, look = entry < count, looks[entry, 0]
+                raw = look * falloffs[place]
                 alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
-                after = transmittance * (one - alpha)
-                if after <= MIN_TRANSMITTANCE:
+                after = transmittance * (one - alpha if own else look)
+                if own and after <= MIN_TRANSMITTANCE:
                     transmittance = zero
                     break
-                weight, transmittance = transmittance * alpha, after
+                weight, transmittance = transmittance * (alpha if own else one), after
                 red += weight * looks[entry, 1]
                 green += weight * looks[entry, 2]
                 blue += weight * looks[entry, 3]
@@ -1552,13 +1568,13 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
     gradients [slots, 4] float32: of opacity, red, green and blue. written [slots] bool: set for the
         slots, and only those, that receive a gradient.
     """
-    tiles, entry_start, _, slots, starts, entries, falloffs, folds, _, behind = fragments
+    tiles, entry_start, _, slots, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
     zero, one = np.float32(0), np.float32(1)
     for index in range(len(tiles)):
         left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
-        looks = _looks(fragments, index, opacities, colours)
-        slopes = np.zeros(looks.shape, np.float32)
+        looks, count = _looks(fragments, index, opacities, colours)
+        slopes = np.zeros(looks.shape, np.float32)  # Those of folds are not asked for.
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
             if begin == end:
@@ -1572,30 +1588,24 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
             transmittance = one
             for place in range(begin, end):
                 entry = entries[place]
-                if entry < 0:
-                    folded = folds[~entry, 1] * d_red + folds[~entry, 2] * d_green
-                    folded += folds[~entry, 3] * d_blue
-                    rest -= transmittance * folded
-                    transmittance *= folds[~entry, 0]
-                    continue
-                raw = looks[entry, 0] * falloffs[place]
+                own, look = entry < count, looks[entry, 0]
+                raw = look * falloffs[place]
                 alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
-                after = transmittance * (one - alpha)
-                if after <= MIN_TRANSMITTANCE:
+                after = transmittance * (one - alpha if own else look)
+                if own and after <= MIN_TRANSMITTANCE:
                     break
-                weight = transmittance * alpha
+                weight = transmittance * (alpha if own else one)
                 value = looks[entry, 1] * d_red + looks[entry, 2] * d_green
                 value += looks[entry, 3] * d_blue
                 rest -= weight * value
                 slopes[entry, 1] += weight * d_red
                 slopes[entry, 2] += weight * d_green
                 slopes[entry, 3] += weight * d_blue
-                if alpha == raw:
-                    more = transmittance * value - rest / (one - alpha)
-                    slopes[entry, 0] += falloffs[place] * more
+                more = falloffs[place] * (transmittance * value - rest / (one - alpha))
+                slopes[entry, 0] += more if alpha == raw else zero
                 transmittance = after
         first = entry_start[index]
-        for k in range(len(slopes)):
+        for k in range(count):
             slot = slots[first + k]
             if slot >= 0:
                 written[slot] = True

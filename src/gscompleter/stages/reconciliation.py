@@ -147,10 +147,11 @@ class Turns:
 
     def take(self, count: int) -> list[int]:
         """The next `count` of them."""
-        worst = sorted(self._waiting, key=self.excess.__getitem__, reverse=True)[: count // 2]
+        over = [k for k in self._waiting if self.excess[k] > 0]
+        worst = sorted(over, key=self.excess.__getitem__, reverse=True)[: count // 2]
         others = [k for k in self._waiting if k not in worst]
-        chosen = [*worst, *others[: count - len(worst)]]
-        self._waiting = [*others[count - len(worst) :], *chosen]
+        chosen = [*worst, *others[: count - count // 2]]
+        self._waiting = [*others[count - count // 2 :], *chosen]
         return chosen
 
 
