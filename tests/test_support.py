@@ -29,7 +29,7 @@ from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.stereo import corrected, stereo_among
 from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
-from gscompleter.types import SceneContext, merge, sh_from_rgb
+from gscompleter.types import Completion, SceneContext, merge, sh_from_rgb
 from scenes import (
     Room,
     camera_at,
@@ -295,7 +295,9 @@ def test_a_sorted_scene_is_the_same_in_the_order_of_its_file():
         sorted_aside = None if aside is None else aside[order]
         context = SCENE[order]
         left = context if aside is None else context[~aside[order]]
-        found = as_in_file(context, merge([left, added]), sorted_aside, brought)
+        drawn = merge([left, added])
+        completion = Completion(drawn, context, (), (), (), {}, set_aside=sorted_aside)
+        found = as_in_file(completion, brought)
         kept = SCENE if aside is None else SCENE[~aside]
         assert torch.equal(found[0].means, SCENE.means)
         assert torch.equal(found[1].means, merge([kept, added]).means)

@@ -21,6 +21,9 @@ from gscompleter.types import Gaussians
 
 ROUNDS = 2
 """Each draws the splat where the former has put the cameras."""
+SETTLED = 0.25
+"""Pixels by which a round moves the points of a photograph, in the middle of all photographs, up to
+which another would change nothing."""
 
 
 def refined(
@@ -42,7 +45,10 @@ def refined(
         better = similarity_of(found)
         if better is None:
             return None
+        moved = np.median([_shift(place, transform, better) for place in found])
         transform = better
+        if moved <= SETTLED:
+            break
     return transform
 
 
@@ -65,8 +71,7 @@ def reprojected(found: Sequence[Located], start: Matrix) -> Matrix:
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    back = np.linalg.inv(start)
-    points = [place.points @ back[:3, :3].T + back[:3, 3] for place in found]
+    points = [brought_back(place, start) for place in found]
     center = np.median(np.concatenate(points), axis=0)
     unit = float(np.median(np.linalg.norm(np.concatenate(points) - center, axis=1)))
 
@@ -80,7 +85,19 @@ def reprojected(found: Sequence[Located], start: Matrix) -> Matrix:
         return np.concatenate([_misses(p @ moved[:3, :3].T + moved[:3, 3], f) for f, p in pairs])
 
     answer = least_squares(errors, np.zeros(7), loss="cauchy", f_scale=0.3 * MAX_ERROR)
-    return np.linalg.inv(change(answer.x) @ back)
+    return start @ np.linalg.inv(change(answer.x))
+
+
+def brought_back(place: Located, transform: Matrix) -> Float[np.ndarray, "m 3"]:
+    """The points of the splat that a photograph shows, in the photographs' frame."""
+    back = np.linalg.inv(transform)
+    return place.points @ back[:3, :3].T + back[:3, 3]
+
+
+def _shift(place: Located, before: Matrix, after: Matrix) -> float:
+    """By how much a photograph's points move in it from one similarity to another, in pixels."""
+    seen = [_misses(brought_back(place, m), place) for m in (before, after)]
+    return float(np.median(np.abs(seen[1] - seen[0])))
 
 
 def _misses(points: Float[np.ndarray, "m 3"], place: Located) -> Float[np.ndarray, "k"]:

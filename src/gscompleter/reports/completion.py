@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from gscompleter.reports.record import Limits, most_changed, record_of, write_re
 from gscompleter.splats.layout import save_like
 from gscompleter.splats.removed import NAME as REMOVED
 from gscompleter.splats.removed import save_removed
-from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion, View
+from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion, View, merge
 
 GENERATED = "generated.ply"
 """The file with what was added, alone."""
@@ -229,10 +230,13 @@ def write_scenes(folder: Path, completion: Completion, brought: Brought | None) 
     if brought is None:
         save_own(folder, completion)
         return
-    found = as_in_file(completion.context, completion.scene, completion.removed, brought)
-    save_ply(folder / CONTEXT, found[0])
-    save_brought(folder, *found, brought)
-    save_ply(folder / GENERATED, completion.added, provenance=True)
+    context, scene, aside = as_in_file(completion, brought)
+    writing = (
+        partial(save_ply, folder / CONTEXT, context),
+        partial(save_brought, folder, context, scene, aside, brought),
+        partial(save_ply, folder / GENERATED, completion.added, provenance=True),
+    )
+    side_by_side(lambda write: write(), writing)
 
 
 def write_pictures(
@@ -288,17 +292,17 @@ def save_own(folder: Path, completion: Completion) -> None:
 
 
 def as_in_file(
-    context: Gaussians, scene: Gaussians, aside: Bool[Tensor, "n"] | None, brought: Brought
+    completion: Completion, brought: Brought
 ) -> tuple[Gaussians, Gaussians, Bool[Tensor, "n"] | None]:
-    """The arguments in the order of the file, and what was added to the scene behind it."""
+    """The context, the scene and what was set aside, in the order of the file; what was added to
+    the scene is behind it."""
+    context, aside = completion.context, completion.removed
     if brought.order is None:
-        return context, scene, aside
+        return context, completion.scene, aside
     places = brought.order.argsort().to(context.means.device)
-    kept = torch.ones_like(places, dtype=torch.bool) if aside is None else ~aside
-    stays = kept[places]
-    number = (kept.cumsum(0) - 1)[places[stays]]
-    added = torch.arange(len(number), len(scene), device=number.device)
-    return context[places], scene[torch.cat([number, added])], None if aside is None else ~stays
+    context, aside = context[places], None if aside is None else aside[places]
+    stays = context if aside is None else context[~aside]
+    return context, merge([stays, completion.added]), aside
 
 
 def save_brought(

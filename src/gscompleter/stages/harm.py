@@ -39,7 +39,8 @@ def do_no_harm(
     In a view that got worse, a Gaussian is harmful where less opacity would bring the view nearer
     to its photograph. The most harmful ones are halved, no more of them than it takes. Where that
     does not help, as of two that hide each other, those at the pixels that got worse most are
-    removed; and in the end every generated Gaussian that the view sees, which restores it.
+    removed; and in the end every generated Gaussian that the view sees, which restores it. Once all
+    that got worse hold, every view is asked anew.
 
     Args:
         added: Generated Gaussians.
@@ -56,10 +57,11 @@ def do_no_harm(
         drawings = [image_of(frozen.plan(added)) for frozen in frozen_views]
     before = [frozen.context.image for frozen in frozen_views]
     checks = [Check(*each) for each in zip(views, before, drawings, allowed_errors, strict=True)]
-    opacities = added.opacities
+    opacities, asked = added.opacities, checks
     for trial in range(HALVINGS + REMOVALS + 1):
-        drawn = [Drawn.of(check, opacities) for check in checks]
-        worse = [seen for seen in drawn if seen.excess > 0]
+        worse = those_over(asked, opacities)
+        if not worse and len(asked) < len(checks):  # What gave way may have been in front.
+            worse = those_over(checks, opacities)
         if not worse:
             break
         lowered = [seen.to_lower(trial, added) for seen in worse]
@@ -67,6 +69,7 @@ def do_no_harm(
         opacities = torch.where(torch.stack(lowered).any(dim=0), left * opacities, opacities)
         if is_undone(added.opacities, opacities, config):
             return added[:0]
+        asked = [seen.check for seen in worse] if trial + 1 < HALVINGS else checks
     return replace(added, opacities=opacities, encoded=None)
 
 
@@ -121,6 +124,12 @@ class Drawn:
         relief = (errors - before) / errors.numel()
         pixels = fewest(relief.flatten(), self.excess).view(relief.shape)
         return falling_on(dilate(pixels, REACH), added, view.camera)
+
+
+def those_over(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[Drawn]:
+    """What the photographs see that are matched worse than allowed with these opacities."""
+    drawn = (Drawn.of(check, opacities) for check in checks)
+    return [seen for seen in drawn if seen.excess > 0]
 
 
 def is_undone(
