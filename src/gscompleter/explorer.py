@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from jaxtyping import Bool
 from torch import Tensor
@@ -11,8 +12,8 @@ from torch import Tensor
 from gscompleter.completer import Clock, GSCompleter
 from gscompleter.config import ExplorationConfig
 from gscompleter.geometry import same_camera
-from gscompleter.kernels.sharing import many_at_once
 from gscompleter.progress import stage, track
+from gscompleter.render import each_view
 from gscompleter.stages.anchor import select_anchor
 from gscompleter.stages.candidates import (
     Candidate,
@@ -130,8 +131,8 @@ class Explorer:
         """What there is to gain at each of `offers`, in the scene as it stands."""
         small = miniature(completion)
         anchors = [self.look(small, view.camera) for view in small.views]
-        each = map if small.drawn.means.is_cuda else many_at_once
-        choices = each(lambda offer: self.choice(small, anchors, offer), offers)
+        choose = partial(self.choice, small, anchors)
+        choices = each_view(small.drawn)(choose, offers)
         counted = zip(track(offers, "finding targets"), choices, strict=True)
         return [choice for _, choice in counted]
 

@@ -20,13 +20,13 @@ BYTES_PER_PIXEL_OF_A_VIEW = 250
 Measured on eight photographs instead of two, at 256 x 256 and 480 x 480."""
 
 MAX_KEPT = 2 * 2**30
-"""Bytes of splats that frozen views of a scene that was brought may hold together; those that are
-no context are drawn with as few Gaussians as that takes."""
+"""Bytes of splats that frozen views of a scene that was brought may hold together; it is drawn with
+as few Gaussians as that takes."""
 FREEZING_BYTES = 300
 """What each Gaussian takes while a view is frozen."""
 BYTES_PER_SPLAT = 52
 """What each Gaussian takes in a frozen view."""
-BYTES_PER_PIXEL_OF_A_WITNESS = 850
+BYTES_PER_PIXEL_OF_A_WITNESS = 500
 """What is fitted to a photograph of such a scene, for each of its pixels."""
 
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
@@ -81,19 +81,18 @@ def _refuse_beyond_memory(
         )
 
 
-def scene_bytes(count: int, numbers: int, contexts: int, photographs: Sequence[int]) -> int:
+def scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
     """About how much memory a scene that was brought takes besides, at most. Measured with 30
-    photographs: 2.7 GB in all for a million Gaussians, 4.1 for 4 and 7.4 for 10 million.
+    photographs: 2.3 GB in all for a million Gaussians, 3.7 for 4 and 6.4 for 10 million.
 
     Args:
         count: Its Gaussians.
         numbers: What each of them is made of, in float32.
-        contexts: How many of its photographs are the context.
         photographs: Pixels of each of all of them, as small as they are looked at.
     """
     number = len(photographs)
     drawn = min(count, most_that_fit(number))
-    views = (number * drawn + contexts * (count - drawn)) * BYTES_PER_SPLAT
+    views = number * drawn * BYTES_PER_SPLAT
     told = 2 * 4 * number * drawn  # how much of each the photographs show, and how they agree
     fitted = BYTES_PER_PIXEL_OF_A_WITNESS * sum(photographs)
     return count * (2 * 4 * numbers + FREEZING_BYTES) + views + told + fitted

@@ -442,7 +442,7 @@ def scene_needs(task: Task, scene: Gaussians) -> int:
     cameras = [view.camera for view in (*task.views, *(task.witnesses or ()))]
     numbers = sum(part[0].numel() for part in vars(scene).values() if part is not None)
     sizes = [camera.width * camera.height for camera in cameras]
-    return scene_bytes(len(scene), numbers, len(task.views), sizes)
+    return scene_bytes(len(scene), numbers, sizes)
 
 
 def check_sides(cameras: Sequence[Camera]) -> None:

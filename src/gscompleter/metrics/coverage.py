@@ -16,8 +16,7 @@ import torch
 from gscompleter.coverage import COVERED
 from gscompleter.frames.thinning import thinned
 from gscompleter.geometry import baseline_between, rotation_about, share_of_turn
-from gscompleter.kernels.sharing import many_at_once
-from gscompleter.render import Renderer
+from gscompleter.render import Renderer, each_view
 from gscompleter.stages.candidates import moved, shrunk, spacing
 from gscompleter.stages.exploration import MAX_GAUSSIANS
 from gscompleter.types import Camera, Completion, Render, merge
@@ -64,8 +63,7 @@ def looks_of(completion: Completion, cameras: Sequence[Camera], renderer: Render
         last = renderer.freeze(kept, camera) if aside else first
         return Look(first.context, last.composite(new))
 
-    each = map if new.means.is_cuda else many_at_once
-    return list(each(look, [shrunk(camera, SIDE) for camera in cameras]))
+    return list(each_view(new)(look, [shrunk(camera, SIDE) for camera in cameras]))
 
 
 def coverage_of(looks: Sequence[Look]) -> Coverage:

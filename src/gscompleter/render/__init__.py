@@ -8,14 +8,15 @@ compositing stopped when transmittance falls to 1e-4, colour over black.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
-from typing import Literal, Protocol, runtime_checkable
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError, quoted
+from gscompleter.kernels.sharing import many_at_once
 from gscompleter.types import Camera, Gaussians, Render
 
 OpacityRender = Callable[[Float[Tensor, "n"]], Render]
@@ -52,6 +53,12 @@ weight itself."""
 ColourErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColourSums]
 """Draws a frozen scene plus Gaussians of which only the colours [n, 3] may change, and sums what a
 photograph [h, w, 3] has more than the image."""
+
+
+def each_view(drawn: Gaussians) -> Callable[..., Iterable[Any]]:
+    """`map`, for what is done to one view of `drawn` after the other: on a CPU several at a time,
+    which then need not wait for each other's threads."""
+    return map if drawn.means.is_cuda else many_at_once
 
 
 @runtime_checkable

@@ -10,7 +10,7 @@ import weakref
 from collections.abc import Callable, Hashable, Sequence
 from itertools import accumulate, pairwise
 
-from gscompleter.render import FrozenView, Renderer
+from gscompleter.render import FrozenView, Renderer, each_view
 from gscompleter.types import Camera, Completion, Gaussians, merge
 
 Views = dict[Hashable, tuple[int, FrozenView]]
@@ -44,16 +44,18 @@ class KeptViews:
         if self._scene is None or self._scene() is not completion.drawn:
             self._scene, self._views, self._parts = weakref.ref(completion.drawn), {}, {}
         views, keys = self._views, [key_of(camera) for camera in cameras]
-        behind = {views[key][0] if key in views else 0 for key in keys}
-        missing = {count: self._since(completion, count) for count in behind}
-        for camera, key in zip(cameras, keys, strict=True):
-            count, view = views.get(key, (0, None))
+        known = [views.get(key, (0, None)) for key in keys]
+        missing = {count: self._since(completion, count) for count, _ in known}
+
+        def up_to_date(camera: Camera, kept: tuple[int, FrozenView | None]) -> FrozenView:
+            count, view = kept
             if view is None:
-                view = self._renderer.freeze(missing[0], camera)
-            elif count < len(completion.drawn):
-                view = view.extended(missing[count])
-            views[key] = len(completion.drawn), view
-        return tuple(views[key][1] for key in keys)
+                return self._renderer.freeze(missing[0], camera)
+            return view if count == len(completion.drawn) else view.extended(missing[count])
+
+        found = tuple(each_view(completion.drawn)(up_to_date, cameras, known))
+        views.update(zip(keys, ((len(completion.drawn), view) for view in found), strict=True))
+        return found
 
     def forget(self) -> None:
         """Let go of all views, whose memory is needed."""

@@ -81,12 +81,13 @@ def reconcile(
 def objections(
     fit: Fit, asked: Sequence[Asked], turns: Turns, count: int
 ) -> list[Float[Tensor, ""]]:
-    """The excess of the `count` photographs whose turn it is; `turns` learns it."""
+    """The excess of those of the `count` photographs whose turn it is that have any; `turns` learns
+    it."""
     chosen = turns.take(count)
     found = [fit.excess(asked[k]) for k in chosen]
     for k, over in zip(chosen, found, strict=True):
         turns.excess[k] = over.item()
-    return found
+    return [over for over in found if over > 0]
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from gscompleter.geometry import z_depths
 from gscompleter.kernels import evidence as kernels
 from gscompleter.kernels.evidence import Place
 from gscompleter.kernels.sharing import share, side_by_side
-from gscompleter.render import FrozenView
+from gscompleter.render import FrozenView, each_view
 from gscompleter.render.folded import float32
 from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import Camera, Evidence, Gaussians, Render, View
@@ -33,6 +33,8 @@ from gscompleter.types import Camera, Evidence, Gaussians, Render, View
 BLUR = 0.01
 """Radius over which differences of colour, and support, are averaged, of the longer side of an
 image: an edge may lie a pixel aside."""
+SAMPLE = 10_000
+"""Pixels by which the exposure of a photograph is known."""
 EXACT = 0.02
 """Median difference of colour up to which a scene counts as exact."""
 ENOUGH = 0.5
@@ -59,11 +61,15 @@ def gather_evidence(
     scale = config.max_difference * max(1.0, usual / EXACT)
     means = float32(drawn.means)
     areas, agreement = np.empty((2, len(views), len(means)), np.float32)
-    for k, (view, different) in enumerate(zip(views, differences, strict=True)):
-        agrees = torch.exp(-((different / scale) ** 2))
+
+    def gather(k: int) -> None:
+        agrees = torch.exp(-((differences[k] / scale) ** 2))
         layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
-        sums = float32(frozen[k].sums(layers))
-        share(kernels.tell, len(means), sums, means, place_of(view.camera), areas[k], agreement[k])
+        seen = (float32(frozen[k].sums(layers)), means, place_of(views[k].camera))
+        share(kernels.tell, len(means), *seen, areas[k], agreement[k])
+
+    for _ in each_view(drawn)(gather, range(len(views))):
+        pass
     told = (torch.from_numpy(array).to(drawn.means) for array in (areas, agreement))
     return Evidence(drawn.means, torch.stack([view.camera.center for view in views]), *told)
 
@@ -71,7 +77,9 @@ def gather_evidence(
 def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
     """Absolute difference of colour once the photograph's exposure is fitted, over a few pixels."""
     shown = render.image.clamp(0, 1)
-    gain, offset = robust_affine(shown.reshape(-1, 3), view.image.reshape(-1, 3))
+    pixels = slice(None, None, max(1, view.image[..., 0].numel() // SAMPLE))
+    pairs = (image.reshape(-1, 3)[pixels] for image in (shown, view.image))
+    gain, offset = robust_affine(*pairs)
     return blurred((gain * shown + offset - view.image).abs().mean(dim=-1))
 
 
