@@ -53,8 +53,9 @@ _MAX_LOGIT = 30.0
 _MAX_SCALE = 1e38
 """Larger scales are written as this one, so that what is read back is finite in float32."""
 
-_BLOCK = 8192
-"""Rows copied at a time: few enough to stay in the cache while one column follows another."""
+BLOCK = 8192
+"""Rows copied or written at a time: few enough to stay in the cache while one column follows
+another."""
 
 
 @dataclass(frozen=True)
@@ -300,7 +301,7 @@ def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
         table = np.empty((len(vertices), len(names)), np.float32)
         # A double beyond the range of float32 becomes infinite, and is counted as such.
         with np.errstate(over="ignore"):
-            for rows in _blocks(len(vertices)):
+            for rows in blocks(len(vertices)):
                 for column, name in enumerate(names):
                     table[rows, column] = vertices[name][rows]
         return torch.from_numpy(table)
@@ -358,8 +359,9 @@ def drawable(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     return good
 
 
-def _blocks(count: int) -> Iterator[slice]:
-    return (slice(start, start + _BLOCK) for start in range(0, count, _BLOCK))
+def blocks(count: int) -> Iterator[slice]:
+    """Rows 0 to `count`, `BLOCK` at a time."""
+    return (slice(start, start + BLOCK) for start in range(0, count, BLOCK))
 
 
 def _decoded_scales(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
@@ -402,15 +404,16 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
     """
     if provenance is None:
         provenance = bool((gaussians.generated > 0).any())
-    vertices = rows_of(gaussians.to("cpu"), provenance)
+    gaussians = gaussians.to("cpu")
     kinds = {"<f4": "float", "|u1": "uchar"}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    assert vertices.dtype.names is not None
-    lines += [f"property {kinds[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    dtype = rows_of(gaussians[:0], provenance).dtype
+    lines += [f"property {kinds[dtype[name].str]} {name}" for name in dtype.names or ()]
     header = "\n".join([*lines, "end_header", ""])
     with replacing(path) as file:
         file.write(header.encode("ascii"))
-        file.write(vertices.view(np.uint8).data)
+        for block in blocks(len(gaussians)):
+            file.write(rows_of(gaussians[block], provenance).view(np.uint8).data)
 
 
 def rows_of(gaussians: Gaussians, provenance: bool) -> np.ndarray:
@@ -425,9 +428,8 @@ def rows_of(gaussians: Gaussians, provenance: bool) -> np.ndarray:
 
     def put(columns: tuple[str, ...], values: Tensor) -> None:
         table = values.detach().float().numpy()
-        for rows in _blocks(len(vertices)):
-            for column, name in enumerate(columns):
-                vertices[name][rows] = table[rows, column]
+        for column, name in enumerate(columns):
+            vertices[name] = table[:, column]
 
     encoded = encode(gaussians)
     put(_MEANS, gaussians.means)

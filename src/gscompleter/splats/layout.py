@@ -7,7 +7,9 @@ stands behind them, rows are appended. Taking these out again leaves the file th
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.io.files import replacing
-from gscompleter.io.ply import Element, read_header, rows_of, save_ply
+from gscompleter.io.ply import Element, blocks, read_header, rows_of, save_ply
 from gscompleter.types import Gaussians
 
 LABEL = "generated"
@@ -83,10 +85,15 @@ def write_layout(path: Path, layout: Layout) -> None:
     Raises:
         InputError: where the file cannot be written.
     """
-    count = str(len(layout.rows)).encode()
+    write_rows(path, layout, len(layout.rows), [layout.rows])
+
+
+def write_rows(path: Path, layout: Layout, count: int, rows: Iterable[ndarray]) -> None:
+    """The same with other `rows` of its kind, `count` altogether, a part at a time."""
     with replacing(path) as file:
-        file.write(_COUNT.sub(rb"\g<1>" + count, layout.header, count=1))
-        file.write(layout.rows.view(np.uint8).data)
+        file.write(_COUNT.sub(rb"\g<1>" + str(count).encode(), layout.header, count=1))
+        for part in rows:
+            file.write(part.view(np.uint8).data)
         file.write(layout.behind)
 
 
@@ -140,17 +147,27 @@ def save_like(
     if layout is None or not _can_hold(layout, scene):
         save_ply(path, scene, provenance=True)
         return
-    context = layout.rows if kept is None else layout.rows[kept.numpy()]
-    if not _begins_with(scene, context):
+    context = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
+    if not _begins_with(scene, layout.rows, context):
         save_ply(path, scene, provenance=True)
         return
     label = [] if layout.is_labelled else [(LABEL, "u1")]
-    rows = np.zeros(len(scene), [*layout.rows.dtype.descr, *label])
-    _fill(rows[: len(context)], context)
-    _fill(rows[len(context) :], rows_of(scene[len(context) :], provenance=False))
-    rows[LABEL] = scene.generated.numpy()
+    dtype = np.dtype([*layout.rows.dtype.descr, *label])
+
+    def labelled(values: ndarray, labels: UInt8[Tensor, "m"]) -> ndarray:
+        rows = np.zeros(len(values), dtype)
+        _fill(rows, values)
+        rows[LABEL] = labels.numpy()
+        return rows
+
+    given_rows = (
+        labelled(layout.rows[context[block]], scene.generated[: len(context)][block])
+        for block in blocks(len(context))
+    )
+    added = scene[len(context) :]
+    added_rows = labelled(rows_of(added, provenance=False), added.generated)
     header = layout.header if layout.is_labelled else _labelled_header(layout)
-    write_layout(path, replace(layout, header=header, rows=rows))
+    write_rows(path, replace(layout, header=header), len(scene), chain(given_rows, [added_rows]))
 
 
 def _can_hold(layout: Layout, scene: Gaussians) -> bool:
@@ -159,13 +176,14 @@ def _can_hold(layout: Layout, scene: Gaussians) -> bool:
     return labels and layout.num_rest == 3 * (scene.sh.shape[1] - 1)
 
 
-def _begins_with(scene: Gaussians, context: ndarray) -> bool:
-    """Whether the first Gaussians of a scene stand where the rows of its context say."""
+def _begins_with(scene: Gaussians, rows: ndarray, context: Int[ndarray, "m"]) -> bool:
+    """Whether the first Gaussians of a scene stand where those rows of its context say."""
     if len(context) > len(scene):
         return False
     means = scene.means[: len(context)].numpy()
     return all(
-        np.array_equal(context[axis].astype(np.float32), means[:, column])
+        np.array_equal(rows[context[block]][axis].astype(np.float32), means[block, column])
+        for block in blocks(len(context))
         for column, axis in enumerate("xyz")
     )
 
