@@ -188,7 +188,7 @@ def test_whoever_stops_it_leaves_no_ffmpeg_behind(tmp_path, monkeypatch):
 
 
 def test_no_film_without_a_target(completion, tmp_path):
-    nothing = replace(completion, scene=completion.context, targets=())
+    nothing = replace(completion, drawn=completion.context, targets=())
     write_film(tmp_path, nothing, [completion.views[0].camera], load_renderer("reference"))
     assert list(tmp_path.iterdir()) == []
 

@@ -21,7 +21,14 @@ from gscompleter.geometry import between, bordered, project, same_camera, sample
 from gscompleter.masks import dilate, is_enclosed
 from gscompleter.progress import stage, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.render import FrozenView, Renderer, image_of, in_colours, load_renderer
+from gscompleter.render import (
+    FrozenView,
+    Renderer,
+    each_view,
+    image_of,
+    in_colours,
+    load_renderer,
+)
 from gscompleter.stages.anchor import (
     AnchorChoice,
     Synthesized,
@@ -568,7 +575,8 @@ class GSCompleter:
     def not_needed(self, completion: Completion, doubtful: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """The `doubtful` Gaussians of the scene as it stands that no photograph needs."""
         views, rest = completion.photographs, completion.drawn[~doubtful]
-        around = (self.renderer.freeze(rest, view.camera) for view in views)
+        cameras = [view.camera for view in views]
+        around = each_view(rest)(partial(self.renderer.freeze, rest), cameras)
         self.frozen.forget()  # A scene without `doubtful` is to come.
         gone = not_needed(completion.drawn[doubtful], around, views)
         return doubtful.masked_scatter(doubtful, gone)
