@@ -462,7 +462,7 @@ class GSCompleter:
         else:
             holes, degree = self.holes(sight), completion.context.sh_degree
             settings = config.reconcile.at_most(degree)
-            plans = [view.plan_appearance(kept) for view in frozen]
+            plans = list(each_view(kept)(lambda view: view.plan_appearance(kept), frozen))
             refined, losses = reconcile(
                 kept, sight.frozen, reference, holes, plans, judges, allowed, settings
             )

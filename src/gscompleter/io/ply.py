@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.files import replacing
+from gscompleter.kernels.sharing import side_by_side
 from gscompleter.types import Gaussians
 
 _SCALARS = {
@@ -308,19 +309,20 @@ def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
 
     names = {p.name for p in vertex.properties}
     num_rest = sum(name.startswith("f_rest_") for name in names)
-    rest = columns(tuple(f"f_rest_{i}" for i in range(num_rest)))
+    rests = tuple(f"f_rest_{i}" for i in range(num_rest))
+    tables = side_by_side(columns, [rests, _MEANS, _QUATS, (*_SCALES, "opacity"), _DC])
+    rest, means, quats, encoded, dc = tables
     rest = rest.view(len(vertices), 3, num_rest // 3).transpose(1, 2)
-    encoded = columns((*_SCALES, "opacity"))
     generated = np.zeros(len(vertices), np.uint8)
     if "generated" in names:
         with np.errstate(invalid="ignore"):
             generated = vertices["generated"].astype(np.uint8)
     return Gaussians(
-        means=columns(_MEANS),
-        quats=columns(_QUATS),
+        means=means,
+        quats=quats,
         scales=_decoded_scales(encoded),
         opacities=_decoded_opacities(encoded),
-        sh=torch.cat([columns(_DC)[:, None], rest], dim=1).contiguous(),
+        sh=torch.cat([dc[:, None], rest], dim=1).contiguous(),
         generated=torch.from_numpy(generated),
         encoded=encoded,
     )
