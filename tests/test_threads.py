@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gscompleter import threads
-from gscompleter.kernels.sharing import many_at_once, meanwhile, share
+from gscompleter.kernels.sharing import many_at_once, meanwhile, run, share, thread_pool
 from scenes import camera_at, photographed
 
 COUNTS = """
@@ -117,3 +117,29 @@ def test_many_at_once_come_in_their_order_and_fail_for_who_asks():
     assert list(many_at_once(lambda a, b: a - b, [5, 6, 7], [1, 2, 3])) == [4, 4, 4]
     with pytest.raises(ZeroDivisionError):
         list(many_at_once(divmod, [1, 2], [1, 0]))
+
+
+def test_who_asks_works_where_others_keep_the_threads_busy(monkeypatch):
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    done = threading.Event()
+    busy = thread_pool(1, os.getpid()).submit(done.wait, 60)
+    try:
+        assert run(divmod, [(number, 3) for number in range(7)]) == [divmod(n, 3) for n in range(7)]
+        with pytest.raises(ZeroDivisionError):
+            run(divmod, [(1, 1), (1, 0), (2, 1)])
+        assert not busy.done()
+    finally:
+        done.set()
+
+
+def test_pieces_are_taken_by_all_threads_and_come_in_their_order(monkeypatch):
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 3)
+    together = threading.Barrier(3, timeout=60)
+
+    def piece(number):
+        together.wait()  # Nobody gets on before three are here.
+        return number, threading.get_ident()
+
+    found = run(piece, [(number,) for number in range(6)])
+    assert [number for number, _ in found] == list(range(6))
+    assert len({thread for _, thread in found}) == 3

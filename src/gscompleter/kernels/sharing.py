@@ -53,12 +53,28 @@ def pieces_of(count, threads):
 
 
 def run(kernel, calls, threads=None):
-    """What a kernel, which releases the interpreter lock, returns of each of `calls`."""
+    """What a kernel, which releases the interpreter lock, returns of each of `calls`.
+
+    Who asks works, too, and does not wait for threads that others keep busy.
+    """
     threads = _sharing(threads)
     if threads == 1 or len(calls) == 1:
         return [kernel(*arguments) for arguments in calls]
-    pool = thread_pool(threads, os.getpid())
-    return [future.result() for future in [pool.submit(kernel, *call) for call in calls]]
+    results, waiting = [None] * len(calls), iter(enumerate(calls))
+
+    def work():
+        for number, arguments in waiting:
+            results[number] = kernel(*arguments)
+
+    pool = thread_pool(threads - 1, os.getpid())
+    helpers = [pool.submit(work) for _ in range(min(threads, len(calls)) - 1)]
+    try:
+        work()
+    finally:
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
+    return results
 
 
 def side_by_side(function, *arguments):

@@ -14,6 +14,7 @@ from gscompleter.config import HarmConfig
 from gscompleter.masks import dilate
 from gscompleter.render import FrozenView, OpacityImage, image_of
 from gscompleter.stages.integration import falling_on
+from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import Gaussians, View
 
 HALVINGS = 16
@@ -25,6 +26,7 @@ REACH = 2
 """Pixels around the worst ones within which Gaussians are lost."""
 
 
+@torch_on_one_thread()
 def do_no_harm(
     added: Gaussians,
     frozen_views: Sequence[FrozenView],

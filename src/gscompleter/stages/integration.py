@@ -15,6 +15,7 @@ from gscompleter.descent import Adam
 from gscompleter.geometry import inside, project
 from gscompleter.progress import track
 from gscompleter.render import OpacityRender
+from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import Camera, Gaussians, View
 
 
@@ -52,6 +53,7 @@ def has_settled(losses: Sequence[float], min_fall: float) -> bool:
     return len(losses) > 1 and losses[-2] - losses[-1] <= min_fall * losses[-2]
 
 
+@torch_on_one_thread()
 def refine_opacities(
     added: Gaussians,
     at_target: OpacityRender,

@@ -21,6 +21,7 @@ from gscompleter.render import FrozenView, Renderer
 from gscompleter.sky import surfaces_in
 from gscompleter.stages.alignment import fit_bridge
 from gscompleter.stages.sky_in_holes import sky_into_holes
+from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
 
 OCCLUSION_TOLERANCE = 0.05
@@ -40,6 +41,7 @@ class Registration:
     """Value of Eq. 11 at each iteration."""
 
 
+@torch_on_one_thread()
 def register(
     lift: Lift,
     frozen_target: FrozenView,
