@@ -224,7 +224,7 @@ class GSCompleter:
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
             gains = None
-            if scene is None or drawn is None:
+            if drawn is None:
                 drawn, gains = init_context(self.reconstructor, views)
                 views = exposed_alike(views, gains)
             context = drawn if scene is None else scene

@@ -22,11 +22,14 @@ Measured on eight photographs instead of two, at 256 x 256 and 480 x 480."""
 MAX_KEPT = 2 * 2**30
 """Bytes of splats that frozen views of a scene that was brought may hold together; it is drawn with
 as few Gaussians as that takes."""
-FREEZING_BYTES = 300
+COPIES = 4
+"""How often a scene is held: in the order that it is drawn in and in that of its file, each with
+and without what was added."""
+FREEZING_BYTES = 60
 """What each Gaussian takes while a view is frozen."""
 BYTES_PER_SPLAT = 52
 """What each Gaussian takes in a frozen view."""
-BYTES_PER_PIXEL_OF_A_WITNESS = 500
+BYTES_PER_PIXEL_OF_A_WITNESS = 400
 """What is fitted to a photograph of such a scene, for each of its pixels."""
 
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
@@ -82,8 +85,10 @@ def _refuse_beyond_memory(
 
 
 def scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
-    """About how much memory a scene that was brought takes besides, at most. Measured with 30
-    photographs: 2.3 GB in all for a million Gaussians, 3.7 for 4 and 6.4 for 10 million.
+    """About how much memory a scene that was brought takes besides, at most.
+
+    Measured with 30 photographs: 1.9 GB in all for a million Gaussians, 3.0 for 4 and 4.7 for 10
+    million; with 40, of 2 million with harmonics of degree 3: 5.8.
 
     Args:
         count: Its Gaussians.
@@ -95,7 +100,7 @@ def scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
     views = number * drawn * BYTES_PER_SPLAT
     told = 2 * 4 * number * drawn  # how much of each the photographs show, and how they agree
     fitted = BYTES_PER_PIXEL_OF_A_WITNESS * sum(photographs)
-    return count * (2 * 4 * numbers + FREEZING_BYTES) + views + told + fitted
+    return count * (COPIES * 4 * numbers + FREEZING_BYTES) + views + told + fitted
 
 
 def most_that_fit(number: int) -> int:
