@@ -58,7 +58,7 @@ photograph [h, w, 3] has more than the image."""
 def each_view(drawn: Gaussians) -> Callable[..., Iterable[Any]]:
     """`map`, for what is done to one view of `drawn` after the other: on a CPU several at a time,
     which then need not wait for each other's threads."""
-    return map if drawn.means.is_cuda else many_at_once
+    return many_at_once if drawn.means.device.type == "cpu" else map
 
 
 @runtime_checkable
