@@ -473,7 +473,8 @@ class Completion:
     @property
     def observed(self) -> Gaussians:
         """The context, bit for bit as it was, without what was set aside."""
-        return self.context if self.removed is None else self.context[~self.removed]
+        removed = self.removed
+        return self.context if removed is None else self.context[~removed]
 
     @cached_property
     def scene(self) -> Gaussians:

@@ -103,15 +103,12 @@ class _Drawn(torch.autograd.Function):
         colours, opaque = folded.colours(float32(sh)), float32(opacities)
         image = folded.draw(opaque, colours)
         ctx.scene = (folded, opaque, colours, image, sh.shape[1])
-        ctx.shapes = (opacities.shape, sh.shape)
         return torch.from_numpy(image)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         folded, opacities, colours, image, bands = ctx.scene
-        if not slope.any():  # A photograph that is content
-            return None, *(torch.zeros(shape) for shape in ctx.shapes)
         slopes = folded.slopes(opacities, colours, image, float32(slope))
         d_opacities, d_sh = np.ascontiguousarray(slopes[:, 0]), None
         if ctx.needs_input_grad[2]:
