@@ -21,8 +21,8 @@ from gscompleter.benchmark.crowding import crowded
 from gscompleter.commands.demo import moved
 from gscompleter.frames.thinning import thinned
 from gscompleter.metrics.image import psnr
+from gscompleter.render.proxy import run_by_run
 from gscompleter.splats.order import order_nearby
-from gscompleter.stages.proxy import run_by_run
 from gscompleter.types import Camera
 
 

@@ -14,10 +14,10 @@ from gscompleter.frames.thinning import thinned
 from gscompleter.memory import BYTES_PER_SPLAT
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
+from gscompleter.render import proxy as proxies
+from gscompleter.render.proxy import LARGEST, REACH, proxy_of, run_by_run
 from gscompleter.splats.order import order_nearby
-from gscompleter.stages import proxy as proxies
 from gscompleter.stages.exploration import thinned_evidence
-from gscompleter.stages.proxy import LARGEST, REACH, proxy_of, run_by_run
 from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
 from gscompleter.types import Evidence, Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, reconstruction_of, view_of

@@ -22,8 +22,9 @@ from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.memory import needed_bytes
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
+from gscompleter.render.proxy import WORTH
 from gscompleter.reports.completion import Brought, as_in_file
-from gscompleter.splats.order import WORTH, order_nearby
+from gscompleter.splats.order import order_nearby
 from gscompleter.stages.harm import squared_error
 from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed

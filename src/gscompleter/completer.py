@@ -29,6 +29,7 @@ from gscompleter.render import (
     in_colours,
     load_renderer,
 )
+from gscompleter.render.proxy import proxy_of
 from gscompleter.stages.anchor import (
     AnchorChoice,
     Synthesized,
@@ -45,7 +46,6 @@ from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.harm import do_no_harm, error_with_loss, squared_error
 from gscompleter.stages.integration import hole_mask, keep_in_holes, refine_opacities
 from gscompleter.stages.kept_views import KeptViews
-from gscompleter.stages.proxy import proxy_of
 from gscompleter.stages.reconciliation import reconcile
 from gscompleter.stages.registration import Registration, register
 from gscompleter.stages.setting_aside import not_needed

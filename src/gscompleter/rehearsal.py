@@ -15,7 +15,7 @@ from gscompleter.interpolation import smoothed
 from gscompleter.kernels.compiled import note_compiled
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.stages.proxy import run_by_run
+from gscompleter.render.proxy import run_by_run
 from gscompleter.stages.support import gather_evidence, support, weight_sums
 from gscompleter.types import Camera, Gaussians, Render, SceneContext, View, observed, sh_from_rgb
 

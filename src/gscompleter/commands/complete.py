@@ -53,6 +53,7 @@ from gscompleter.kernels.sharing import meanwhile
 from gscompleter.progress import expecting, preparing, shown_on, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
+from gscompleter.render.proxy import WORTH
 from gscompleter.reports.completion import Around, Target, write_report
 from gscompleter.reports.completion_page import completion_page
 from gscompleter.reports.film import NAME as FILM
@@ -61,7 +62,7 @@ from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
 from gscompleter.reports.plain_words import NO_TARGET, exposures, moved
 from gscompleter.splats.formats import load_splat
-from gscompleter.splats.order import WORTH, order_nearby
+from gscompleter.splats.order import order_nearby
 from gscompleter.types import Camera, Completion, View
 
 

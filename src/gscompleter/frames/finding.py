@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,10 +14,18 @@ from gscompleter.frames.fit import FrameFit, frame_fit
 from gscompleter.frames.matching import photographs_of
 from gscompleter.frames.refinement import refined
 from gscompleter.frames.search import searched
-from gscompleter.frames.similarity import Matrix, moved_view, pose_of, stand_apart
+from gscompleter.frames.similarity import (
+    Matrix,
+    moved_camera,
+    moved_view,
+    pose_of,
+    stand_apart,
+)
+from gscompleter.frames.thinning import thinned
 from gscompleter.frames.trainers import Points, Poses, trainers_frames
 from gscompleter.frames.witnesses import LONG_SIDE, rough_points
 from gscompleter.render import Renderer
+from gscompleter.render.proxy import proxy_of
 from gscompleter.types import Gaussians, View
 
 CLEARLY = 2.0
@@ -66,14 +74,22 @@ class Evidence:
     """All that tells where a splat lies."""
 
     scene: Gaussians
+    """The splat. One of very many lies in an order in which neighbours follow each other."""
     views: Sequence[View]
     """A few small photographs, in their own frame."""
     renderer: Renderer
 
+    def near(self, transform: Matrix) -> Evidence:
+        """The same with what the photographs can see of the splat if that is about where it lies,
+        by a transform from their frame to its."""
+        cameras = [moved_camera(view.camera, transform) for view in self.views]
+        proxy = proxy_of(self.scene, cameras)
+        return replace(self, scene=thinned(self.scene if proxy is None else proxy.scene))
+
     def at(self, transform: Matrix) -> FrameFit:
         """The fit under a transform from the photographs' frame to the splat's."""
         views = [moved_view(view, transform) for view in self.views]
-        return frame_fit(self.scene, views, self.renderer)
+        return frame_fit(self.near(transform).scene, views, self.renderer)
 
 
 def find_frame(
@@ -143,6 +159,7 @@ def better(fit: FrameFit, than: FrameFit) -> bool:
 
 def polished(evidence: Evidence, found: SplatFrame) -> SplatFrame:
     """`found`, or the similarity near it that features agree with where it is clearly better."""
+    evidence = evidence.near(found.transform)
     photographs = photographs_of(evidence.views)
     transform = refined(evidence.scene, photographs, found.transform, evidence.renderer)
     if transform is None:
@@ -157,13 +174,13 @@ def similarity_frame(
     evidence: Evidence, points: Points | None, given: FrameFit
 ) -> SplatFrame | None:
     """The first similarity by which the splat shows what the photographs show; None without one."""
-    scene, renderer = evidence.scene, evidence.renderer
+    renderer = evidence.renderer
     if not stand_apart([pose_of(view.camera) for view in evidence.views]):
         return None
     photographs = photographs_of(evidence.views)
     place = rough_points(evidence.views) if points is None else points
-    for start in searched(scene, photographs, place, renderer):
-        transform = refined(scene, photographs, start, renderer)
+    for start in searched(thinned(evidence.scene), photographs, place, renderer):
+        transform = refined(evidence.near(start).scene, photographs, start, renderer)
         if transform is None:
             continue
         fit = evidence.at(transform)

@@ -13,7 +13,7 @@ from torch import Tensor
 from gscompleter.coverage import COVERED
 from gscompleter.frames.drift import drift
 from gscompleter.geometry import z_depths
-from gscompleter.render import Renderer
+from gscompleter.render import Renderer, each_view
 from gscompleter.types import Camera, Gaussians, Render, View
 
 GAINS = (0.5, 2.0)
@@ -101,9 +101,11 @@ class FrameFit:
 
 def frame_fit(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> FrameFit:
     """How well `scene` fits the photographs at their cameras, which are in its frame."""
-    return FrameFit(
-        tuple(compared(seen_from(scene, view.camera, renderer), view.image) for view in views)
-    )
+
+    def fit(view: View) -> ImageFit:
+        return compared(seen_from(scene, view.camera, renderer), view.image)
+
+    return FrameFit(tuple(each_view(scene)(fit, views)))
 
 
 def seen_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from gscompleter.data.photographs import Photographs
 from gscompleter.frames.beside import GivenSplat, frames_left
 from gscompleter.frames.finding import Evidence, SplatFrame, find_frame
-from gscompleter.frames.thinning import thinned
 from gscompleter.frames.witnesses import usable_poses, witnesses
 from gscompleter.render import Renderer
 
@@ -26,7 +25,7 @@ def frame_of_splat(
     views = [view.to(splat.scene.means.device) for view in witnesses(photographs, frames)]
     points = photographs.points()
     return find_frame(
-        Evidence(thinned(splat.scene), views, renderer),
+        Evidence(splat.scene, views, renderer),
         usable_poses(photographs),
         None if points is None else points.double().numpy(),
         frames_left(splat, photographs),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +17,7 @@ from gscompleter.frames.similarity import (
     similarity_between,
     stand_apart,
 )
-from gscompleter.render import Renderer
+from gscompleter.render import Renderer, each_view
 from gscompleter.types import Gaussians
 
 ROUNDS = 2
@@ -35,13 +36,10 @@ def refined(
         transform: From the frame of the photographs to that of `scene`.
     """
     for _ in range(ROUNDS):
-        found = [
-            place
-            for photograph in photographs
-            for place in located(
-                scene, moved_camera(photograph.camera, transform), [photograph], renderer
-            )
-        ]
+        cameras = [moved_camera(photograph.camera, transform) for photograph in photographs]
+        alone = [[photograph] for photograph in photographs]
+        places = each_view(scene)(partial(located, scene, renderer=renderer), cameras, alone)
+        found = [place for these in places for place in these]
         better = similarity_of(found)
         if better is None:
             return None

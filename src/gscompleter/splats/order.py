@@ -22,8 +22,6 @@ SPREADING = (
 """Shifts, and the bits that stay after each, that leave room for two between any two of them."""
 SAMPLE = 100_000
 """Gaussians by which it is known where most of all lie."""
-WORTH = 500_000
-"""Gaussians from which on a scene is drawn sooner by more than it takes to sort it."""
 
 
 def order_nearby(gaussians: Gaussians) -> Int64[Tensor, "n"]:
