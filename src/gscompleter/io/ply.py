@@ -155,7 +155,10 @@ def read_vertices(
     remaining = _bytes_left(file)
     if remaining < vertex.count * dtype.itemsize:
         raise _truncated(path, remaining // dtype.itemsize, vertex.count)
-    return np.fromfile(file, dtype, vertex.count)
+    if vertex.count == 0:
+        return np.empty(0, dtype)
+    # Rows that are copied into columns at once need not be copied into memory before.
+    return np.asarray(np.memmap(file, dtype, "r", file.tell(), (vertex.count,)))
 
 
 def _check_claim(file: BinaryIO, element: Element, file_format: str, path: Path) -> None:
@@ -357,7 +360,8 @@ def drawable(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     opacities = gaussians.opacities if gaussians.encoded is None else gaussians.encoded
     good = (gaussians.quats != 0).any(1)
     for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, opacities):
-        good &= values.isfinite().reshape(len(values), -1).all(1)
+        if not values.sum().isfinite():  # Looking at each of them takes ten times as long.
+            good &= values.isfinite().reshape(len(values), -1).all(1)
     return good
 
 
@@ -367,11 +371,11 @@ def blocks(count: int) -> Iterator[slice]:
 
 
 def _decoded_scales(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
-    return encoded[:, :3].double().exp().float()
+    return encoded[:, :3].double().exp_().float()
 
 
 def _decoded_opacities(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
-    return encoded[:, 3].double().sigmoid().float()
+    return encoded[:, 3].double().sigmoid_().float()
 
 
 def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:

@@ -161,7 +161,7 @@ def save_like(
         return rows
 
     given_rows = (
-        labelled(layout.rows[context[block]], scene.generated[: len(context)][block])
+        labelled(_taken(layout.rows, context[block]), scene.generated[: len(context)][block])
         for block in blocks(len(context))
     )
     added = scene[len(context) :]
@@ -182,7 +182,7 @@ def _begins_with(scene: Gaussians, rows: ndarray, context: Int[ndarray, "m"]) ->
         return False
     means = scene.means[: len(context)].numpy()
     return all(
-        np.array_equal(rows[context[block]][axis].astype(np.float32), means[block, column])
+        np.array_equal(rows[axis][context[block]].astype(np.float32), means[block, column])
         for block in blocks(len(context))
         for column, axis in enumerate("xyz")
     )
@@ -196,6 +196,11 @@ def _fill(rows: ndarray, values: ndarray) -> None:
         return
     for name in set(rows.dtype.names or ()) & set(values.dtype.names or ()):
         rows[name] = values[name]
+
+
+def _taken(rows: ndarray, numbers: Int[ndarray, "m"]) -> ndarray:
+    """`rows[numbers]`. numpy copies a row of columns one after the other, and its bytes at once."""
+    return _as_bytes(rows)[numbers].view(rows.dtype)[:, 0]
 
 
 def _as_bytes(rows: ndarray) -> UInt8[ndarray, "n bytes"]:
