@@ -65,7 +65,7 @@ def test_a_scene_to_which_nothing_was_added_comes_back(tmp_path, monkeypatch):
 def test_a_file_of_another_program_comes_back(tmp_path, monkeypatch):
     given = foreign(tmp_path / "given.ply")
     scene = merge([load_ply(given), added(sh_degree=1)])
-    save_like(tmp_path / "completed.ply", scene, given)
+    save_like(tmp_path / "completed.ply", load_ply(given), added(sh_degree=1), given)
     loaded = load_ply(tmp_path / "completed.ply")
     for field in ("means", "quats", "scales", "opacities", "sh", "generated"):
         assert torch.allclose(getattr(loaded, field), getattr(scene, field), rtol=1e-5)
@@ -79,7 +79,7 @@ def test_ascii_and_big_endian_scenes(tmp_path, monkeypatch, options):
     data = plyfile.PlyData.read(str(tmp_path / "ours.ply"))
     given = tmp_path / "given.ply"
     plyfile.PlyData(list(data.elements), **options).write(str(given))
-    save_like(tmp_path / "completed.ply", merge([load_ply(given), added()]), given)
+    save_like(tmp_path / "completed.ply", load_ply(given), added(), given)
     context = stripped(monkeypatch, tmp_path / "completed.ply")
     # Of an ASCII file the values come back, not the digits.
     kept = tmp_path / "ours.ply" if "text" in options else given
@@ -96,9 +96,9 @@ def test_where_the_layout_cannot_be_kept_ours_is_written(tmp_path, case):
         given = tmp_path / "given.spz"
     save_splat(given, context)
     first = random_gaussians(30, seed=4) if case == "another scene" else load_splat(given)
-    scene = merge([first, added(sh_degree=1 if case == "fewer harmonics" else 0)])
-    save_like(tmp_path / "completed.ply", scene, given)
-    save_ply(tmp_path / "ours.ply", scene, provenance=True)
+    more = added(sh_degree=1 if case == "fewer harmonics" else 0)
+    save_like(tmp_path / "completed.ply", first, more, given)
+    save_ply(tmp_path / "ours.ply", merge([first, more]), provenance=True)
     assert (tmp_path / "completed.ply").read_bytes() == (tmp_path / "ours.ply").read_bytes()
 
 

@@ -121,7 +121,7 @@ def write(folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[s
             "the same scene."
         )
     assert task.brought is not None
-    save_brought(folder, given, given[~taken], taken, task.brought)
+    save_brought(folder, given, taken, given[:0], task.brought)
     (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n")
 
 

@@ -26,7 +26,7 @@ from gscompleter.reports.record import Limits, most_changed, record_of, write_re
 from gscompleter.splats.layout import save_like
 from gscompleter.splats.removed import NAME as REMOVED
 from gscompleter.splats.removed import save_removed
-from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion, View, merge
+from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion, View
 
 GENERATED = "generated.ply"
 """The file with what was added, alone."""
@@ -230,10 +230,10 @@ def write_scenes(folder: Path, completion: Completion, brought: Brought | None) 
     if brought is None:
         save_own(folder, completion)
         return
-    context, scene, aside = as_in_file(completion, brought)
+    context, aside = as_in_file(completion, brought)
     writing = (
         partial(save_ply, folder / CONTEXT, context),
-        partial(save_brought, folder, context, scene, aside, brought),
+        partial(save_brought, folder, context, aside, completion.added, brought),
         partial(save_ply, folder / GENERATED, completion.added, provenance=True),
     )
     side_by_side(lambda write: write(), writing)
@@ -293,23 +293,20 @@ def save_own(folder: Path, completion: Completion) -> None:
 
 def as_in_file(
     completion: Completion, brought: Brought
-) -> tuple[Gaussians, Gaussians, Bool[Tensor, "n"] | None]:
-    """The context, the scene and what was set aside, in the order of the file; what was added to
-    the scene is behind it."""
+) -> tuple[Gaussians, Bool[Tensor, "n"] | None]:
+    """The context, and what of it was set aside, in the order of the file."""
     context, aside = completion.context, completion.removed
     if brought.order is None:
-        return context, completion.scene, aside
+        return context, aside
     places = brought.order.argsort().to(context.means.device)
-    context, aside = context[places], None if aside is None else aside[places]
-    stays = context if aside is None else context[~aside]
-    return context, merge([stays, completion.added]), aside
+    return context[places], None if aside is None else aside[places]
 
 
 def save_brought(
     folder: Path,
     context: Gaussians,
-    scene: Gaussians,
     aside: Bool[Tensor, "n"] | None,
+    added: Gaussians,
     brought: Brought,
 ) -> None:
     """Write `completed.ply` in the layout of the file that was brought, and `removed.ply`.
@@ -317,21 +314,21 @@ def save_brought(
     Args:
         folder: Where to.
         context: The n Gaussians that were brought.
-        scene: What became of them.
-        aside: Which of them are no more in `scene`; None for none.
+        aside: Which of them are left out; None for none.
+        added: What comes behind them.
         brought: The file.
     """
     kept = brought.kept
     if aside is None or not aside.any():
-        save_like(folder / COMPLETED, scene, brought.path, kept)
+        save_like(folder / COMPLETED, context, added, brought.path, kept)
         return
     rows = torch.nonzero(aside.cpu())[:, 0]
     removed = context[aside].to("cpu")
     save_removed(folder / REMOVED, removed, rows, brought.path, kept)
-    stays = ~aside.cpu()
+    stays, left = ~aside.cpu(), context[~aside]
     if kept is not None:
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
-    save_like(folder / COMPLETED, scene, brought.path, stays)
+    save_like(folder / COMPLETED, left, added, brought.path, stays)
 
 
 def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:

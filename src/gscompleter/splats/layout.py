@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gscompleter.io.files import replacing
 from gscompleter.io.ply import Element, blocks, read_header, rows_of, save_ply
-from gscompleter.types import Gaussians
+from gscompleter.types import Gaussians, merge
 
 LABEL = "generated"
 _COUNT = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
@@ -125,31 +125,33 @@ def with_rows(layout: Layout, others: Layout, places: Int[Tensor, "m"]) -> Layou
 
 
 def save_like(
-    path: Path, scene: Gaussians, given: Path, kept: Bool[Tensor, "n"] | None = None
+    path: Path,
+    context: Gaussians,
+    added: Gaussians,
+    given: Path,
+    kept: Bool[Tensor, "n"] | None = None,
 ) -> None:
     """Write a completed scene as the file of its context, labelled and longer.
 
     Where that file has no rows to keep (it is ASCII or no .ply, labels by other numbers than
-    bytes, has fewer harmonics than the scene, or is not what the scene begins with) the scene is
-    written in our layout.
+    bytes, has fewer harmonics than what is added, or is not what the context was read from) the
+    scene is written in our layout.
 
     Args:
         path: The file.
-        scene: The Gaussians of `given` in their order, and others behind them.
+        context: The Gaussians of `given`, in their order.
+        added: Others, which come behind them.
         given: The file that the context was read from.
-        kept: Which rows of `given` the scene begins with; all if left out.
+        kept: Which rows of `given` the context has; all if left out.
 
     Raises:
         InputError: where `given` cannot be read or the file cannot be written.
     """
-    scene = scene.to("cpu")
-    layout = given_layout(given)
-    if layout is None or not _can_hold(layout, scene):
-        save_ply(path, scene, provenance=True)
-        return
-    context = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
-    if not _begins_with(scene, layout.rows, context):
-        save_ply(path, scene, provenance=True)
+    context, layout = context.to("cpu"), given_layout(given)
+    added = merge([context[:0], added.to("cpu")])
+    numbers = _rows_of(context, layout, kept) if layout and _can_hold(layout, added) else None
+    if layout is None or numbers is None:
+        save_ply(path, merge([context, added]), provenance=True)
         return
     label = [] if layout.is_labelled else [(LABEL, "u1")]
     dtype = np.dtype([*layout.rows.dtype.descr, *label])
@@ -161,13 +163,13 @@ def save_like(
         return rows
 
     given_rows = (
-        labelled(_taken(layout.rows, context[block]), scene.generated[: len(context)][block])
+        labelled(_taken(layout.rows, numbers[block]), context.generated[block])
         for block in blocks(len(context))
     )
-    added = scene[len(context) :]
     added_rows = labelled(rows_of(added, provenance=False), added.generated)
     header = layout.header if layout.is_labelled else _labelled_header(layout)
-    write_rows(path, replace(layout, header=header), len(scene), chain(given_rows, [added_rows]))
+    count = len(context) + len(added)
+    write_rows(path, replace(layout, header=header), count, chain(given_rows, [added_rows]))
 
 
 def _can_hold(layout: Layout, scene: Gaussians) -> bool:
@@ -176,16 +178,20 @@ def _can_hold(layout: Layout, scene: Gaussians) -> bool:
     return labels and layout.num_rest == 3 * (scene.sh.shape[1] - 1)
 
 
-def _begins_with(scene: Gaussians, rows: ndarray, context: Int[ndarray, "m"]) -> bool:
-    """Whether the first Gaussians of a scene stand where those rows of its context say."""
-    if len(context) > len(scene):
-        return False
-    means = scene.means[: len(context)].numpy()
-    return all(
-        np.array_equal(rows[axis][context[block]].astype(np.float32), means[block, column])
-        for block in blocks(len(context))
+def _rows_of(
+    context: Gaussians, layout: Layout, kept: Bool[Tensor, "n"] | None
+) -> Int[ndarray, "m"] | None:
+    """The rows of a file that its context is of; None where that stands elsewhere than they say."""
+    numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
+    if len(numbers) != len(context):
+        return None
+    means = context.means.numpy()
+    stands = all(
+        np.array_equal(layout.rows[axis][numbers[block]].astype(np.float32), means[block, column])
+        for block in blocks(len(numbers))
         for column, axis in enumerate("xyz")
     )
+    return numbers if stands else None
 
 
 def _fill(rows: ndarray, values: ndarray) -> None:
