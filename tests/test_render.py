@@ -334,6 +334,40 @@ def image_gradients(function, values: dict[str, torch.Tensor]):
     return image.detach(), dict(zip(leaves, slopes, strict=True))
 
 
+def test_what_a_plan_compares_is_its_image():
+    """Weights are 0 in places, and what nothing new shows in counts all the same."""
+    context, new = context_and_new()
+    generator = torch.Generator().manual_seed(0)
+    wanted = torch.rand(CAMERA.height, CAMERA.width, 3, generator=generator)
+    weights = torch.rand(CAMERA.height, CAMERA.width, generator=generator).sub(0.3).clamp_min(0)
+    plans = [CpuRenderer(n).freeze(context, CAMERA).plan_appearance(new) for n in (1, 3)]
+    slow = ReferenceRenderer().freeze(context, CAMERA).plan_appearance(new)
+    leaves = {"opacities": 0.5 * new.opacities, "sh": 0.9 * new.sh}
+
+    def told(opacities, sh):
+        return (weights * (plans[0](opacities, sh) - wanted).square().sum(dim=-1)).sum()
+
+    true_error, true_slopes = value_and_gradients(told, leaves)
+    errors = [plan.compared(wanted, weights) for plan in (*plans, slow)]
+    assert errors[0](**leaves) == errors[1](**leaves)
+    for compared in errors:
+        error, slopes = value_and_gradients(partial(tripled, compared), leaves)
+        assert_close(error / 3, true_error, "error", 1e-4)
+        for name in leaves:
+            assert_close(slopes[name] / 3, true_slopes[name], f"slope of {name}", 1e-3)
+
+
+def tripled(function, **leaves):
+    return 3 * function(**leaves)
+
+
+def value_and_gradients(function, values: dict[str, torch.Tensor]):
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    value = function(**leaves)
+    slopes = torch.autograd.grad(value, list(leaves.values()))
+    return value.detach(), dict(zip(leaves, slopes, strict=True))
+
+
 def test_what_is_closed_by_something_solid_is_closed_at_the_same_splat():
     """A wall behind a wall behind a wall, of which a pixel drops the very one that closes it."""
     wall = gaussians_of(view_of(Room(), camera_at(size=64)))

@@ -69,7 +69,8 @@ def doubt_brought(_: str) -> None:
     run_by_run(gaussians, [view.camera])
     evidence = gather_evidence(gaussians, [view], [frozen], config)
     support(evidence, weight_sums(frozen), view.camera, config)
-    frozen.plan_appearance(gaussians)(*looks).sum().backward()
+    plan = frozen.plan_appearance(gaussians)
+    (plan(*looks).sum() + plan.compared(view.image, view.image[..., 0])(*looks)).backward()
 
 
 def some_gaussians() -> Gaussians:

@@ -1521,12 +1521,13 @@ def _looks(fragments, index, opacities, colours):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def draw_fragments(fragments, opacities, colours, image):
-    """Draw the pixels that have fragments.
+def draw_fragments(fragments, opacities, colours, where, image):
+    """Draw the pixels that have fragments, `where` they are asked for.
 
     Whether one is a fold is no branch: processors cannot foretell it.
 
-    opacities [n], colours [n, 3] float32: of the new splats. image [h, w, 3] float32 is written.
+    opacities [n], colours [n, 3] float32: of the new splats. where [h, w] bool. image [h, w, 3]
+        float32 is written.
     """
     tiles, _, _, _, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
@@ -1536,7 +1537,8 @@ def draw_fragments(fragments, opacities, colours, image):
         looks, count = _looks(fragments, index, opacities, colours)
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
-            if begin == end:
+            y, x = top + pixel // TILE, left + pixel % TILE
+            if begin == end or not where[y, x]:
                 continue
             transmittance, red, green, blue = one, zero, zero, zero
             for place in range(begin, end):
@@ -1552,10 +1554,36 @@ def draw_fragments(fragments, opacities, colours, image):
                 red += weight * looks[entry, 1]
                 green += weight * looks[entry, 2]
                 blue += weight * looks[entry, 3]
-            y, x = top + pixel // TILE, left + pixel % TILE
             image[y, x, 0] = red + transmittance * behind[y, x, 0]
             image[y, x, 1] = green + transmittance * behind[y, x, 1]
             image[y, x, 2] = blue + transmittance * behind[y, x, 2]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def compare_fragments(fragments, image, wanted, weights, slopes, errors):
+    """Compare the pixels that have fragments with what is wanted there.
+
+    image, wanted [h, w, 3], weights [h, w] float32; where a weight is 0, image may be anything.
+        slopes [h, w, 3] float32, those of the error in the image, are written. errors
+        [h * w / TILE²] float64: for each tile the sum of weights times squared differences of all
+        channels is written.
+    """
+    tiles, starts = fragments.tiles, fragments.pixel_start
+    tiles_x = (image.shape[1] + TILE - 1) // TILE
+    zero, two = np.float32(0), np.float32(2)
+    for index in range(len(tiles)):
+        left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
+        error = 0.0
+        for pixel in range(TILE * TILE):
+            if starts[index, pixel] == starts[index, pixel + 1]:
+                continue
+            y, x = top + pixel // TILE, left + pixel % TILE
+            weight = weights[y, x]
+            for channel in range(3):
+                missed = image[y, x, channel] - wanted[y, x, channel] if weight > zero else zero
+                slopes[y, x, channel] = two * weight * missed
+                error += weight * missed * missed
+        errors[tiles[index]] = error
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

@@ -35,9 +35,24 @@ DepthRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene plus Gaussians of which only the z-depths [n] may change."""
 
 
-AppearanceRender = Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, "h w 3"]]
-"""The image of a frozen scene plus Gaussians of which only the opacities [n] and the spherical
-harmonics [n, k, 3] may change."""
+LooksError = Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, ""]]
+"""How far an image is from what is wanted with these opacities and spherical harmonics of something
+in it; differentiable in both."""
+
+
+@runtime_checkable
+class AppearanceRender(Protocol):
+    """Draws a frozen scene plus Gaussians of which only the opacities [n] and the spherical
+    harmonics [n, k, 3] may change."""
+
+    def __call__(
+        self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
+    ) -> Float[Tensor, "h w 3"]:
+        """The image; differentiable."""
+
+    def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
+        """The sum over the image of `weights`, from 0 up, times the squared differences from what
+        is `wanted`, of all channels."""
 
 
 def in_colours(plan: AppearanceRender, sh: Float[Tensor, "n k 3"]) -> OpacityImage:

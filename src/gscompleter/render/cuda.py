@@ -17,7 +17,14 @@ from torch import Tensor
 from gscompleter.errors import InputError
 from gscompleter.geometry import at_depths
 from gscompleter.render import AppearanceRender, ColourErrors, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import errors_by_slopes, grey, looking, painted, sums_by_slopes
+from gscompleter.render.painting import (
+    DrawnAnew,
+    errors_by_slopes,
+    grey,
+    looking,
+    painted,
+    sums_by_slopes,
+)
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -196,7 +203,7 @@ class CudaView:
 
     def plan_appearance(self, new: Gaussians) -> AppearanceRender:
         """Context and `new` with other looks, all of it drawn anew."""
-        return lambda opacities, sh: self.composite(looking(new, opacities, sh)).image
+        return DrawnAnew(lambda *looks: self.composite(looking(new, *looks)).image)
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
         """Context and `new` in other colours, all of it drawn anew."""

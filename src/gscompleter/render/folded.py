@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -23,6 +23,7 @@ from gscompleter.kernels.rasterizer import Fragments
 from gscompleter.kernels.sharing import pieces_of, run
 
 if TYPE_CHECKING:
+    from gscompleter.render import LooksError
     from gscompleter.render.cpu import Binned, CpuView, Viewpoint
 
 
@@ -45,6 +46,16 @@ class Folded:
         image: Tensor = _Drawn.apply(self, opacities, sh)
         return image
 
+    def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
+        """How far the image is from what is wanted, told from the pixels that have fragments."""
+        held = Held(self, float32(wanted), float32(weights))
+
+        def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:
+            missed: Tensor = _Missed.apply(held, opacities, sh)
+            return missed
+
+        return error
+
     @cached_property
     def shown(self) -> Int64[ndarray, "shown"]:
         """Which of the Gaussians have fragments."""
@@ -65,9 +76,19 @@ class Folded:
     ) -> Float32[ndarray, "h w 3"]:
         """The frozen image, drawn anew where it has fragments."""
         image = self.image.copy()
-        drawn = [(piece, opacities, colours, image) for piece in self.fragments]
-        run(kernels.draw_fragments, drawn, self.viewpoint.threads)
+        self.draw_fragments(opacities, colours, np.ones(image.shape[:2], np.bool_), image)
         return image
+
+    def draw_fragments(
+        self,
+        opacities: Float32[ndarray, "n"],
+        colours: Float32[ndarray, "n 3"],
+        where: Bool[ndarray, "h w"],
+        image: Float32[ndarray, "h w 3"],
+    ) -> None:
+        """Write the pixels that have fragments, of those that are asked for."""
+        drawn = [(piece, opacities, colours, where, image) for piece in self.fragments]
+        run(kernels.draw_fragments, drawn, self.viewpoint.threads)
 
     def slopes(
         self,
@@ -95,6 +116,57 @@ class Folded:
         return d_sh
 
 
+@dataclass(frozen=True)
+class Held:
+    """What the image of `Folded` is held against."""
+
+    folded: Folded
+    wanted: Float32[ndarray, "h w 3"]
+    weights: Float32[ndarray, "h w"]
+
+    def missed(self, image: Float32[ndarray, "h w 3"]) -> tuple[float, Float32[ndarray, "h w 3"]]:
+        """The error of the pixels that have fragments, and its slopes in them."""
+        slopes = np.empty_like(image)
+        errors = np.zeros(self.folded.viewpoint.tiles)  # summed in one order on any threads
+        seen = (image, self.wanted, self.weights, slopes, errors)
+        pieces = [(piece, *seen) for piece in self.folded.fragments]
+        run(kernels.compare_fragments, pieces, self.folded.viewpoint.threads)
+        return float(errors.sum()), slopes
+
+    @cached_property
+    def where(self) -> Bool[ndarray, "h w"]:
+        """The pixels that count."""
+        return self.weights > 0
+
+    @cached_property
+    def elsewhere(self) -> float:
+        """The error of all others, which stays."""
+        frozen = self.folded.image
+        squares = np.square(frozen - self.wanted).sum(axis=2, dtype=np.float64)
+        return float((self.weights * squares).sum()) - self.missed(frozen)[0]
+
+
+class _Missed(torch.autograd.Function):
+    """The error of the image of `Folded`."""
+
+    @staticmethod
+    def forward(ctx: Any, held: Held, opacities: Tensor, sh: Tensor) -> Tensor:
+        folded = held.folded
+        colours, opaque = folded.colours(float32(sh)), float32(opacities)
+        image = np.empty_like(folded.image)
+        folded.draw_fragments(opaque, colours, held.where, image)
+        error, slopes = held.missed(image)
+        ctx.scene = (folded, opaque, colours, image, slopes, sh.shape[1])
+        return torch.tensor(held.elsewhere + error, dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        folded, opacities, colours, image, slopes, bands = ctx.scene
+        found = slope.item() * folded.slopes(opacities, colours, image, slopes)
+        return None, *slopes_of_looks(folded, colours, found, bands, ctx.needs_input_grad[2])
+
+
 class _Drawn(torch.autograd.Function):
     """The image of `Folded`."""
 
@@ -109,11 +181,22 @@ class _Drawn(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         folded, opacities, colours, image, bands = ctx.scene
-        slopes = folded.slopes(opacities, colours, image, float32(slope))
-        d_opacities, d_sh = np.ascontiguousarray(slopes[:, 0]), None
-        if ctx.needs_input_grad[2]:
-            d_sh = torch.from_numpy(folded.slopes_of_sh(colours, slopes[:, 1:], bands))
-        return None, torch.from_numpy(d_opacities), d_sh
+        found = folded.slopes(opacities, colours, image, float32(slope))
+        return None, *slopes_of_looks(folded, colours, found, bands, ctx.needs_input_grad[2])
+
+
+def slopes_of_looks(
+    folded: Folded,
+    colours: Float32[ndarray, "n 3"],
+    slopes: Float32[ndarray, "n 4"],
+    bands: int,
+    of_sh: bool,
+) -> tuple[Tensor, Tensor | None]:
+    """Of opacities and, where they are asked for, of spherical harmonics."""
+    opacities = torch.from_numpy(np.ascontiguousarray(slopes[:, 0]))
+    if not of_sh:
+        return opacities, None
+    return opacities, torch.from_numpy(folded.slopes_of_sh(colours, slopes[:, 1:], bands))
 
 
 def folded(view: CpuView, binned: Binned, means: Float32[ndarray, "n 3"]) -> Folded:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.render import ColourSums
+from gscompleter.render import ColourSums, LooksError
 from gscompleter.types import Gaussians, sh_from_rgb
 
 
@@ -28,6 +28,24 @@ def looking(
 ) -> Gaussians:
     """The Gaussians where they are, with other opacities and spherical harmonics."""
     return replace(gaussians, opacities=opacities, sh=sh, encoded=None)
+
+
+@dataclass(frozen=True)
+class DrawnAnew:
+    """An `AppearanceRender` that draws all of the image whenever it is asked."""
+
+    draw: Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, "h w 3"]]
+
+    def __call__(
+        self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
+    ) -> Float[Tensor, "h w 3"]:
+        return self.draw(opacities, sh)
+
+    def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
+        def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:
+            return (weights * (self.draw(opacities, sh) - wanted).square().sum(dim=-1)).sum()
+
+        return error
 
 
 def sums_by_slopes(

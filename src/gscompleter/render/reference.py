@@ -15,7 +15,14 @@ from torch.utils.checkpoint import checkpoint
 
 from gscompleter.geometry import at_depths, rotations_from
 from gscompleter.render import AppearanceRender, ColourErrors, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import errors_by_slopes, grey, looking, painted, sums_by_slopes
+from gscompleter.render.painting import (
+    DrawnAnew,
+    errors_by_slopes,
+    grey,
+    looking,
+    painted,
+    sums_by_slopes,
+)
 from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -96,7 +103,7 @@ class ReferenceView:
         return lambda opacities: self.composite(replace(fixed, opacities=opacities))
 
     def plan_appearance(self, new: Gaussians) -> AppearanceRender:
-        return lambda opacities, sh: self.composite(looking(new, opacities, sh)).image
+        return DrawnAnew(lambda *looks: self.composite(looking(new, *looks)).image)
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
 

@@ -19,9 +19,12 @@ from torch.nn.functional import pad
 from gscompleter.config import ReconcileConfig
 from gscompleter.descent import Adam
 from gscompleter.progress import track
-from gscompleter.render import AppearanceRender, FrozenView
+from gscompleter.render import AppearanceRender, FrozenView, LooksError
 from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import SH_C0, Gaussians, View
+
+Looks = tuple[Float[Tensor, "n"], Float[Tensor, "n k 3"]]
+"""Opacities and spherical harmonics."""
 
 FAINT = 0.2
 """Share of its opacity with which something new begins. It grows where it is welcome, which harms
@@ -62,16 +65,18 @@ def reconcile(
     if config.iterations == 0 or len(added) == 0:
         return added, ()
     fit = Fit(added, config)
-    at_target = frozen_target.plan_appearance(added)
+    at_target = frozen_target.plan_appearance(added).compared(reference.image, shares_of(holes))
     before = hole_error(frozen_target.context.image, reference, holes).clamp_min(1e-12)
-    asked = [Asked(*each) for each in zip(plans, views, allowed_errors, strict=True)]
+    asked = [Asked.by(*each) for each in zip(plans, views, allowed_errors, strict=True)]
     with torch.no_grad():
-        turns = Turns([fit.excess(photograph).item() for photograph in asked])
+        looks = fit.looks()
+        turns = Turns([photograph.excess(looks).item() for photograph in asked])
     weight = config.photograph_weight / config.views_per_step
     losses = []
     for _ in track(range(config.iterations), "Reconciling"):
-        loss = hole_error(fit.drawn(at_target), reference, holes) / before
-        for over in objections(fit, asked, turns, config.views_per_step):
+        looks = fit.looks()
+        loss = at_target(*looks) / before
+        for over in objections(looks, asked, turns, config.views_per_step):
             loss = loss + weight * over
         fit.step(loss)
         losses.append(loss.item())
@@ -79,12 +84,12 @@ def reconcile(
 
 
 def objections(
-    fit: Fit, asked: Sequence[Asked], turns: Turns, count: int
+    looks: Looks, asked: Sequence[Asked], turns: Turns, count: int
 ) -> list[Float[Tensor, ""]]:
     """The excess of those of the `count` photographs whose turn it is that have any; `turns` learns
     it."""
     chosen = turns.take(count)
-    found = [fit.excess(asked[k]) for k in chosen]
+    found = [asked[k].excess(looks) for k in chosen]
     for k, over in zip(chosen, found, strict=True):
         turns.excess[k] = over.item()
     return [over for over in found if over > 0]
@@ -94,12 +99,19 @@ def objections(
 class Asked:
     """A photograph that is asked whether it agrees."""
 
-    plan: AppearanceRender
-    """What its camera sees of the scene with what is added."""
-    view: View
-    """The photograph."""
+    error: LooksError
+    """The mean squared error of what its camera sees."""
     allowed: float
-    """Largest mean squared error allowed in it."""
+    """The largest that is allowed."""
+
+    @staticmethod
+    def by(plan: AppearanceRender, view: View, allowed: float) -> Asked:
+        """The photograph `view`, whose camera sees what `plan` draws."""
+        return Asked(plan.compared(view.image, shares_of(view.counted)), max(allowed, 1e-12))
+
+    def excess(self, looks: Looks) -> Float[Tensor, ""]:
+        """By how much the error is above its goal, relative to what is allowed."""
+        return (self.error(*looks) / self.allowed - GOAL).clamp_min(0.0)
 
 
 class Fit:
@@ -112,15 +124,9 @@ class Fit:
         rates = [(self._logits, config.opacity_step), (self._sh, config.colour_step)]
         self._optimizer = Adam(rates, (config.beta1, config.beta2))
 
-    def drawn(self, plan: AppearanceRender) -> Float[Tensor, "h w 3"]:
-        """The scene with it; differentiable."""
-        return plan(self._logits.sigmoid(), self._sh)
-
-    def excess(self, photograph: Asked) -> Float[Tensor, ""]:
-        """By how much the error of a photograph is above its goal, relative to what is allowed."""
-        image = photograph.view.compared(self.drawn(photograph.plan))
-        error = (image - photograph.view.image).square().mean()
-        return (error / max(photograph.allowed, 1e-12) - GOAL).clamp_min(0.0)
+    def looks(self) -> Looks:
+        """As they are by now; differentiable."""
+        return self._logits.sigmoid(), self._sh
 
     def step(self, loss: Float[Tensor, ""]) -> None:
         """One step down the slope of `loss`; colours stay colours."""
@@ -170,4 +176,9 @@ def hole_error(
     image: Float[Tensor, "h w 3"], reference: View, holes: Bool[Tensor, "h w"]
 ) -> Float[Tensor, ""]:
     """Mean squared difference from the synthesized image within the holes."""
-    return ((image - reference.image).square().mean(dim=-1) * holes).mean()
+    return (shares_of(holes) * (image - reference.image).square().sum(dim=-1)).sum()
+
+
+def shares_of(where: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """What each pixel and channel counts in a mean over all of an image of what is `where`."""
+    return where.float() / (3 * where.numel())
