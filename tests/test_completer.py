@@ -421,7 +421,7 @@ def test_depths_that_the_scene_contradicts_are_reported_and_not_added(tmp_path):
     assert result.affine.refuted
     assert result.losses == {}
     assert torch.equal(result.after.image, result.before.image)
-    summary = write_report(tmp_path, refused, [Target(target)], completer.renderer, {})
+    summary = write_report(tmp_path, refused, [Target(target)], completer, {})
     (said,) = summary["targets"]
     assert said["added"] == 0
     assert said["affine"]["agreement"] < 0.1

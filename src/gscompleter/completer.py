@@ -629,7 +629,8 @@ class GSCompleter:
             error_with_loss(squared_error(v.compared(r.image), v.image).item(), loss)
             for r, v in zip(drawn, judges, strict=True)
         )
-        return replace(completion, judges=judges, allowed_errors=allowed)
+        begun = drawn[: len(completion.views)]
+        return replace(completion, judges=judges, allowed_errors=allowed, begun=begun)
 
     def at(self, completion: Completion, views: Sequence[View]) -> tuple[FrozenView, ...]:
         """The scene as it stands, frozen at the cameras of photographs."""

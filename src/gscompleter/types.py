@@ -435,6 +435,8 @@ class Completion:
     judges: tuple[View, ...] = ()
     """`views`, then `witnesses`, as they are held against the scene whatever is added: where this
     has a hole at first they are ignored, so that nothing makes up for what was good."""
+    begun: tuple[Render, ...] = ()
+    """What each of `views` saw of the context, as it is drawn, before any target."""
     proxy: Proxy | None = None
     """What a large context is drawn with; None where it is drawn itself."""
     evidence: Evidence | None = None

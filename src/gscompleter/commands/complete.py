@@ -133,7 +133,7 @@ def write_done(
             folder,
             done.completion,
             task.targets,
-            explorer.completer.renderer,
+            explorer.completer,
             said,
             task.brought,
             lambda: Around(tuple(looks()), cameras),

@@ -22,7 +22,7 @@ def note_compiled(part):
 
 def cache_folder():
     """Where numba keeps what it compiled."""
-    return Path(variation.fit.stats.cache_path)
+    return Path(variation.advance.stats.cache_path)
 
 
 def _mark(part):

@@ -32,7 +32,7 @@ def _stay_alone():
     _thread.alone = True
 
 
-def _sharing(threads):
+def sharing(threads):
     """How many threads share a kernel that is called here, and is to have so many."""
     return 1 if _thread.alone else threads or numba.config.NUMBA_NUM_THREADS
 
@@ -43,7 +43,7 @@ def share(kernel, count, *arguments, threads=None):
     The result depends neither on the pieces nor on the threads, which are NUMBA_NUM_THREADS if left
     out: as many as there are usable cores where that is not set.
     """
-    threads = _sharing(threads)
+    threads = sharing(threads)
     run(kernel, [(*piece, *arguments) for piece in pieces_of(count, threads)], threads)
 
 
@@ -57,7 +57,7 @@ def run(kernel, calls, threads=None):
 
     Who asks works, too, and does not wait for threads that others keep busy.
     """
-    threads = _sharing(threads)
+    threads = sharing(threads)
     if threads == 1 or len(calls) == 1:
         return [kernel(*arguments) for arguments in calls]
     results, waiting = [None] * len(calls), iter(enumerate(calls))

@@ -3,24 +3,29 @@
 import numpy as np
 from numba import njit
 
+from gscompleter.kernels.sharing import ranges, run, sharing
+
 PRIMAL_STEP, SLOPE_STEP = np.float32(0.25), np.float32(0.2)
 DUAL_STEP, SLOPE_DUAL_STEP = np.float32(1 / 3), np.float32(0.5)
 """Steps of the four variables: inverse row sums of the operator, as in Pock and Chambolle 2011."""
 AT_ONCE = 10
 """Iterations that go down the image together, each a row behind the one before: their rows stay in
 the cache."""
+LEAST_ROWS = 4 * AT_ONCE
+"""Of a band that a thread has for itself. What two bands leave between them takes half of as many,
+and is no more than is worth a thread."""
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations):
+def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations, threads=None):
     """Heights u and slopes v that minimise, by the first-order primal-dual algorithm,
 
         sum weight * huber(u - data) + across |u_x - v_x| + down |u_y - v_y| + bend |grad v|
 
     over all pixels: an image of least bending in which a step, where it must be, costs its height.
 
-    A row needs no more of an iteration than the next row has: the forces of row y read heights of
-    y and y + 1, and the heights of y read forces of y - 1 and y.
+    Each thread has a band of rows. An iteration reads a row beyond those that it writes, so that in a
+    band each goes less far than the one before; what is left at the seams comes afterwards. Every row
+    meets what it would meet in one band, and the result is the same to the bit.
 
     Args:
         heights, slopes: Where to begin [h, w] and [2, h, w] (x, y); written to.
@@ -29,19 +34,72 @@ def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations
         bend: Cost of a change of slope.
         tolerance: Deviation from `data` under which the loss is quadratic.
         iterations: How many.
+        threads: How many share it; as `share` has it.
     """
     h, w = heights.shape
-    ahead, slopes_ahead = heights.copy(), slopes.copy()
-    steps = np.zeros((2, h, w), np.float32)
-    bends = np.zeros((4, h, w), np.float32)
+    forces = np.zeros((2, h, w), np.float32), np.zeros((4, h, w), np.float32)
+    state = heights, slopes, heights.copy(), slopes.copy(), *forces
+    given = data, weight, across, down, bend, tolerance
+    bands = ranges(h, min(sharing(threads), h // LEAST_ROWS))
+    if len(bands) == 1:
+        advance(0, 0, h, 0, iterations, *state, *given)
+        return
     for begin in range(0, iterations, AT_ONCE):
         count = min(AT_ONCE, iterations - begin)
-        for front in range(h + count - 1):
-            for y in range(min(front, h - 1), max(front - count, -1), -1):
-                _raise_duals(y, ahead, slopes_ahead, steps, bends, across, down, bend)
-                _lower_primals(
-                    y, heights, slopes, ahead, slopes_ahead, steps, bends, data, weight, tolerance
-                )
+        inner = [(top, int(top > 0), end, -int(end < h)) for top, end in bands]
+        seams = [(top, -1, top, 1) for top, _ in bands[1:]]
+        for parts in (inner, seams):
+            run(advance, [(*part, count, *state, *given) for part in parts], threads)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def advance(
+    top,
+    top_step,
+    end,
+    end_step,
+    iterations,
+    heights,
+    slopes,
+    ahead,
+    slopes_ahead,
+    steps,
+    bends,
+    data,
+    weight,
+    across,
+    down,
+    bend,
+    tolerance,
+):
+    """Iterations on a range of rows, whose ends move by a step each time. Those of more than
+    `AT_ONCE` iterations may not move.
+
+    A row needs no more of an iteration than the next row has: the forces of row y read heights of
+    y and y + 1, and the heights of y read forces of y - 1 and y. So an end that moves away from the
+    neighbour leaves it the last forces that it needs, and one that moves to the neighbour finds them.
+    """
+    for begin in range(0, iterations, AT_ONCE):
+        count = min(AT_ONCE, iterations - begin)
+        for front in range(top, end + 2 * count):
+            for number in range(1, count + 1):
+                y = front - number
+                first, last = top + number * top_step, end + number * end_step
+                if first - (top_step > 0) <= y < last - (end_step > 0):
+                    _raise_duals(y, ahead, slopes_ahead, steps, bends, across, down, bend)
+                if first <= y < last:
+                    _lower_primals(
+                        y,
+                        heights,
+                        slopes,
+                        ahead,
+                        slopes_ahead,
+                        steps,
+                        bends,
+                        data,
+                        weight,
+                        tolerance,
+                    )
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

@@ -70,11 +70,7 @@ def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
     targets = sum(camera.kind == "target" for camera in cameras)
     told = f"{len(cameras)} cameras, {targets} of them targets, among {len(places)} points."
     svg = figure("Cameras in space", told, SIZE, SIZE, "space")
-    drawn = frame(means)
-    for point, (x, y), (_, added) in zip(drawn, projected(drawn), places, strict=True):
-        if np.abs(point).max() <= EDGE:
-            kind, told = "added" if added else "seen", text_of(point[None])
-            put(svg, "circle", class_=kind, r=1.6, cx=x, cy=y, data_points=told)
+    draw_points(svg, frame(means), [added for _, added in places])
     for camera, pose in zip(cameras, poses, strict=True):
         draw_camera(svg, camera, frame(frustum(pose, camera.pose.opening, DEPTH * frame.radius)))
     return markup(svg)
@@ -83,6 +79,15 @@ def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
 def finite(numbers: Sequence[float]) -> bool:
     """Whether all of them can be drawn."""
     return all(map(math.isfinite, numbers))
+
+
+def draw_points(svg: Element, points: Float[np.ndarray, "n 3"], added: Sequence[bool]) -> None:
+    """Draw those places on surfaces that lie within the drawing."""
+    within = np.abs(points).max(axis=1, initial=0) <= EDGE
+    centers, kinds = projected(points).tolist(), ["added" if new else "seen" for new in added]
+    for row in np.flatnonzero(within):
+        (x, y), told = centers[row], text_of(points[row])
+        put(svg, "circle", class_=kinds[row], r=1.6, cx=x, cy=y, data_points=told)
 
 
 def draw_camera(svg: Element, camera: Placed, corners: Float[np.ndarray, "11 3"]) -> None:
@@ -145,9 +150,9 @@ def projected(
     )
 
 
-def text_of(points: Float[np.ndarray, "n 3"]) -> str:
+def text_of(points: Float[np.ndarray, "*n 3"]) -> str:
     """Points as the script reads them."""
-    return " ".join(f"{value:.3f}" for value in points.flatten())
+    return " ".join(f"{value:.3f}" for value in points.flatten().tolist())
 
 
 def placed_cameras(

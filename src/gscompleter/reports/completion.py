@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter import __version__
+from gscompleter.completer import GSCompleter, contexts_of
 from gscompleter.io.files import COMPLETED, CONTEXT
 from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
@@ -101,6 +102,16 @@ def compare(
     return Images(frozen.context, after, truth)
 
 
+def at_photographs(completion: Completion, completer: GSCompleter) -> list[Images]:
+    """The same at the photographs of the context. What `completer` saw there is not drawn again,
+    unless a proxy stood for the scene."""
+    views = completion.views
+    if completion.proxy is not None:
+        return [compare(completion, v.camera, v.image, completer.renderer) for v in views]
+    after = contexts_of(completer.at(completion, views))
+    return [Images(*seen, v.image) for *seen, v in zip(completion.begun, after, views, strict=True)]
+
+
 def summarize(
     completion: Completion,
     targets: Sequence[Target],
@@ -182,7 +193,7 @@ def write_report(
     folder: Path,
     completion: Completion,
     targets: Sequence[Target],
-    renderer: Renderer,
+    completer: GSCompleter,
     said: Mapping[str, Any],
     brought: Brought | None = None,
     around: Callable[[], Around] = Around,
@@ -193,7 +204,7 @@ def write_report(
         folder: Where to.
         completion: What was done.
         targets: The cameras it was done for, in their order.
-        renderer: Draws the scene before and after.
+        completer: What did it, and draws the scene before and after.
         said: Settings, seed and device, for the summary.
         brought: Where the context comes from, if not from Ψ: `completed.ply` keeps its layout.
         around: Tells what surrounds it; asked once all else is drawn and written.
@@ -201,9 +212,9 @@ def write_report(
     Raises:
         InputError: where a file cannot be written.
     """
-    context_images = [compare(completion, v.camera, v.image, renderer) for v in completion.views]
+    context_images = at_photographs(completion, completer)
     target_images = [
-        compare(completion, result.target, target.photograph, renderer)
+        compare(completion, result.target, target.photograph, completer.renderer)
         for target, result in zip(targets, completion.targets, strict=True)
     ]
     scores = side_by_side(Images.scores, [*context_images, *target_images])

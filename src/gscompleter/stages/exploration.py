@@ -38,7 +38,7 @@ from gscompleter.types import (
     observed,
 )
 
-MAX_GAUSSIANS = 50_000
+MAX_GAUSSIANS = 25_000
 """Several for each pixel of the images that candidates are judged by."""
 SAME_DEPTH = 0.1
 """Share of its depth by which a point may lie behind what the anchor sees, and still be that."""
