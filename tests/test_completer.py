@@ -19,7 +19,7 @@ from gscompleter.generators import Synthesis
 from gscompleter.geometry import project
 from gscompleter.metrics.image import psnr
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.reports.completion import Target, write_report
+from gscompleter.reports.completion import Target, at_photographs, compare, write_report
 from gscompleter.stages.anchor import lift
 from gscompleter.stages.free_space import respect_free_space
 from gscompleter.stages.harm import is_undone
@@ -329,6 +329,23 @@ class Counting(CpuRenderer):
     def freeze(self, context, camera):
         self.frozen.append(camera)
         return super().freeze(context, camera)
+
+
+def test_a_report_draws_no_photograph_again():
+    """What was seen of the scene before and after, to the bit, and nothing is frozen for it."""
+    renderer = Counting()
+    completer = GSCompleter(KnowingReconstructor(), KnowingGenerator(), renderer)
+    done = completer(photographs(), cameras()[1])
+    assert len(done.added) > 0
+    renderer.frozen.clear()
+    found = at_photographs(done, completer)
+    assert renderer.frozen == []
+    for images, view in zip(found, done.views, strict=True):
+        drawn = compare(done, view.camera, view.image, CpuRenderer())
+        assert torch.equal(images.truth, drawn.truth)
+        for seen, again in ((images.before, drawn.before), (images.after, drawn.after)):
+            assert torch.equal(seen.image, again.image)
+            assert torch.equal(seen.alpha, again.alpha)
 
 
 def test_photographs_are_frozen_once_however_many_targets_there_are():

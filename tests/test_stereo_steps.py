@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from gscompleter.kernels import stereo
+from gscompleter.kernels import stereo, variation
+from gscompleter.kernels.sharing import run
 from gscompleter.matching.features import features_of, matches
 from gscompleter.matching.stereo_image import (
     StereoImage,
@@ -186,6 +187,34 @@ def test_without_any_measurement_nothing_is_made_up():
     measured = slanted()
     found = fit_surfaces(measured, np.zeros_like(measured), blank(measured))
     assert np.array_equal(found, measured)
+
+
+@pytest.mark.parametrize("iterations", [1, variation.AT_ONCE, 2 * variation.AT_ONCE + 3])
+@pytest.mark.parametrize("threads", [2, 3])
+def test_bands_of_rows_fit_the_surfaces_of_one(monkeypatch, threads, iterations):
+    """To the bit, also at the seams, and with as many bands as threads."""
+    rows, random, found, parts = (
+        threads * variation.LEAST_ROWS + 7,
+        np.random.default_rng(0),
+        [],
+        [],
+    )
+    shape = rows, 24
+    data, weight, across, down = (random.random(shape, np.float32) * k for k in (9, 1, 3, 3))
+    given = data, weight, across, down, np.float32(12), np.float32(0.15), iterations
+
+    def counted(kernel, calls, threads):
+        parts.append(len(calls))
+        return run(kernel, calls, threads)
+
+    monkeypatch.setattr(variation, "run", counted)
+    for count in (1, threads):
+        heights, slopes = np.zeros(shape, np.float32), np.zeros((2, *shape), np.float32)
+        variation.fit(heights, slopes, *given, threads=count)
+        found.append(np.concatenate([heights[None], slopes]))
+    assert np.array_equal(*found)
+    assert np.abs(found[0]).max() > 0
+    assert parts == [threads, threads - 1] * -(-iterations // variation.AT_ONCE)
 
 
 def test_stereo_does_not_depend_on_the_number_of_threads(monkeypatch):

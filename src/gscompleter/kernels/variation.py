@@ -23,9 +23,9 @@ def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations
 
     over all pixels: an image of least bending in which a step, where it must be, costs its height.
 
-    Each thread has a band of rows. An iteration reads a row beyond those that it writes, so that in a
-    band each goes less far than the one before; what is left at the seams comes afterwards. Every row
-    meets what it would meet in one band, and the result is the same to the bit.
+    Each thread has a band of rows. An iteration reads a row beyond those that it writes, so that
+    in a band each goes less far than the one before; what is left at the seams comes afterwards.
+    Every row meets what it would meet in one band, and the result is the same to the bit.
 
     Args:
         heights, slopes: Where to begin [h, w] and [2, h, w] (x, y); written to.
@@ -76,8 +76,9 @@ def advance(
     `AT_ONCE` iterations may not move.
 
     A row needs no more of an iteration than the next row has: the forces of row y read heights of
-    y and y + 1, and the heights of y read forces of y - 1 and y. So an end that moves away from the
-    neighbour leaves it the last forces that it needs, and one that moves to the neighbour finds them.
+    y and y + 1, and the heights of y read forces of y - 1 and y. So an end that moves away from
+    the neighbour leaves it the last forces that it needs, and one that moves to the neighbour
+    finds them.
     """
     for begin in range(0, iterations, AT_ONCE):
         count = min(AT_ONCE, iterations - begin)

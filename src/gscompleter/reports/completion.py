@@ -109,7 +109,8 @@ def at_photographs(completion: Completion, completer: GSCompleter) -> list[Image
     if completion.proxy is not None:
         return [compare(completion, v.camera, v.image, completer.renderer) for v in views]
     after = contexts_of(completer.at(completion, views))
-    return [Images(*seen, v.image) for *seen, v in zip(completion.begun, after, views, strict=True)]
+    seen = zip(completion.begun, after, views, strict=True)
+    return [Images(first, last, view.image) for first, last, view in seen]
 
 
 def summarize(
