@@ -25,6 +25,9 @@ SWITCHES = [
 NO_SCREEN = ["--disable-gpu-vsync", "--disable-frame-rate-limit"]
 """No screen is waited for. A page that draws all the time would leave no time for others."""
 
+PATIENCE = 60_000
+"""Milliseconds that anything may take."""
+
 Picture = Float[np.ndarray, "h w 3"]
 
 
@@ -54,6 +57,7 @@ class Tab:
         self.context = browser.new_context(viewport={"width": width, "height": height})
         self.context.set_offline(True)
         self.page = self.context.new_page()
+        self.page.set_default_timeout(PATIENCE)
         self.requests: list[str] = []
         self.errors: list[str] = []
         self.page.on("request", lambda request: self.requests.append(request.url))

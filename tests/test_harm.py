@@ -70,7 +70,7 @@ def test_drawings_that_are_known_already_are_asked_instead():
     frozen = load_renderer("cpu").freeze(context, CAMERA)
     allowed = error_with_loss(squared_error(frozen.context.image, view.image).item(), 0.05)
     asked: list[torch.Tensor] = []
-    folded = in_colours(frozen.plan_appearance(harmful), harmful.sh)
+    folded = in_colours(frozen.plan_appearance(harmful, view.counted), harmful.sh)
 
     def draw(opacities: torch.Tensor) -> torch.Tensor:
         asked.append(opacities)

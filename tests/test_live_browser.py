@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from browsing import SWITCHES, launched
+from browsing import PATIENCE, SWITCHES, launched
 from command import run
 from scenes import camera_at, photographed
 
@@ -21,8 +21,6 @@ pytestmark = pytest.mark.browser
 SIZE = 48
 PLACES = ((-0.3, 0), (0.1, 0), (0.4, 4))
 SMALL = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--quiet")
-PATIENCE = 60_000
-"""Milliseconds that anything may take."""
 
 
 @pytest.fixture(scope="module")

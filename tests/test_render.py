@@ -4,6 +4,7 @@ import sys
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
@@ -21,6 +22,7 @@ from scenes import Room, camera_at, gaussians_of, random_gaussians, scaled, view
 
 CAMERA = camera_at(size=48)
 CPU, REFERENCE = load_renderer("cpu"), load_renderer("reference")
+EVERYWHERE = torch.ones(48, 48, dtype=torch.bool)
 DRAWN = ("image", "depth", "alpha")
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 ROUNDING = 1e-5
@@ -310,7 +312,7 @@ def test_a_plan_of_appearances_is_the_composite_that_looks_like_this(name):
     """In front of the context, within it and behind it; to what a closed pixel may be off by."""
     _, new = context_and_new()
     frozen = CPU.freeze(SCENES[name], CAMERA)
-    plan, generator = frozen.plan_appearance(new), torch.Generator().manual_seed(0)
+    plan, generator = frozen.plan_appearance(new, EVERYWHERE), torch.Generator().manual_seed(0)
     for share in (1.0, 0.5, 0.1):
         leaves = {
             "opacities": share * new.opacities,
@@ -340,21 +342,56 @@ def test_what_a_plan_compares_is_its_image():
     generator = torch.Generator().manual_seed(0)
     wanted = torch.rand(CAMERA.height, CAMERA.width, 3, generator=generator)
     weights = torch.rand(CAMERA.height, CAMERA.width, generator=generator).sub(0.3).clamp_min(0)
-    plans = [CpuRenderer(n).freeze(context, CAMERA).plan_appearance(new) for n in (1, 3)]
-    slow = ReferenceRenderer().freeze(context, CAMERA).plan_appearance(new)
+    frozen = [r.freeze(context, CAMERA) for r in (CpuRenderer(1), CpuRenderer(3), REFERENCE)]
+    plans = [view.plan_appearance(new, EVERYWHERE) for view in frozen]
     leaves = {"opacities": 0.5 * new.opacities, "sh": 0.9 * new.sh}
 
     def told(opacities, sh):
         return (weights * (plans[0](opacities, sh) - wanted).square().sum(dim=-1)).sum()
 
     true_error, true_slopes = value_and_gradients(told, leaves)
-    errors = [plan.compared(wanted, weights) for plan in (*plans, slow)]
+    errors = [plan.compared(wanted, weights) for plan in plans]
     assert errors[0](**leaves) == errors[1](**leaves)
     for compared in errors:
         error, slopes = value_and_gradients(partial(tripled, compared), leaves)
         assert_close(error / 3, true_error, "error", 1e-4)
         for name in leaves:
             assert_close(slopes[name] / 3, true_slopes[name], f"slope of {name}", 1e-3)
+
+
+@pytest.mark.parametrize("name", ["random", "room"])
+def test_a_plan_of_appearances_has_fragments_only_where_it_is_asked_for(name):
+    """A disk within four tiles, and a pixel far from it: there all is as in a plan of the whole
+    image, and the rest is the frozen scene."""
+    _, new = context_and_new()
+    frozen = CPU.freeze(SCENES[name], CAMERA)
+    rows, columns = torch.meshgrid(torch.arange(48), torch.arange(48), indexing="ij")
+    where = (rows - 16) ** 2 + (columns - 18) ** 2 < 100
+    where[40, 41] = True
+    whole, part = (frozen.plan_appearance(new, asked) for asked in (EVERYWHERE, where))
+    looks = 0.7 * new.opacities, 0.9 * new.sh
+    assert torch.equal(part(*looks)[where], whole(*looks)[where])
+    assert torch.equal(part(*looks)[~where], frozen.context.image[~where])
+    wanted = torch.rand(48, 48, 3, generator=torch.Generator().manual_seed(0))
+    leaves = dict(zip(("opacities", "sh"), looks, strict=True))
+    told = [plan.compared(wanted, where.float()) for plan in (whole, part)]
+    (error, slopes), (expected, true_slopes) = (value_and_gradients(t, leaves) for t in told)
+    assert_close(error, expected, "error", 1e-6)
+    assert all(torch.equal(slopes[name], true_slopes[name]) for name in leaves)
+    of_pixels, of_part = fragments_of(whole), fragments_of(part)
+    assert torch.equal(of_part, of_pixels * where)
+    assert 0 < of_part.sum() < of_pixels.sum() / 4
+
+
+def fragments_of(plan) -> torch.Tensor:
+    """How many each pixel has [h, w]."""
+    counts, tiles_x = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.long), CAMERA.width // 16
+    for piece in plan.fragments:
+        for tile, starts in zip(piece.tiles, piece.pixel_start, strict=True):
+            top, left = 16 * (int(tile) // tiles_x), 16 * (int(tile) % tiles_x)
+            found = torch.from_numpy(np.diff(starts)).view(16, 16)
+            counts[top : top + 16, left : left + 16] = found
+    return counts
 
 
 def tripled(function, **leaves):
@@ -375,7 +412,7 @@ def test_what_is_closed_by_something_solid_is_closed_at_the_same_splat():
     frozen, new = CPU.freeze(context, CAMERA), merge([placed(wall, 0.98), placed(wall, 1.01)])
     for opacity in (0.3, 0.9, 0.97):
         opacities = torch.full((len(new),), opacity)
-        planned = frozen.plan_appearance(new)(opacities, new.sh)
+        planned = frozen.plan_appearance(new, EVERYWHERE)(opacities, new.sh)
         truth = frozen.composite(replace(new, opacities=opacities)).image
         assert_close(planned, truth, "image", FOLDED)
 
@@ -392,7 +429,7 @@ def test_what_looks_otherwise_costs_what_is_new_however_much_is_frozen():
     counts = []
     for context in (few, many):
         faint = replace(context, opacities=0.02 * context.opacities)
-        fragments = CPU.freeze(faint, CAMERA).plan_appearance(new).fragments
+        fragments = CPU.freeze(faint, CAMERA).plan_appearance(new, EVERYWHERE).fragments
         counts.append(sum(len(piece.entries) - len(piece.folds) for piece in fragments))
     assert counts[0] == counts[1] > 0
 

@@ -22,6 +22,7 @@ from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.memory import needed_bytes
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
+from gscompleter.render.cpu import CpuView
 from gscompleter.render.proxy import WORTH
 from gscompleter.reports.completion import Brought, as_in_file
 from gscompleter.splats.order import order_nearby
@@ -177,6 +178,25 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     assert max(gained) > 0
 
 
+def test_what_is_added_is_drawn_only_where_photographs_count(monkeypatch):
+    """Not in their holes; and at the target, whose wider camera is asked last, in nothing else."""
+    asked, plan = [], CpuView.plan_appearance
+
+    def noted(self, new, where):
+        asked.append((self, where))
+        return plan(self, new, where)
+
+    monkeypatch.setattr(CpuView, "plan_appearance", noted)
+    half = SURFACES[SURFACES.means[:, 0] < 0.3]
+    completion = knowing()(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
+    *at_photographs, (at_target, holes) = asked
+    shares = sorted(where.float().mean().item() for _, where in at_photographs)
+    assert shares == sorted(judge.counted.float().mean().item() for judge in completion.judges)
+    assert shares[0] < 0.9
+    assert holes.float().mean() > 0.1
+    assert (at_target.context.alpha < 0.5)[holes].float().mean() > 0.9
+
+
 def test_without_its_photographs_a_scene_is_taken_as_it_is():
     completion = knowing()(VIEWS[::2], TARGET, SCENE)
     assert completion.set_aside is None
@@ -212,7 +232,7 @@ def test_what_is_added_is_fitted_to_all_photographs_at_once():
         target,
         view,
         holes,
-        [RENDERER.freeze(SURFACES, v.camera).plan_appearance(new) for v in VIEWS],
+        [RENDERER.freeze(SURFACES, v.camera).plan_appearance(new, v.counted) for v in VIEWS],
         VIEWS,
         allowed,
     )

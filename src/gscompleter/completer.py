@@ -462,7 +462,8 @@ class GSCompleter:
         else:
             holes, degree = self.holes(sight), completion.context.sh_degree
             settings = config.reconcile.at_most(degree)
-            plans = list(each_view(kept)(lambda view: view.plan_appearance(kept), frozen))
+            counted = [view.counted for view in judges]
+            plans = list(each_view(kept)(lambda v, c: v.plan_appearance(kept, c), frozen, counted))
             refined, losses = reconcile(
                 kept, sight.frozen, reference, holes, plans, judges, allowed, settings
             )

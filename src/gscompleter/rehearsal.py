@@ -69,7 +69,8 @@ def doubt_brought(_: str) -> None:
     run_by_run(gaussians, [view.camera])
     evidence = gather_evidence(gaussians, [view], [frozen], config)
     support(evidence, weight_sums(frozen), view.camera, config)
-    plan = frozen.plan_appearance(gaussians)
+    everywhere = torch.ones_like(frozen.context.alpha, dtype=torch.bool)
+    plan = frozen.plan_appearance(gaussians, everywhere)
     (plan(*looks).sum() + plan.compared(view.image, view.image[..., 0])(*looks)).backward()
 
 

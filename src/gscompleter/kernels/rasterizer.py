@@ -1333,11 +1333,12 @@ def _by_pixel(
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def find_fragments(begin, end, tiles, context, new, new_slots, behind):
+def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
     """The Fragments of tiles[begin:end] of two layers, where what is frozen is folded.
 
     context, new: Layer; the opacities of `new` are 1. new_slots [entries] int32: their slots.
-    behind [h, w, 3] float32 is written in these tiles.
+    where [h, w] bool: the pixels that are to have fragments. behind [h, w, 3] float32 is written
+        in these tiles.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -1376,13 +1377,19 @@ def find_fragments(begin, end, tiles, context, new, new_slots, behind):
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         rows, columns = min(TILE, height - top), min(TILE, width - left)
         state[:] = 0
-        state[:, 0, :columns] = 1
-        state[:, 0, columns:] = -1
+        # Pixels that nobody asks for are full from the start.
+        state[:, 0] = -1
+        row_limit[:] = -1
+        open_rows = 0
+        for row in range(rows):
+            for column in range(columns):
+                if where[top + row, left + column]:
+                    state[row, 0, column] = 1
+                    row_limit[row] = np.iinfo(np.int32).max
+            open_rows += row_limit[row] >= 0
         known[:] = 0
         known[:, 0] = 1
         veiled[:] = False
-        row_limit[:] = np.iinfo(np.int32).max
-        open_rows = rows
 
         first_entry, first_fold, count = entry, fold, np.int64(0)
         c_begin, c_end = c_start[tile], c_start[tile + 1]
@@ -1521,13 +1528,12 @@ def _looks(fragments, index, opacities, colours):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def draw_fragments(fragments, opacities, colours, where, image):
-    """Draw the pixels that have fragments, `where` they are asked for.
+def draw_fragments(fragments, opacities, colours, image):
+    """Draw the pixels that have fragments.
 
     Whether one is a fold is no branch: processors cannot foretell it.
 
-    opacities [n], colours [n, 3] float32: of the new splats. where [h, w] bool. image [h, w, 3]
-        float32 is written.
+    opacities [n], colours [n, 3] float32: of the new splats. image [h, w, 3] float32 is written.
     """
     tiles, _, _, _, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
@@ -1537,9 +1543,9 @@ def draw_fragments(fragments, opacities, colours, where, image):
         looks, count = _looks(fragments, index, opacities, colours)
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
-            y, x = top + pixel // TILE, left + pixel % TILE
-            if begin == end or not where[y, x]:
+            if begin == end:
                 continue
+            y, x = top + pixel // TILE, left + pixel % TILE
             transmittance, red, green, blue = one, zero, zero, zero
             for place in range(begin, end):
                 entry = entries[place]
@@ -1563,7 +1569,7 @@ def draw_fragments(fragments, opacities, colours, where, image):
 def compare_fragments(fragments, image, wanted, weights, slopes, errors):
     """Compare the pixels that have fragments with what is wanted there.
 
-    image, wanted [h, w, 3], weights [h, w] float32; where a weight is 0, image may be anything.
+    image, wanted [h, w, 3], weights [h, w] float32; where a weight is 0, `wanted` may be anything.
         slopes [h, w, 3] float32, those of the error in the image, are written. errors
         [h * w / TILE²] float64: for each tile the sum of weights times squared differences of all
         channels is written.

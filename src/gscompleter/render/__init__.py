@@ -105,9 +105,10 @@ class FrozenView(Protocol):
     def plan(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities; the function it returns is differentiable."""
 
-    def plan_appearance(self, new: Gaussians) -> AppearanceRender:
-        """Fix all of `new` but the opacities and spherical harmonics; the function it returns is
-        differentiable in both. It takes longer to make than `plan`, and then draws faster."""
+    def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
+        """Fix all of `new` but the opacities and spherical harmonics, and draw it at least `where`
+        it is asked for; the function it returns is differentiable in both. It takes longer to make
+        than `plan`, and then draws faster."""
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
         """Fix all of `new` but its colours, which the camera sees as they are given, from 0 up."""

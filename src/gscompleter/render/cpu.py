@@ -135,10 +135,12 @@ class CpuView:
 
         return render
 
-    def plan_appearance(self, new: Gaussians) -> Folded:
+    def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> Folded:
         """Project, sort and bin `new` once, and fold what is frozen around it."""
         arrays = opaque(new)
-        return folded(self, self.viewpoint.bin(arrays, self.depth_limits), arrays.means)
+        limits = np.minimum(self.viewpoint.tiles_of(where), self.depth_limits)
+        binned = self.viewpoint.bin(arrays, limits)
+        return folded(self, binned, arrays.means, where)
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
         """Project, sort and bin `new` once."""
@@ -154,7 +156,7 @@ class CpuView:
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Project `new` once, as far as it touches a tile that is asked for."""
         splats = self.viewpoint.project(arrays_of(new))
-        anywhere = np.where(self.viewpoint.tiles_of(where), np.inf, -np.inf).astype(np.float32)
+        anywhere = self.viewpoint.tiles_of(where)
         asked = np.zeros(len(splats.boxes), np.bool_)
         asked[self.viewpoint.enter(splats, anywhere).entries] = True
         splats = splats.only(asked)
@@ -325,10 +327,11 @@ class Viewpoint:
         self.share(lists.sum_entries, len(totals), new.slot_start, *gradients, totals)
         return totals
 
-    def tiles_of(self, where: Bool[Tensor, "h w"]) -> Bool[ndarray, "tiles"]:
-        """The tiles that hold any pixel of a mask."""
-        tiles = max_pool2d(where[None].float(), TILE, ceil_mode=True)
-        return (tiles.flatten() > 0).cpu().numpy()
+    def tiles_of(self, where: Bool[Tensor, "h w"]) -> Float32[ndarray, "tiles"]:
+        """Depth limits that let everything into the tiles that hold any pixel of a mask, and
+        nothing into the others."""
+        tiles = max_pool2d(where[None].float(), TILE, ceil_mode=True).flatten() > 0
+        return np.where(tiles.cpu().numpy(), np.float32(np.inf), np.float32(-np.inf))
 
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
         """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time."""

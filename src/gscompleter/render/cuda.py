@@ -201,7 +201,7 @@ class CudaView:
         render = self.drawing.plan(merge([self.seen, opaque]), self.camera)
         return lambda opacities: render(torch.cat([self.seen.opacities, opacities]))
 
-    def plan_appearance(self, new: Gaussians) -> AppearanceRender:
+    def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
         """Context and `new` with other looks, all of it drawn anew."""
         return DrawnAnew(lambda *looks: self.composite(looking(new, *looks)).image)
 

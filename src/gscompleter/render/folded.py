@@ -76,18 +76,17 @@ class Folded:
     ) -> Float32[ndarray, "h w 3"]:
         """The frozen image, drawn anew where it has fragments."""
         image = self.image.copy()
-        self.draw_fragments(opacities, colours, np.ones(image.shape[:2], np.bool_), image)
+        self.draw_fragments(opacities, colours, image)
         return image
 
     def draw_fragments(
         self,
         opacities: Float32[ndarray, "n"],
         colours: Float32[ndarray, "n 3"],
-        where: Bool[ndarray, "h w"],
         image: Float32[ndarray, "h w 3"],
     ) -> None:
-        """Write the pixels that have fragments, of those that are asked for."""
-        drawn = [(piece, opacities, colours, where, image) for piece in self.fragments]
+        """Write the pixels that have fragments."""
+        drawn = [(piece, opacities, colours, image) for piece in self.fragments]
         run(kernels.draw_fragments, drawn, self.viewpoint.threads)
 
     def slopes(
@@ -134,11 +133,6 @@ class Held:
         return float(errors.sum()), slopes
 
     @cached_property
-    def where(self) -> Bool[ndarray, "h w"]:
-        """The pixels that count."""
-        return self.weights > 0
-
-    @cached_property
     def elsewhere(self) -> float:
         """The error of all others, which stays."""
         frozen = self.folded.image
@@ -154,7 +148,7 @@ class _Missed(torch.autograd.Function):
         folded = held.folded
         colours, opaque = folded.colours(float32(sh)), float32(opacities)
         image = np.empty_like(folded.image)
-        folded.draw_fragments(opaque, colours, held.where, image)
+        folded.draw_fragments(opaque, colours, image)
         error, slopes = held.missed(image)
         ctx.scene = (folded, opaque, colours, image, slopes, sh.shape[1])
         return torch.tensor(held.elsewhere + error, dtype=torch.float32)
@@ -199,12 +193,15 @@ def slopes_of_looks(
     return opacities, torch.from_numpy(folded.slopes_of_sh(colours, slopes[:, 1:], bands))
 
 
-def folded(view: CpuView, binned: Binned, means: Float32[ndarray, "n 3"]) -> Folded:
-    """The fragments of splats of opacity 1, and what is frozen between them."""
+def folded(
+    view: CpuView, binned: Binned, means: Float32[ndarray, "n 3"], where: Bool[Tensor, "h w"]
+) -> Folded:
+    """The fragments of splats of opacity 1 `where` they are asked for, and what is frozen between
+    them."""
     viewpoint, context, new = view.viewpoint, view.layer, binned.layer
     tiles = np.flatnonzero(np.diff(new.tile_start))
     behind = np.zeros_like(view.frame.image)
-    known = (tiles, context, new, binned.slots, behind)
+    known = (tiles, context, new, binned.slots, where.cpu().numpy(), behind)
     pieces = [(*piece, *known) for piece in pieces_of(len(tiles), viewpoint.threads)]
     fragments = run(kernels.find_fragments, pieces, viewpoint.threads)
     return Folded(viewpoint, view.frame.image, binned, means, fragments)

@@ -102,7 +102,7 @@ class ReferenceView:
         )
         return lambda opacities: self.composite(replace(fixed, opacities=opacities))
 
-    def plan_appearance(self, new: Gaussians) -> AppearanceRender:
+    def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
         return DrawnAnew(lambda *looks: self.composite(looking(new, *looks)).image)
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:

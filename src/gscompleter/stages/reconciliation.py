@@ -53,7 +53,7 @@ def reconcile(
         frozen_target: The scene frozen at the target.
         reference: The synthesized image there.
         holes: Where the scene is to look like it.
-        plans: What draws each of `views` with other looks of `added`.
+        plans: What draws each of `views`, as far as it counts, with other looks of `added`.
         views: The photographs.
         allowed_errors: Largest mean squared error allowed in each of them.
         config: How long, and how freely.
@@ -65,7 +65,8 @@ def reconcile(
     if config.iterations == 0 or len(added) == 0:
         return added, ()
     fit = Fit(added, config)
-    at_target = frozen_target.plan_appearance(added).compared(reference.image, shares_of(holes))
+    planned = frozen_target.plan_appearance(added, holes)
+    at_target = planned.compared(reference.image, shares_of(holes))
     before = hole_error(frozen_target.context.image, reference, holes).clamp_min(1e-12)
     asked = [Asked.by(*each) for each in zip(plans, views, allowed_errors, strict=True)]
     with torch.no_grad():
