@@ -44,9 +44,6 @@ SOLID = np.float32(0.5)
 """Alpha above which a frozen splat is not folded with others. Where a pixel is closed among what is
 folded, its colour is off by at most `MIN_TRANSMITTANCE / SOLID`."""
 
-FARTHER = np.float32(0.01)
-"""By how much farther, in units of the exponent, a splat is looked at than it is visible."""
-
 X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
 """Columns of the splats."""
 NUM_SPLAT_COLUMNS = 9
@@ -410,6 +407,26 @@ def _spread_rows(typing, begin, end, place, state, kept, sums):
         out = _Rows(context, builder, signature.args[5], sums, _FLOATS, 1)
         columns = [_Lanes(builder, builder.load(total)) for total in totals]
         out.store(ir.Constant(_LONG, 0), 0, _sums_of_lanes(builder, columns))
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+def _fall_off(typing, row, falloffs, splat):
+    """Write the alphas of a splat in a row of its tile before they are capped, of pixels that it is
+    visible in, and of the others 0.
+
+    falloffs: [16] float32.
+    """
+    signature = types.void(types.int64, falloffs, splat)
+
+    def generate(context, builder, signature, arguments):
+        row, falloffs, splat = arguments
+        splat = _Splat(builder, *cgutils.unpack_tuple(builder, splat))
+        out = _Rows(context, builder, signature.args[1], falloffs, _FLOATS, 1)
+        _, raw, _, visible = splat.falloff(row)
+        out.store(ir.Constant(_LONG, 0), 0, raw.where(visible, 0.0).value)
         return context.get_dummy_value()
 
     return signature, generate
@@ -1345,12 +1362,13 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
     height, width, _ = behind.shape
     tiles_x = (width + TILE - 1) // TILE
     state = _aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
-    # What `state` was at the last fragment of each pixel, and whether anything new was before
+    # What `state` was at the last fragment of each pixel, and in bits of a row whether anything new
+    # was before
     known = np.empty((TILE, 4, TILE), np.float32)
-    veiled = np.empty((TILE, TILE), np.bool_)
+    veiled, falloffs_of_row = np.empty(TILE, np.uint32), np.empty(TILE, np.float32)
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
-    infinity, zero, one = np.float32(np.inf), np.float32(0), np.float32(1)
+    infinity, one = np.float32(np.inf), np.float32(1)
     position = np.int32(0)
 
     most = most_entries = most_at_once = 0
@@ -1389,7 +1407,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
             open_rows += row_limit[row] >= 0
         known[:] = 0
         known[:, 0] = 1
-        veiled[:] = False
+        veiled[:] = 0
 
         first_entry, first_fold, count = entry, fold, np.int64(0)
         c_begin, c_end = c_start[tile], c_start[tile + 1]
@@ -1418,32 +1436,23 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
                 n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
 
             begun = count
-            x, y, u, v, w, opacity, red, green, blue, _ = splat
-            # A little more than where the falloff is MIN_ALPHA: exp takes longer than all the rest
-            farthest = math.log(opacity / MIN_ALPHA) + FARTHER
-            inverse_u, shear = one / u, v / u
+            _, _, _, _, _, _, red, green, blue, _ = splat
+            columns_of_splat = (1 << x_to) - (1 << x_from)
             for row in range(y_from, y_to):
                 if row_limit[row] < 0:
                     continue
-                dy = np.float32(row) - y
-                t = w * dy
-                reach, middle = inverse_u * math.sqrt(max(farthest - t * t, zero)), x - shear * dy
-                from_x = max(middle - reach, np.float32(x_from))
-                to_x = min(middle + reach, np.float32(x_to - 1))
-                # Written so that NaN fails it, here and below.
-                if not (t * t <= farthest and from_x <= to_x):
+                if frozen and not veiled[row] & columns_of_splat:
+                    open_rows -= _draw_rows(row, row + 1, position, state, last, row_limit, splat)
                     continue
-                for column in range(math.ceil(from_x), int(to_x) + 1):
-                    if state[row, 0, column] < 0:
-                        continue
-                    s = u * (np.float32(column) - x) + v * dy
-                    falloff = opacity * math.exp(-(s * s + t * t))
-                    if not falloff >= MIN_ALPHA:
+                _fall_off(row, falloffs_of_row, splat)
+                for column in range(x_from, x_to):
+                    falloff = falloffs_of_row[column]
+                    if falloff == 0 or state[row, 0, column] < 0:
                         continue
                     alpha = min(falloff, MAX_ALPHA)
-                    own = not frozen or (alpha > SOLID and veiled[row, column])
+                    own = not frozen or (alpha > SOLID and veiled[row] >> column & 1)
                     if own:
-                        veiled[row, column] = True
+                        veiled[row] |= 1 << column
                         pixel = np.uint8(row * TILE + column)
                         # Whatever is frozen lets less pass.
                         if state[row, 0, column] != known[row, 0, column]:
