@@ -386,13 +386,12 @@ def test_a_plan_of_appearances_has_fragments_only_where_it_is_asked_for(name):
 
 def fragments_of(plan) -> torch.Tensor:
     """How many each pixel has [h, w]."""
-    counts, tiles_x = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.long), CAMERA.width // 16
+    side = rasterizer.TILE
+    counts = torch.zeros(CAMERA.height // side, CAMERA.width // side, side, side, dtype=torch.long)
     for piece in plan.fragments:
-        for tile, starts in zip(piece.tiles, piece.pixel_start, strict=True):
-            top, left = 16 * (int(tile) // tiles_x), 16 * (int(tile) % tiles_x)
-            found = torch.from_numpy(np.diff(starts)).view(16, 16)
-            counts[top : top + 16, left : left + 16] = found
-    return counts
+        found = torch.from_numpy(np.diff(piece.pixel_start)).view(-1, side, side)
+        counts.view(-1, side, side)[torch.from_numpy(piece.tiles)] = found
+    return counts.transpose(1, 2).reshape(CAMERA.height, CAMERA.width)
 
 
 def tripled(function, **leaves):

@@ -69,8 +69,7 @@ def doubt_brought(_: str) -> None:
     run_by_run(gaussians, [view.camera])
     evidence = gather_evidence(gaussians, [view], [frozen], config)
     support(evidence, weight_sums(frozen), view.camera, config)
-    everywhere = torch.ones_like(frozen.context.alpha, dtype=torch.bool)
-    plan = frozen.plan_appearance(gaussians, everywhere)
+    plan = frozen.plan_appearance(gaussians, view.counted)
     (plan(*looks).sum() + plan.compared(view.image, view.image[..., 0])(*looks)).backward()
 
 

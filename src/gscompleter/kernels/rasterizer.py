@@ -1436,7 +1436,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
                 n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
 
             begun = count
-            _, _, _, _, _, _, red, green, blue, _ = splat
+            red, green, blue = splat[6:9]
             columns_of_splat = (1 << x_to) - (1 << x_from)
             for row in range(y_from, y_to):
                 if row_limit[row] < 0:
@@ -1578,14 +1578,13 @@ def draw_fragments(fragments, opacities, colours, image):
 def compare_fragments(fragments, image, wanted, weights, slopes, errors):
     """Compare the pixels that have fragments with what is wanted there.
 
-    image, wanted [h, w, 3], weights [h, w] float32; where a weight is 0, `wanted` may be anything.
-        slopes [h, w, 3] float32, those of the error in the image, are written. errors
-        [h * w / TILE²] float64: for each tile the sum of weights times squared differences of all
-        channels is written.
+    image, wanted [h, w, 3], weights [h, w] float32. slopes [h, w, 3] float32, those of the error in
+        the image, are written. errors [h * w / TILE²] float64: for each tile the sum of weights
+        times squared differences of all channels is written.
     """
     tiles, starts = fragments.tiles, fragments.pixel_start
     tiles_x = (image.shape[1] + TILE - 1) // TILE
-    zero, two = np.float32(0), np.float32(2)
+    two = np.float32(2)
     for index in range(len(tiles)):
         left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
         error = 0.0
@@ -1595,7 +1594,7 @@ def compare_fragments(fragments, image, wanted, weights, slopes, errors):
             y, x = top + pixel // TILE, left + pixel % TILE
             weight = weights[y, x]
             for channel in range(3):
-                missed = image[y, x, channel] - wanted[y, x, channel] if weight > zero else zero
+                missed = image[y, x, channel] - wanted[y, x, channel]
                 slopes[y, x, channel] = two * weight * missed
                 error += weight * missed * missed
         errors[tiles[index]] = error

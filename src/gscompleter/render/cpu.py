@@ -138,7 +138,7 @@ class CpuView:
     def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> Folded:
         """Project, sort and bin `new` once, and fold what is frozen around it."""
         arrays = opaque(new)
-        limits = np.minimum(self.viewpoint.tiles_of(where), self.depth_limits)
+        limits = np.minimum(self.viewpoint.limits_within(where), self.depth_limits)
         binned = self.viewpoint.bin(arrays, limits)
         return folded(self, binned, arrays.means, where)
 
@@ -156,7 +156,7 @@ class CpuView:
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Project `new` once, as far as it touches a tile that is asked for."""
         splats = self.viewpoint.project(arrays_of(new))
-        anywhere = self.viewpoint.tiles_of(where)
+        anywhere = self.viewpoint.limits_within(where)
         asked = np.zeros(len(splats.boxes), np.bool_)
         asked[self.viewpoint.enter(splats, anywhere).entries] = True
         splats = splats.only(asked)
@@ -327,7 +327,7 @@ class Viewpoint:
         self.share(lists.sum_entries, len(totals), new.slot_start, *gradients, totals)
         return totals
 
-    def tiles_of(self, where: Bool[Tensor, "h w"]) -> Float32[ndarray, "tiles"]:
+    def limits_within(self, where: Bool[Tensor, "h w"]) -> Float32[ndarray, "tiles"]:
         """Depth limits that let everything into the tiles that hold any pixel of a mask, and
         nothing into the others."""
         tiles = max_pool2d(where[None].float(), TILE, ceil_mode=True).flatten() > 0
