@@ -86,13 +86,15 @@ def test_the_unit_of_the_scene_does_not_matter(unit):
     assert torch.allclose(place(unit) / unit, place(1.0), rtol=1e-4)
 
 
-def test_without_steps_nothing_is_checked():
-    config = FreeSpaceConfig(num_steps=0)
+@pytest.mark.parametrize("behind", [4.0, 8.0 * WITNESS.far], ids=["a wall", "the sky"])
+def test_without_steps_nothing_is_checked(behind):
+    """Neither a surface nor the sky behind the candidates moves them."""
+    candidates, config = floaters(2.0), FreeSpaceConfig(num_steps=0)
     moved, placed = respect_free_space(
-        floaters(2.0), TARGET, [WITNESS], [wall(4.0)], "constant", config
+        candidates, TARGET, [WITNESS], [wall(behind)], "constant", config
     )
     assert placed.all()
-    assert torch.allclose(moved.means, floaters(2.0).means, atol=1e-6)
+    assert moved is candidates
 
 
 def test_nothing_stands_where_a_camera_stood():

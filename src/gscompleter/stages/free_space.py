@@ -47,6 +47,8 @@ def respect_free_space(
         footprint: Whether sizes follow the distance, as in `slide`.
         config: How often they may slide.
     """
+    if config.num_steps == 0:
+        return gaussians, torch.ones_like(gaussians.opacities, dtype=torch.bool)
     ratio = torch.ones_like(gaussians.opacities)
     offsets = gaussians.means - target.center
     waiting = torch.arange(len(gaussians), device=ratio.device)
@@ -64,7 +66,7 @@ def respect_free_space(
         ratio[waiting[found]] = behind[found]
         waiting = waiting[~found]
     placed = torch.ones_like(ratio, dtype=torch.bool)
-    placed[waiting] = config.num_steps == 0
+    placed[waiting] = False
     return slide(gaussians, target, ratio, footprint), placed
 
 
