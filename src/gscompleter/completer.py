@@ -64,6 +64,7 @@ from gscompleter.types import (
     DepthAffine,
     Evidence,
     Gaussians,
+    InitialContext,
     Lift,
     Render,
     SceneContext,
@@ -215,28 +216,43 @@ class GSCompleter:
                 f"{len(views)} context view was given, and stereo needs at least 2; name more "
                 "frames, or bring a scene."
             )
+        if scene is None:
+            return self.begin_with(self.reconstruct(views))
         clock = Clock()
         with clock("context"):
             cameras = [*targets, *(view.camera for view in (*views, *(witnesses or ())))]
-            proxy = None if scene is None else proxy_of(scene, cameras)
+            proxy = proxy_of(scene, cameras)
             drawn = scene if proxy is None else proxy.scene
             near, far = working_range(views, drawn, self.renderer)
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
-            gains = None
-            if drawn is None:
-                drawn, gains = init_context(self.reconstructor, views)
-                views = exposed_alike(views, gains)
-            context = drawn if scene is None else scene
-            completion = Completion(
-                drawn, context, views, (), (), {}, others, gains=gains, proxy=proxy
-            )
-            if scene is None:
-                completion = self.wary_of_what_moved(completion)
-            elif witnesses is not None and self.config.support.doubts:
+            completion = Completion(drawn, scene, views, (), (), {}, others, proxy=proxy)
+            if witnesses is not None and self.config.support.doubts:
                 completion = self.doubted(completion)
             completion = self.judged(completion)
         return replace(completion, seconds=clock.seconds)
+
+    def reconstruct(self, views: Sequence[View]) -> InitialContext:
+        """Reconstruct the context from posed photographs (paper, Eq. 5).
+
+        Raises:
+            InputError: too few views, no baseline.
+        """
+        clock = Clock()
+        with clock("context"):
+            near, far = working_range(views, None, self.renderer)
+            views = [ranged(view, near, far) for view in views]
+            gaussians, gains = init_context(self.reconstructor, views)
+        return InitialContext(gaussians, exposed_alike(views, gains), gains, clock.seconds)
+
+    def begin_with(self, context: InitialContext) -> Completion:
+        """Begin the completion of a reconstructed context: find what moved, set error budgets."""
+        clock = Clock()
+        with clock("context"):
+            made = context.gaussians
+            completion = Completion(made, made, context.views, (), (), {}, gains=context.gains)
+            completion = self.judged(self.wary_of_what_moved(completion))
+        return replace(completion, seconds=total(clock.seconds, context.seconds))
 
     def advance(
         self, completion: Completion, target: Camera, reference: Synthesized | None = None
@@ -612,7 +628,7 @@ class GSCompleter:
         return replace(
             completion,
             views=tuple(
-                replace(view, contradicted=mask) if mask.any() else view
+                replace(view, contradicted=mask if mask.any() else None)
                 for view, mask in zip(views, masks, strict=True)
             ),
         )

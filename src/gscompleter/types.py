@@ -278,6 +278,20 @@ class Reconstruction:
 
 
 @dataclass(frozen=True)
+class InitialContext:
+    """The context scene of stage 1 with the photographs that it was reconstructed from."""
+
+    gaussians: Gaussians
+    views: tuple[View, ...]
+    """The photographs with the depth range of the scene, in the exposure of `gaussians`."""
+    gains: Float[Tensor, "v 3"] | None = None
+    """Exposure of each original photograph relative to `gaussians`, by channel; None where Ψ did
+    not normalize exposures."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Wall time by stage."""
+
+
+@dataclass(frozen=True)
 class SceneContext:
     """What is known of the scene when a generator Φ is asked for an unseen image."""
 

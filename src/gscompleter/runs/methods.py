@@ -17,7 +17,7 @@ from gscompleter.generators import Generator
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render import Renderer
 from gscompleter.stages.anchor import lift, select_anchor
-from gscompleter.types import Camera, Completion, Gaussians, merge
+from gscompleter.types import Camera, Completion, Gaussians, InitialContext, merge
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ def completed_with(config: str) -> Method:
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         completer = models.completer(config)
-        done = completer.advance(completer.begin(state.views, state.scene), target)
+        context = InitialContext(state.scene, state.views)
+        done = completer.advance(completer.begin_with(context), target)
         (made,) = done.targets
         told = (made.anchor, made.anchor_fallback, made.notes)
         return Prediction(done.scene, made.added, done.seconds, *told)

@@ -269,13 +269,12 @@ def context_at(path: Path, views: Sequence[View], models: Models) -> SavedContex
     device = views[0].image.device if views else "cpu"
 
     def save() -> None:
-        begun = models.completer().begin(views)
-        camera = begun.views[0].camera
-        assert camera.near is not None
-        assert camera.far is not None
-        seconds = begun.seconds["total"]
-        made = SavedContext(begun.scene, camera.near, camera.far, seconds, begun.gains)
-        save_context(path, made)
+        made = models.completer().reconstruct(views)
+        near, far = made.views[0].camera.near, made.views[0].camera.far
+        assert near is not None
+        assert far is not None
+        seconds = made.seconds["total"]
+        save_context(path, SavedContext(made.gaussians, near, far, seconds, made.gains))
 
     return kept(path, lambda: load_context(path, device), save)
 

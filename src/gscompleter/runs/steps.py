@@ -32,7 +32,7 @@ from gscompleter.runs.store import (
     truth_path,
 )
 from gscompleter.stages.anchor import lift
-from gscompleter.types import Camera, Completion, DepthMap, Gaussians, View
+from gscompleter.types import Camera, Completion, DepthMap, Gaussians, InitialContext, View
 
 T = TypeVar("T")
 
@@ -124,7 +124,7 @@ def advanced(
 ) -> Progress:
     """`progress` after the step at `target`."""
     number = len(progress.steps) + 1
-    state = task.models.completer().begin(progress.views, progress.scene)
+    state = task.models.completer().begin_with(InitialContext(progress.scene, progress.views))
     path = step_path(folder, method, number)
     prediction = predicted(method, state, target.camera, number, task.models, path)
     step, seen = step_of(prediction, state, target, task)

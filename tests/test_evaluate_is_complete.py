@@ -1,0 +1,44 @@
+"""`evaluate` scores what `complete` writes, byte for byte."""
+
+import pytest
+
+from command import run
+from gscompleter.data.cases import Case
+from gscompleter.data.scene import write_cameras
+from gscompleter.io.image import write_image
+from gscompleter.io.ply import save_ply
+from gscompleter.runs.runner import RunConfig, evaluate, prepare
+from gscompleter.runs.store import load_prediction, step_path, task_folder
+from gscompleter.runs.tasks import task_of
+from scenes import camera_at, view_of
+from test_contradiction import CAMERAS, ROOM, SIZE, photographed
+
+TARGET = camera_at(0.5, -0.5, yaw=10, size=SIZE)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A room in which something moved between frames 0 and 1; frame 2 is the target."""
+    folder = tmp_path_factory.mktemp("moving")
+    views = [*photographed()[0], view_of(ROOM, TARGET)]
+    names = [f"{number}.png" for number in range(len(views))]
+    for name, view in zip(names, views, strict=True):
+        write_image(folder / name, view.image)
+    write_cameras(folder / "transforms.json", [*CAMERAS, TARGET], names)
+    return folder
+
+
+@pytest.mark.parametrize(("method", "config"), [("full", "default"), ("paper", "paper")])
+def test_a_case_gives_the_bytes_of_complete(method, config, scene, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    frames = ("--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20, "--resolution", 96, 96)
+    assert run(monkeypatch, "complete", scene, *frames, "--config", config, "--out", out) == 0
+
+    results = tmp_path / "results"
+    task = task_of(Case(scene, (0, 1), 2, (), (SIZE, SIZE), 0.5, 20.0))
+    evaluate([task], ["context", "full", "paper"], results)
+    folder = task_folder(results, task.name)
+    context = prepare(task, folder, RunConfig()).context
+    prediction = load_prediction(step_path(folder, method, 1), context)
+    save_ply(tmp_path / "evaluated.ply", prediction.scene, provenance=True)
+    assert (tmp_path / "evaluated.ply").read_bytes() == (out / "completed.ply").read_bytes()
