@@ -1,8 +1,12 @@
 """`evaluate` scores what `complete` writes, byte for byte."""
 
+from dataclasses import replace
+
 import pytest
+import torch
 
 from command import run
+from gscompleter import GSCompleter
 from gscompleter.data.cases import Case
 from gscompleter.data.scene import write_cameras
 from gscompleter.io.image import write_image
@@ -42,3 +46,20 @@ def test_a_case_gives_the_bytes_of_complete(method, config, scene, tmp_path, mon
     prediction = load_prediction(step_path(folder, method, 1), context)
     save_ply(tmp_path / "evaluated.ply", prediction.scene, provenance=True)
     assert (tmp_path / "evaluated.ply").read_bytes() == (out / "completed.ply").read_bytes()
+
+
+def test_the_order_of_the_context_does_not_matter(scene, tmp_path, monkeypatch):
+    written = []
+    for order in ((0, 1), (1, 0)):
+        out = tmp_path / f"{order[0]}-first"
+        frames = ("--context", *order, "--target", 2, "--resolution", 96, 96)
+        assert run(monkeypatch, "complete", scene, *frames, "--out", out) == 0
+        written.append((out / "completed.ply").read_bytes())
+    assert written[0] == written[1]
+
+
+def test_a_completer_sorts_its_views_by_frame(scene):
+    views = [replace(view, frame=frame) for frame, view in enumerate(photographed()[0])]
+    scenes = [GSCompleter().begin(order).scene for order in (views, views[::-1])]
+    assert torch.equal(scenes[0].means, scenes[1].means)
+    assert torch.equal(scenes[0].sh, scenes[1].sh)

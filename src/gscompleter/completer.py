@@ -39,7 +39,12 @@ from gscompleter.stages.anchor import (
 )
 from gscompleter.stages.candidates import shrunk
 from gscompleter.stages.compared_depths import compared_depths
-from gscompleter.stages.context import exposed_alike, init_context, working_range
+from gscompleter.stages.context import (
+    exposed_alike,
+    init_context,
+    sort_by_frame,
+    working_range,
+)
 from gscompleter.stages.contradiction import contradicted
 from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
@@ -169,7 +174,8 @@ class GSCompleter:
         """Complete what `views` never saw, as seen from `target`.
 
         Args:
-            views: Photographs with their cameras: at least two, or one with `scene`.
+            views: Photographs with their cameras: at least two, or one with `scene`. Those with
+                frame numbers are sorted by them.
             target: The camera (or cameras, completed one after the other into one scene; a
                 generator that takes several at once is asked for their images before that).
             scene: Gaussians that are the context already, in the frame and unit of the cameras;
@@ -216,6 +222,7 @@ class GSCompleter:
                 f"{len(views)} context view was given, and stereo needs at least 2; name more "
                 "frames, or bring a scene."
             )
+        views = sort_by_frame(views)
         if scene is None:
             return self.begin_with(self.reconstruct(views))
         clock = Clock()

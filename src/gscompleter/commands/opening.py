@@ -184,8 +184,9 @@ def task_of(
     device: str,
     check: Callable[[Sequence[Camera]], None],
 ) -> Task:
-    """The photographs of `frames`, and the targets with theirs, once their cameras pass `check`."""
-    resolution = working_size(options.resolution)
+    """The photographs of `frames`, ascending, and the targets with theirs, once their cameras pass
+    `check`."""
+    frames, resolution = sorted(frames), working_size(options.resolution)
     bounded = with_depth_range(given, frames, resolution)
     targets = [replace(t, camera=with_planes(t.camera, bounded)) for t in targets]
     cameras = [bounded.camera(frame, resolution) for frame in frames]

@@ -39,7 +39,7 @@ from gscompleter.runs.store import (
     write_json,
 )
 from gscompleter.runs.tasks import Task
-from gscompleter.stages.context import exposed_alike
+from gscompleter.stages.context import exposed_alike, sort_by_frame
 from gscompleter.types import View
 
 RETRIES = 2
@@ -218,7 +218,7 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
             not enough memory.
         OutputError: where the scene cannot be saved.
     """
-    views = photographs(task, task.context, config)
+    views = sort_by_frame(photographs(task, task.context, config))
     neighbours = photographs(task, task.neighbours, config)
     targets, error = readable_targets(task, config)
     if not targets:

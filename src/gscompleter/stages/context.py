@@ -29,6 +29,17 @@ def init_context(
     return without_ignored(made, views), made.gains
 
 
+def sort_by_frame(views: Sequence[View]) -> list[View]:
+    """Sort photographs by frame number, so that no result depends on the order they were named in.
+
+    Views without a frame number keep their order, and all others with them.
+    """
+    frames = [view.frame for view in views if view.frame is not None]
+    if len(frames) < len(views):
+        return list(views)
+    return [view for _, view in sorted(zip(frames, views, strict=True), key=lambda pair: pair[0])]
+
+
 def without_ignored(made: Reconstruction, views: Sequence[View]) -> Gaussians:
     """What Ψ made of pixels that count. Where it does not say which pixel a Gaussian is of, those
     go that fall on an ignored one."""
