@@ -40,6 +40,12 @@ def test_a_colour_shift_is_measured_and_taken_back_in_the_unseen_part_too():
     assert (found.image - TRUTH).abs().max() < 0.01
 
 
+def test_a_colour_shift_stays_where_the_paper_leaves_it():
+    image, notes = told(lambda seed: SHIFTED, 0, observed(), 0, False)
+    assert torch.equal(image, SHIFTED.clamp(0, 1))
+    assert notes == ()
+
+
 def test_a_fifth_of_the_image_that_shows_something_else_does_not_bend_the_colours():
     spoiled = SHIFTED.clone()
     spoiled[:, :12] = 1.0

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gscompleter.config import AnchorConfig
+from gscompleter.config import AnchorConfig, CompleterConfig
 from gscompleter.stages.anchor import lift, nearest_view, select_anchor, synthesize
 from gscompleter.types import Camera, DepthMap, Reconstruction, Render, SceneContext, View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
@@ -36,6 +36,13 @@ def test_a_view_from_where_the_target_stands_tells_no_depth():
     assert select_anchor(TARGET, views, overlaps=[0.5, 0.1, 0.1]).index == 2
     assert select_anchor(TARGET, views[:2]).index == 1
     assert select_anchor(TARGET, views[:1]).index == 0
+
+
+def test_the_paper_excludes_no_view_for_a_small_baseline():
+    """Of views that are all turned too far the least turned wins, wherever it stands."""
+    views, target = [view(0.001, 50), view(1.0, 60)], camera_at(0.0)
+    assert select_anchor(target, views).index == 1
+    assert select_anchor(target, views, CompleterConfig.paper().anchor).index == 0
 
 
 def test_the_largest_rotation_is_a_setting():

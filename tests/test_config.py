@@ -25,13 +25,18 @@ def test_the_papers_numbers():
     assert (weights.depth_weight, weights.stereo_weight, weights.rgb_weight) == (1, 1, 0.1)
     assert (paper.registration.step, paper.registration.footprint) == ("literal", "fixed")
     assert not paper.registration.mask_occluded
-    assert (paper.holes.max_alpha, paper.holes.dilation) == (0.5, 3)
+    assert (paper.holes.max_alpha, paper.holes.dilation) == (0.5, 0)
+    assert named_config("paper/dilation").holes.dilation == 3
     assert (paper.refine.iterations, paper.refine.learning_rate) == (30, 0.08)
     assert (paper.refine.target_weight, paper.refine.num_views) == (0.1, 2)
     assert paper.harm.tolerance is None
+    assert not paper.registration.mask_sky
+    assert paper.registration.min_ratio is None
+    assert paper.anchor.min_baseline == 0
+    assert (paper.synthesis.correct_color, paper.synthesis.source_depth) == (False, "monocular")
 
 
-@pytest.mark.parametrize("name", [n for n in ABLATIONS if n not in ("dilation", "theta-45")])
+@pytest.mark.parametrize("name", [n for n in ABLATIONS if n not in ("no-dilation", "theta-45")])
 def test_every_ablation_changes_something_of_the_paper(name):
     assert named_config(f"paper/{name}") != CompleterConfig.paper()
 

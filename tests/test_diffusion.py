@@ -24,6 +24,7 @@ from command import run
 from gscompleter import InputError, load_generator, load_renderer
 from gscompleter.config.generators import DiffusersInpaintSettings, PEFieldSettings, settings_class
 from gscompleter.generators import Request
+from gscompleter.generators.diffusion import pe_field
 from gscompleter.generators.diffusion.inpaint import (
     DiffusersInpaint,
     completed_warp,
@@ -32,7 +33,11 @@ from gscompleter.generators.diffusion.inpaint import (
 from gscompleter.generators.diffusion.kontext import SIZES, nearest_size
 from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
 from gscompleter.generators.diffusion.pe_field import PEField, grouped
-from gscompleter.generators.diffusion.source_depth import MonocularDepth, context_depth
+from gscompleter.generators.diffusion.source_depth import (
+    MonocularDepth,
+    context_depth,
+    load_monocular,
+)
 from gscompleter.types import Gaussians, SceneContext, merge
 from parity import assert_close
 from scenes import Room, answer, camera_at, gaussians_of, photographed, view_of
@@ -150,6 +155,25 @@ def test_images_made_together_are_those_made_alone(kontext_folder):
     assert (together[0] - together[1]).abs().max() > 1e-4
 
 
+def test_pe_field_takes_the_depth_that_the_completer_names(kontext_folder, tmp_path, monkeypatch):
+    """`paper()` names a monocular network, the default the scene."""
+    network = load_monocular(str(tiny_model(tmp_path)))
+    named = {"context": context_depth, "monocular": network}
+    monkeypatch.setattr(pe_field, "source_depth_named", lambda name, device: named[name])
+    context = known_room()
+    generator = PEField(load_kontext(str(kontext_folder)), steps=1)
+
+    def image(generator, source):
+        asked = replace(context, source_depth=source, correct_color=False)
+        return answer(generator, context.views[1], TARGET, asked).image
+
+    for source, depth in named.items():
+        assert torch.equal(
+            image(generator, source), image(replace(generator, depth=depth), "context")
+        )
+    assert not torch.equal(image(generator, "context"), image(generator, "monocular"))
+
+
 def test_further_seeds_are_tried_and_the_best_is_kept(kontext_folder):
     context = known_room()
     generator = load_generator(
@@ -170,7 +194,9 @@ def test_settings_reach_the_generators(kontext_folder, inpaint_folder, tmp_path)
     generator = load_generator("pe-field", 5, settings=asked)
     assert (generator.seed, generator.steps, generator.retries) == (5, 3, 2)
     assert generator.at_once == 1
-    assert generator.depth is context_depth
+    assert generator.depth is None
+    chosen = load_generator("pe-field", settings=replace(asked, depth="context"))
+    assert chosen.depth is context_depth
     assert load_generator("pe-field", settings=PEFieldSettings(asked.path)).steps == 4
     network = tiny_model(tmp_path)
     with_depth = load_generator("pe-field", settings=replace(asked, depth=str(network)))

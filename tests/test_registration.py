@@ -10,7 +10,8 @@ from gscompleter.geometry import project, slide
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.reference import ReferenceView
-from gscompleter.stages.registration import Objective, apply_affine, register
+from gscompleter.sky import SKY_DEPTH
+from gscompleter.stages.registration import Objective, apply_affine, displace, register
 from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
@@ -224,6 +225,27 @@ def test_the_affine_acts_on_z_depth_and_a_shift_pushes_nothing_through_the_camer
         apply_affine(gaussians, DepthAffine(1.0, -100.0), TARGET, "fixed").means, TARGET
     )
     assert (clamped > 0).all()
+
+
+def test_the_papers_affine_and_distances_are_not_bounded():
+    gaussians = gaussians_of(view_of(ROOM, TARGET))
+    _, z = project(gaussians.means, TARGET)
+    affine = DepthAffine(1.0, -100.0)
+    moved = apply_affine(gaussians, affine, TARGET, "fixed", PAPER.min_ratio)
+    assert torch.allclose(project(moved.means, TARGET)[1], z - 100.0, rtol=1e-4)
+    back = displace(gaussians, torch.full((len(gaussians), 1), -100.0), TARGET, PAPER)
+    distances = (gaussians.means - TARGET.center).norm(dim=-1)
+    assert torch.allclose((back.means - TARGET.center).norm(dim=-1), 100.0 - distances, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("config", "counts"), [(RegistrationConfig(), False), (PAPER, True)])
+def test_the_sky_counts_in_the_papers_losses_alone(config, counts):
+    view = view_of(ROOM, TARGET)
+    depth = torch.full_like(view.depth, SKY_DEPTH * TARGET.far)
+    at = load_renderer("cpu").render(gaussians_of(view, depth), TARGET)
+    objective = Objective.of(at, at, view, TARGET, config)
+    assert bool(objective.target_depth.valid.any()) == counts
+    assert bool(objective.anchor_depth.valid.any()) == counts
 
 
 @pytest.mark.parametrize("unit", [0.001, 1000.0])

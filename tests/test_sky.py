@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from gscompleter.data.formats import open_photographs
 from gscompleter.geometry import project
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
+from gscompleter.reconstructors.plane_sweep.reconstructor import ranged
 from gscompleter.render import load_renderer
 from gscompleter.sky import SKY_DEPTH, is_sky, sky_behind, surfaces_in
 from gscompleter.stages.free_space import respect_free_space
@@ -71,16 +73,66 @@ def test_the_sky_is_not_brighter_at_its_edges_than_any_photograph(reconstructed)
     assert colours.amax() <= shown.amax() + 1e-4
 
 
-def test_an_even_ceiling_is_no_sky():
-    def view(z: float) -> View:
-        camera = replace(camera_at(z=z), near=0.5, far=20.0)
-        image, depth = cast(Room(), camera)
-        y = (camera.center + depth[..., None] * camera.z_rays())[..., 1]
-        return View(torch.where((y < -1.49)[..., None], 0.95, image), camera, depth=depth)
+HALL = ((-3.0, -1.5, -1.0), (3.0, 1.5, 14.0))
+DEFAULT = Room().boxes[0]
+BOX = ((-0.8, -0.1, 1.0), (0.7, 1.5, 1.6))
+CUPBOARDS = (((-3.0, -1.5, 2.0), (-1.2, 1.5, 2.6)), ((1.0, -0.9, 3.0), (3.0, 1.5, 3.4)))
+FORWARD, ASIDE = ((0.0, 0.2), (0.0, 0.0)), ((-0.1, 0.0), (0.1, 0.0))
+"""Where two photographs are taken, in x and z."""
+WHITE_ROOMS = {
+    "ceiling": ((DEFAULT, *Room().boxes[1:]), False, FORWARD),
+    "hall behind a box": ((HALL, BOX), False, FORWARD),
+    "hall behind a box, aside": ((HALL, BOX), False, ASIDE),
+    "hall with a white end": ((HALL, BOX), True, FORWARD),
+    "hall with cupboards": ((HALL, *CUPBOARDS), False, ASIDE),
+    "full hall": ((HALL, BOX, *CUPBOARDS), False, FORWARD),
+    "cupboards": ((DEFAULT, BOX, *CUPBOARDS), False, ASIDE),
+    "cupboards before a white wall": ((DEFAULT, BOX, *CUPBOARDS), True, FORWARD),
+}
+"""Boxes, whether the end is white like the ceiling, and where the photographs are taken."""
 
-    views = [view(0.2), view(0.0)]
+
+def has_sky(views: list[View]) -> bool:
+    views = ranged(views)
     depths = PlaneSweep().depths(views)
-    assert not any(is_sky(d.depth, v.camera).any() for d, v in zip(depths, views, strict=True))
+    return any(is_sky(d.depth, v.camera).any() for d, v in zip(depths, views, strict=True))
+
+
+@pytest.mark.parametrize("name", WHITE_ROOMS)
+def test_a_room_with_a_white_ceiling_has_no_sky(name):
+    boxes, is_end_white, places = WHITE_ROOMS[name]
+    (_, top, _), (_, _, end) = boxes[0]
+
+    def view(x: float, z: float) -> View:
+        camera = replace(camera_at(x, z=z), near=0.3, far=20.0)
+        image, depth = cast(Room(boxes=boxes), camera)
+        _, y, ahead = (camera.center + depth[..., None] * camera.z_rays()).unbind(-1)
+        white = (y < top + 0.01) | (is_end_white & (ahead > end - 0.01))
+        return View(torch.where(white[..., None], 0.93, image), camera, depth=depth)
+
+    assert not has_sky([view(*place) for place in places])
+
+
+@pytest.mark.parametrize(
+    ("scene", "frames", "size"),
+    [
+        ("hololens_room", (0, 1), None),
+        ("hololens_room", (3, 4), (256, 256)),
+        ("redkitchen", (0, 1), None),
+        ("redkitchen", (18, 19), (256, 256)),
+        ("open3d_rgbd", (0, 2), (256, 256)),
+        ("re10k_000c3ab1", (30, 31), None),
+        ("re10k_0d4de33c", (0, 4), (256, 256)),
+    ],
+)
+def test_a_photographed_room_has_no_sky(scene, frames, size, shared):
+    assert not has_sky(open_photographs(shared / "data" / scene).views(frames, size))
+
+
+@pytest.mark.parametrize("frames", [(0, 1), (34, 32), (22, 21)])
+def test_a_photographed_street_has_a_sky(frames, shared):
+    given = open_photographs(shared / "data" / "kitti_city", near=3.0, far=100.0)
+    assert has_sky(given.views(frames, (256, 256)))
 
 
 def test_a_hole_beside_the_sky_is_sky_if_it_shows_its_colour():

@@ -376,9 +376,15 @@ class GSCompleter:
 
     def known(self, sight: Sight, at_views: Sequence[Render]) -> SceneContext:
         """What Φ is told of the scene."""
-        drawn, max_alpha = sight.frozen.context, self.config.holes.max_alpha
+        synthesis = self.config.synthesis
         context = SceneContext(
-            sight.completion.views, tuple(at_views), drawn, max_alpha, sight.believed
+            sight.completion.views,
+            tuple(at_views),
+            sight.frozen.context,
+            self.config.holes.max_alpha,
+            synthesis.correct_color,
+            synthesis.source_depth,
+            sight.believed,
         )
         return context if sight.stereo is None else corrected(context, sight.stereo)
 

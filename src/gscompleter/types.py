@@ -303,6 +303,10 @@ class SceneContext:
     """The context scene rendered at the target camera."""
     max_alpha: float = COVERED
     """A pixel of the target that the scene covers by less is a hole."""
+    correct_color: bool = True
+    """Whether a Φ with weights brings its colours to those of the photographs."""
+    source_depth: Literal["context", "monocular"] = "context"
+    """Where PE-Field takes the depth of the photograph from, unless its own settings name it."""
     believed: Float[Tensor, "h w"] | None = None
     """The alpha of the scene at the target as far as photographs support it; None where it is not
     doubted."""

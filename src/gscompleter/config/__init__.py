@@ -18,11 +18,26 @@ Memory = Annotated[float, Interval(ge=0, lt=1)]
 
 
 @dataclass(frozen=True)
+class SynthesisConfig(Settings):
+    """How a Φ with weights is used. A Φ without any has no use for it."""
+
+    correct_color: bool = True
+    """Bring the colours of the synthesized image to those of the photographs. The paper takes the
+    image as it is."""
+    source_depth: Literal["context", "monocular"] = "context"
+    """Depth of the photograph for PE-Field, where its own settings name none: that of the scene,
+    or, as in the paper, of a monocular network."""
+
+
+@dataclass(frozen=True)
 class AnchorConfig(Settings):
     max_rotation: Annotated[float, Interval(ge=0, le=180)] = 45.0
     """Largest turn away from the target, in degrees, that still leaves overlap."""
     selection: Literal["widest", "nearest"] = "widest"
     """`widest` baseline is the paper's rule; `nearest` view is its ablation without it."""
+    min_baseline: Share = 0.01
+    """Smallest baseline to the target, as a share of the widest, of which a pair tells a depth. The
+    paper excludes no view."""
     min_overlap: Share = 0.25
     """Smallest share of what the target observes of the scene that an anchor must see too, where
     any view does. The paper asks for none."""
@@ -78,6 +93,11 @@ class RegistrationConfig(Settings):
     mask_occluded: bool = True
     """Leave out of the stereo loss what the anchor cannot see: a new surface that lies behind the
     context there. The paper's literal loss pulls it forward onto the context."""
+    mask_sky: bool = True
+    """Leave the sky out of the depth losses. The paper's losses have every pixel."""
+    min_ratio: Annotated[float, Interval(gt=0, le=1)] | None = 0.1
+    """Smallest factor by which the affine, or the optimisation, may shorten a distance, so that
+    nothing is pushed through the camera. None bounds nothing, as in the paper."""
     carry_into_holes: bool = True
     """Let pixels in a hole, where the scene has no depth to agree with, move like the observed
     ones around them, so that no step remains at the border. The paper leaves them to the affine."""
@@ -224,6 +244,8 @@ class CompleterConfig(Settings):
     """Share of its size by which the target image is extended on every side while it is completed,
     where a hole reaches its border, so that a camera that moves on from the target does not meet
     the next hole there. The paper completes what the target itself sees."""
+    synthesis: SynthesisConfig = SynthesisConfig()
+    """How the target image is synthesized."""
     anchor: AnchorConfig = AnchorConfig()
     """Which photograph forms the stereo pair with the synthesized image."""
     registration: RegistrationConfig = RegistrationConfig()
@@ -247,11 +269,15 @@ class CompleterConfig(Settings):
 
     @staticmethod
     def paper() -> CompleterConfig:
-        """The paper to the letter: steps in scene units, sizes that stay what they were when a
-        Gaussian slides, no occlusion mask in the stereo loss, nothing checked afterwards."""
+        """The paper to the letter: the hard hole mask, steps in scene units, sizes that stay what
+        they were when a Gaussian slides, every pixel in the losses, nothing checked afterwards.
+
+        `docs/paper.md` lists what remains different, and how ambiguous sentences are read.
+        """
         return CompleterConfig(
             margin=0.0,
-            anchor=AnchorConfig(min_overlap=0.0),
+            synthesis=SynthesisConfig(correct_color=False, source_depth="monocular"),
+            anchor=AnchorConfig(min_baseline=0.0, min_overlap=0.0),
             registration=RegistrationConfig(
                 iterations=50,
                 learning_rate=0.01,
@@ -263,12 +289,14 @@ class CompleterConfig(Settings):
                 depth_of="composite",
                 footprint="fixed",
                 mask_occluded=False,
+                mask_sky=False,
+                min_ratio=None,
                 carry_into_holes=False,
                 affine=AffineConfig(min_agreement=None, min_merged=None),
             ),
             free_space=FreeSpaceConfig(num_steps=0),
             refine=RefineConfig(iterations=30, min_fall=None, learning_rate=0.08),
-            holes=HoleConfig(neighbourhood=None),
+            holes=HoleConfig(dilation=0, neighbourhood=None),
             harm=HarmConfig(tolerance=None, max_loss=None),
             support=SupportConfig(doubts=False),
             contradiction=ContradictionConfig(min_difference=None),

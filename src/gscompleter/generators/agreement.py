@@ -66,6 +66,7 @@ def checked(
     seed: int,
     observed: Warped,
     retries: int = 0,
+    correct_color: bool = True,
 ) -> Synthesis:
     """An image painted from a seed, its colours brought to those observed, and notes on it.
 
@@ -74,6 +75,7 @@ def checked(
         seed: The first to try.
         observed: What the photographs show of the target.
         retries: How many further seeds are tried while the image disagrees. The best one is kept.
+        correct_color: Whether a colour shift is taken back.
 
     Raises:
         InputError: where no seed gives finite colours.
@@ -81,7 +83,7 @@ def checked(
     found: list[Agreement] = []
     for attempt in range(retries + 1):
         image = paint(seed + attempt)
-        found.append(compare(image, observed.image, observed.known))
+        found.append(compare(image, observed.image, observed.known, correct_color))
         if found[-1].agrees:
             break
     best = min(found, key=lambda one: (not one.agrees, one.residual))
@@ -97,8 +99,10 @@ def compare(
     image: Float[Tensor, "h w 3"],
     observed: Float[Tensor, "h w 3"],
     known: Bool[Tensor, "h w"],
+    correct_color: bool = True,
 ) -> Agreement:
-    """Measure the colour shift of `image` against `observed` where that is `known`."""
+    """Measure the colour shift of `image` against `observed` where that is `known`, and take it
+    back if the image agrees and its colours are to be corrected."""
     ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
     share = known.float().mean().item()
     if not image.isfinite().all():
@@ -116,6 +120,8 @@ def compare(
         ((gain >= 1 / MAX_GAIN) & (gain <= MAX_GAIN)).all() and (offset.abs() <= MAX_OFFSET).all()
     )
     agrees = plausible and residual <= limit
+    if agrees and not correct_color:
+        gain, offset = ones, zeros
     corrected = (gain * image + offset).clamp(0, 1) if agrees else image
     return Agreement(gain, offset, residual, limit, share, agrees, corrected)
 

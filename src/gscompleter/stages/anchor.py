@@ -16,9 +16,6 @@ from gscompleter.geometry import baseline_between, inside, project, rotation_bet
 from gscompleter.reconstructors import Reconstructor, reconstructed
 from gscompleter.types import Camera, Lift, SceneContext, View
 
-NO_BASELINE = 0.01
-"""Share of the widest baseline under which a pair with the target tells no depth."""
-
 
 @dataclass(frozen=True)
 class AnchorChoice:
@@ -52,9 +49,10 @@ def select_anchor(
     baseline makes triangulation precise. When every view is turned further than that, overlap
     matters more than precision, and the least-turned view wins (paper, Fig. 3).
 
-    A view that stands where the target does is left out, unless all do. Where it is known which
-    share of what the target observes each view sees, those that see too little are left out, too:
-    of a long path the widest baseline shows something else. If all do, the one that sees most wins.
+    A view that stands too close to the target (`min_baseline`) is left out, unless all do. Where it
+    is known which share of what the target observes each view sees, those that see too little are
+    left out, too: of a long path the widest baseline shows something else. If all do, the one that
+    sees most wins.
     """
     if not views:
         raise ValueError("select_anchor needs at least one observed view, got none")
@@ -63,8 +61,8 @@ def select_anchor(
 
     rotations = [rotation_between(target, view.camera) for view in views]
     baselines = [baseline_between(target, view.camera) for view in views]
-    apart = [i for i in range(len(views)) if baselines[i] > NO_BASELINE * max(baselines)]
-    possible = apart or list(range(len(views)))
+    least = config.min_baseline * max(baselines)
+    possible = [i for i in range(len(views)) if baselines[i] >= least]
     overlapping = [i for i in possible if rotations[i] < config.max_rotation]
     if not overlapping:
         return AnchorChoice(min(possible, key=rotations.__getitem__), fallback=True)

@@ -67,7 +67,9 @@ def register(
         max_alpha: A pixel of the target that the scene covers by less is a hole.
     """
     affine = fit_bridge(lift, frozen_target.context, at_anchor, rng, config.affine)
-    coarse = apply_affine(lift.gaussians, affine, reference.camera, config.footprint)
+    coarse = apply_affine(
+        lift.gaussians, affine, reference.camera, config.footprint, config.min_ratio
+    )
     if affine.refuted or config.iterations == 0 or len(coarse) == 0:
         return Registration(coarse, affine, ())
     registered, losses = register_along_rays(
@@ -116,16 +118,22 @@ def apply_affine(
     affine: DepthAffine,
     camera: Camera,
     footprint: Literal["constant", "fixed"],
+    min_ratio: float | None = RegistrationConfig.min_ratio,
 ) -> Gaussians:
     """`gaussians` at corrected z-depth `scale * z + shift`, each on its own ray of `camera`.
 
     The distance along the ray follows from the means themselves, d' = d z'/z, which is the
-    paper's Eq. 9 for z-depth models and holds for models of ray distance too. A shift must not
-    push anything through the camera: a tenth of its depth is the least that remains.
+    paper's Eq. 9 for z-depth models and holds for models of ray distance too. At least `min_ratio`
+    of a distance remains, so that no shift pushes anything through the camera.
     """
     z = z_depths(gaussians.means, camera)
-    ratio = ((affine.scale * z + affine.shift) / z).clamp_min(0.1)
-    return slide(gaussians, camera, ratio, footprint)
+    ratio = (affine.scale * z + affine.shift) / z
+    return slide(gaussians, camera, bound(ratio, min_ratio), footprint)
+
+
+def bound(ratio: Float[Tensor, "n"], least: float | None) -> Float[Tensor, "n"]:
+    """Keep ratios of distances from falling below `least`; None bounds nothing."""
+    return ratio if least is None else ratio.clamp_min(least)
 
 
 def register_along_rays(
@@ -176,7 +184,7 @@ def displace(
     if config.degrees_of_freedom == 3:
         return replace(coarse, means=coarse.means + unit * parameters, encoded=None)
     ratio = 1 + (unit * parameters / distances)[:, 0]
-    return slide(coarse, camera, ratio.clamp_min(0.1), config.footprint)
+    return slide(coarse, camera, bound(ratio, config.min_ratio), config.footprint)
 
 
 def drawn_alone(
@@ -195,6 +203,11 @@ def drawn_alone(
         return lambda moved: renderer.render(moved, camera)
     plan = renderer.freeze(coarse[:0], camera).plan_depths(coarse, where)
     return lambda moved: plan(z_depths(moved.means, camera))
+
+
+def compared_depth(render: Render, camera: Camera, config: RegistrationConfig) -> DepthMap:
+    """Return the rendered depth that the losses compare with: without the sky, unless it counts."""
+    return surfaces_in(render, camera) if config.mask_sky else render.depth_map()
 
 
 @dataclass(frozen=True)
@@ -217,11 +230,11 @@ class Objective:
         config: RegistrationConfig,
     ) -> Objective:
         """The objective that draws the candidates to the scene as both cameras see it."""
-        anchor_depth = surfaces_in(at_anchor, anchor)
+        anchor_depth = compared_depth(at_anchor, anchor, config)
         seen = anchor_depth.depth[anchor_depth.valid]
         relative = config.step == "relative" and len(seen) > 0
         unit = seen.median().item() if relative else 1.0
-        target_depth = surfaces_in(at_target, reference.camera)
+        target_depth = compared_depth(at_target, reference.camera, config)
         return Objective(target_depth, anchor_depth, reference.image, unit, config)
 
     def reached_by(self, candidates: Gaussians, target: Camera, anchor: Camera) -> Tensor:

@@ -115,7 +115,8 @@ class DiffusersInpaint:
             return self.painter.paint(observed.image, hole, self.prompt, seed, self.steps)
 
         compared = replace(observed, known=~hole)
-        painted = checked(paint, self.seed, compared, self.retries)
+        correct = context.correct_color
+        painted = checked(paint, self.seed, compared, self.retries, correct)
         known = observed.known[..., None]
         return replace(painted, image=torch.where(known, observed.image, painted.image))
 

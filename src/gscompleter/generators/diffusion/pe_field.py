@@ -56,8 +56,11 @@ class PEField:
     """Of the noise; the same seed gives the same image on the same device."""
     steps: int = PEFieldSettings.steps
     """Evaluations of the transformer."""
-    depth: SourceDepth = context_depth
-    """Depth of the photograph: of the scene itself, or `MonocularDepth`."""
+    depth: SourceDepth | None = None
+    """Depth of the photograph: of the scene itself, or `MonocularDepth`; None takes what the
+    completer's settings name."""
+    device: str = "cpu"
+    """Where a depth network runs that the completer's settings name."""
     ids_dtype: torch.dtype = torch.bfloat16
     """What positions of the target are rounded to: bfloat16 as in the authors' run."""
     retries: int = 0
@@ -90,7 +93,8 @@ class PEField:
                 return back.to(nearest.image.device)
 
             observed = warp_photographs(nearest, target, requests[i].context)
-            return checked(paint, self.seed, observed, self.retries)
+            correct = requests[i].context.correct_color
+            return checked(paint, self.seed, observed, self.retries, correct)
 
         return [answer(i) for i in range(len(requests))]
 
@@ -99,7 +103,8 @@ class PEField:
         size = self.model.size_for(target.height, target.width)
         source_size = self.model.size_for(nearest.camera.height, nearest.camera.width)
         grids = self.model.grid(source_size), self.model.grid(size)
-        depth = self.depth(nearest, render_at(nearest, context))
+        source = self.depth or source_depth_named(context.source_depth, self.device)
+        depth = source(nearest, render_at(nearest, context))
         positions = source_ids(depth, nearest.camera, target, *grids).cpu()
         return Condition(resized(nearest.image, source_size), size, positions)
 
@@ -165,7 +170,8 @@ def load_pe_field(
         load_kontext(settings.path, device, settings.offload),
         seed,
         settings.steps,
-        source_depth_named(settings.depth, device),
+        None if settings.depth is None else source_depth_named(settings.depth, device),
+        device,
         retries=settings.retries,
         at_once=settings.at_once,
     )

@@ -2,7 +2,10 @@
 
 Stereo knows nothing of a sky: it is even, so that any depth matches, and aggregation lends it that
 of roofs and trees. A ceiling or a blank wall is even, too, but bounded by a room: what surrounds it
-lies on the plane that it is, and nowhere out of stereo's reach.
+lies on the plane that it is, and not much farther than the rest of the room. So a sky needs all of:
+no texture and no parallax, a wide and high region in the upper half of the image that nothing cuts
+off from its top, and an outline of which a good part is far away. A sky that lacks one of them is
+not found, and stays at the depth of what surrounds it.
 """
 
 from __future__ import annotations
@@ -32,18 +35,33 @@ EDGE = 3
 """Pixels by which edges blur the slope of the sky beside them."""
 OUTLINE = 3
 """Width in pixels of what counts as the outline of a sky."""
-MIN_AREA = 0.01
-"""Share of the image below which nothing is taken for a sky."""
+MIN_WIDTH = 0.4
+"""Smallest share of the image's top row that a sky fills."""
+MIN_HEIGHT = 0.1
+"""Smallest mean height of a sky, over the columns in which it reaches the top, as a share of the
+image's height."""
+MIN_UNBROKEN = 0.6
+"""Smallest share of a sky with nothing between it and the top of the image."""
+LOWEST, MOST = 0.55, 0.95
+"""Share of the image's height, from the top, above which at least this share of a sky lies."""
 MIN_OUTLINE = 64
 """Fewest measured pixels of an outline that can tell a sky."""
-FAR_SHARE = 0.05
+END_SHARE = 0.05
+"""Share of the outline, the farthest, that has to come close to infinity."""
+END_PLANES = 3.0
+"""Planes from infinity within which it has to come: half a pixel of parallax each."""
+FAR_PLANE_MARGIN, MAX_FAR_PLANE = 2.0, 10.0
+"""Or planes from the far plane, where that itself lies no more planes than this from infinity."""
+FAR_SHARE = 0.2
 """Share of the outline, the farthest, that has to be far away."""
-FAR_PLANES = 10.0
-"""Planes from infinity within which the outline has to come: half a pixel each."""
 FAR_RATIO = 2.5
-"""Depth of the far end of the outline, in medians of what is measured below the sky, at least."""
+"""Depth of that part of the outline, in medians of what is measured below the sky, at least."""
 MAX_ON_PLANE = 0.8
 """Share of the outline on one plane from which the region is that plane: a ceiling or a wall."""
+NEAR_PLANES, MAX_NEAR_ON_PLANE = 5.0, 0.9
+"""The same for that part of the outline which is more planes than this from infinity, where all
+planes meet, and twice as many as its far end.
+"""
 PLANE_TOLERANCE = 2.0
 """Planes of the sweep by which a pixel may miss a plane that it lies on."""
 ROUNDS = 20
@@ -87,12 +105,28 @@ def is_open(image: StereoImage, found: Measured, region: Mask) -> bool:
     full = found.at_size(image.size)
     measured = full.confidence > 0
     outline = dilated(region, OUTLINE) & ~region & measured
-    if region.mean() < MIN_AREA or outline.sum() < MIN_OUTLINE:
+    if not is_overhead(region) or outline.sum() < MIN_OUTLINE:
         return False
     heights = full.index + full.planes[0] / (full.planes[1] - full.planes[0])
     bright = bool(np.median(image.image[region]) > np.median(image.image[outline]))
-    far = reaches_far(heights[outline], heights[measured & ~region])
-    return bright and far and on_one_plane(outline, heights) < MAX_ON_PLANE
+    far_plane = float(heights.min() - full.index.min())
+    if not bright or not reaches_far(heights[outline], heights[measured & ~region], far_plane):
+        return False
+    near = outline & (heights > max(NEAR_PLANES, 2 * np.quantile(heights[outline], END_SHARE)))
+    return (
+        on_one_plane(outline, heights) < MAX_ON_PLANE
+        and on_one_plane(near, heights) < MAX_NEAR_ON_PLANE
+    )
+
+
+def is_overhead(region: Mask) -> bool:
+    """Tell whether `region` fills a good part of the top of the image, as a sky does."""
+    width, area = region[0].mean(), region.mean()
+    if width < MIN_WIDTH or area < MIN_HEIGHT * width:
+        return False
+    unbroken = np.logical_and.accumulate(region, axis=0).sum() / region.sum()
+    above = region[: round(LOWEST * len(region))].sum() / region.sum()
+    return bool(unbroken >= MIN_UNBROKEN and above >= MOST)
 
 
 def even_above(image: StereoImage) -> Mask:
@@ -122,19 +156,26 @@ def difference_from(core: Mask, image: StereoImage) -> Map:
     return contrast(colour, mean)
 
 
-def reaches_far(outline: Float32[np.ndarray, "n"], measured: Float32[np.ndarray, "m"]) -> bool:
-    """Whether an outline comes close to infinity, and far beyond most of what is measured.
+def reaches_far(
+    outline: Float32[np.ndarray, "n"], measured: Float32[np.ndarray, "m"], far_plane: float
+) -> bool:
+    """Tell whether an outline comes close to infinity, and far beyond most of what is measured.
 
     Args:
         outline: Inverse depths, in planes from infinity.
         measured: The same of all pixels that were measured and may not be sky.
+        far_plane: The same of the far plane, beyond which nothing is measured.
     """
-    end = float(np.quantile(outline, FAR_SHARE))
-    return end <= FAR_PLANES and end * FAR_RATIO <= float(np.median(measured))
+    end, far = np.quantile(outline, [END_SHARE, FAR_SHARE])
+    is_far = end <= END_PLANES or (end <= far_plane + FAR_PLANE_MARGIN <= MAX_FAR_PLANE)
+    return bool(is_far and far * FAR_RATIO <= np.median(measured))
 
 
 def on_one_plane(outline: Mask, heights: Map) -> float:
-    """Share of the outline that lies on the plane that fits it best, by absolute differences."""
+    """Share of the outline that lies on the plane that fits it best, by absolute differences; 0 of
+    fewer than `MIN_OUTLINE` pixels."""
+    if outline.sum() < MIN_OUTLINE:
+        return 0.0
     rows, columns = np.nonzero(outline)
     sites = np.stack([columns, rows, np.ones_like(rows)], axis=1).astype(np.float64)
     values, weight = heights[outline].astype(np.float64), np.ones(len(rows))
