@@ -315,3 +315,37 @@ def test_rows_beyond_one_block_are_in_their_place(tmp_path):
     gaussians = random_gaussians(20_000, sh_degree=1)
     loaded = load_ply(saved(tmp_path, gaussians))
     assert same(loaded, gaussians, ("means", "quats", "sh"))
+
+
+@pytest.mark.parametrize(
+    ("comments", "antialiased"),
+    [
+        (["SplatRenderMode: mip"], True),
+        (["splatrendermode:MIP"], True),
+        (["SplatRenderMode  mip "], True),
+        (["antialiased 1"], True),
+        (["Antialiased = true"], True),
+        (["postshot.anti_aliasing=1"], True),
+        (["antialiased 0"], False),
+        (["SplatRenderMode: default"], False),
+        (["antialiased 1", "SplatRenderMode: default"], False),
+        (["Exported from Brush", "Vertical axis: y", "SplatRenderMode: mip", "SH degree: 0"], True),
+        (["mip", "antialiased", "not antialiased 1"], False),
+    ],
+)
+@pytest.mark.parametrize("ending", [b"\n", b"\r\n"])
+def test_comments_mark_antialiased_gaussians(tmp_path, comments, antialiased, ending):
+    path = saved(tmp_path, random_gaussians(5))
+    assert not load_ply(path).is_antialiased
+    header, _, rows = path.read_bytes().partition(b"end_header\n")
+    lines = header.splitlines()
+    lines[2:2] = [f"comment {text}".encode() for text in comments]
+    path.write_bytes(ending.join([*lines, b"end_header", rows]))
+    assert load_ply(path).is_antialiased == antialiased
+
+
+def test_antialiased_gaussians_are_written_as_such_and_others_as_ever(tmp_path):
+    scene = random_gaussians(5)
+    marked = saved(tmp_path, replace(scene, is_antialiased=True), "marked.ply").read_bytes()
+    plain = saved(tmp_path, scene, "plain.ply").read_bytes()
+    assert marked.replace(b"comment SplatRenderMode: mip\n", b"") == plain != marked

@@ -242,6 +242,43 @@ def test_what_was_generated_is_known_after_every_conversion(tmp_path, name):
     assert place_of_labels(tmp_path / name).exists() == (name != "scene.ply")
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_mode_of_gaussians_is_known_after_every_conversion(tmp_path, antialiased):
+    given = replace(plausible(60), is_antialiased=antialiased)
+    for name in ("a.ply", "b.spz", "c.compressed.ply", "d.ply"):
+        save_splat(tmp_path / name, given)
+        given = load_splat(tmp_path / name)
+        assert given.is_antialiased == antialiased, name
+    assert load_splat(write_spz_4(tmp_path / "4.spz", tmp_path / "b.spz")).is_antialiased == (
+        antialiased
+    )
+    save_splat(tmp_path / "scene.splat", given)
+    assert not load_splat(tmp_path / "scene.splat").is_antialiased
+
+
+@pytest.mark.parametrize(
+    ("entry", "antialiased"),
+    [
+        ({"model": "antialiased"}, True),
+        ({"antialias": True}, True),
+        ({"model": "default", "antialias": False}, False),
+        ({"model": "2dgs"}, False),
+    ],
+)
+def test_a_sog_marks_antialiased_gaussians(tmp_path, entry, antialiased):
+    files = sog_files(plausible(30, 0))
+    files["meta.json"] = json.dumps(json.loads(files["meta.json"]) | entry).encode()
+    assert load_splat(write_sog(tmp_path / "scene.sog", files)).is_antialiased == antialiased
+
+
+def test_convert_says_where_the_mode_is_lost(tmp_path, monkeypatch, capsys):
+    save_splat(tmp_path / "a.ply", replace(plausible(30, 0), is_antialiased=True))
+    assert run(monkeypatch, "convert", tmp_path / "a.ply", tmp_path / "b.spz") == 0
+    assert "antialiased" not in capsys.readouterr().out
+    assert run(monkeypatch, "convert", tmp_path / "b.spz", tmp_path / "c.splat") == 0
+    assert "A .splat file cannot mark Gaussians as antialiased" in capsys.readouterr().out
+
+
 def test_labels_of_another_file_are_not_believed(tmp_path):
     path, other = tmp_path / "scene.spz", tmp_path / "other.spz"
     gaussians = plausible(20, 0)

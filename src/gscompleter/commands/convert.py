@@ -39,7 +39,7 @@ def run_convert(options: ConvertOptions) -> None:
     from rich.console import Console
 
     from gscompleter.progress import preparing, shown_on
-    from gscompleter.splats.formats import load_splat, save_splat, writable_format
+    from gscompleter.splats.formats import load_splat, loss_of_mode, save_splat, writable_format
 
     writable_format(options.out)
     check_free(options.out, options.overwrite)
@@ -50,6 +50,9 @@ def run_convert(options: ConvertOptions) -> None:
             save_splat(options.out, gaussians)
     if not options.quiet:
         generated = int((gaussians.generated > 0).sum())
+        loss = loss_of_mode(options.out, gaussians)
+        if loss is not None:
+            print(loss)
         print(f"{len(gaussians):,} Gaussians, {generated:,} of them generated: {options.out}")
 
 

@@ -72,7 +72,8 @@ def cameras_line(frames: Sequence[Frame]) -> str:
 
 def splat_line(path: Path, scene: Gaussians) -> str:
     """The splat that was brought."""
-    return f"{quoted(path)}, {len(scene):,} Gaussians of SH degree {scene.sh_degree}"
+    mode = "antialiased " if scene.is_antialiased else ""
+    return f"{quoted(path)}, {len(scene):,} {mode}Gaussians of SH degree {scene.sh_degree}"
 
 
 def found_line(options: SceneOptions, opened: Opened, task: Task) -> str:
