@@ -38,6 +38,7 @@ def run_convert(options: ConvertOptions) -> None:
     # Here, so that `--help` does not wait for torch.
     from rich.console import Console
 
+    from gscompleter.io.ply import note_infinite_opacities
     from gscompleter.progress import preparing, shown_on
     from gscompleter.splats.formats import load_splat, loss_of_mode, save_splat, writable_format
 
@@ -50,9 +51,9 @@ def run_convert(options: ConvertOptions) -> None:
             save_splat(options.out, gaussians)
     if not options.quiet:
         generated = int((gaussians.generated > 0).sum())
-        loss = loss_of_mode(options.out, gaussians)
-        if loss is not None:
-            print(loss)
+        notes = note_infinite_opacities(gaussians), loss_of_mode(options.out, gaussians)
+        for note in filter(None, notes):
+            print(note)
         print(f"{len(gaussians):,} Gaussians, {generated:,} of them generated: {options.out}")
 
 

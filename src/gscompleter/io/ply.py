@@ -251,7 +251,8 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """The Gaussians of a 3DGS .ply, of SH degree 0 to 3.
 
     With `drop_nonfinite`, Gaussians that hold NaN or infinity, or a rotation of zeros, are left
-    out; else the file is refused.
+    out; else the file is refused. A logit of opacity may be infinite, which is how converters write
+    opacities of 1 and 0, and stands for these.
 
     Raises:
         InputError: no such file, not a PLY, truncated, empty, not 3DGS, or with damaged values.
@@ -380,13 +381,27 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
 
 
 def drawable(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    """Which Gaussians hold neither NaN nor infinity nor a rotation of zeros."""
-    opacities = gaussians.opacities if gaussians.encoded is None else gaussians.encoded
-    good = (gaussians.quats != 0).any(1)
-    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, opacities):
+    """Which Gaussians hold neither NaN nor infinity nor a rotation of zeros. An opacity is finite
+    where its logit is not."""
+    scales = gaussians.scales if gaussians.encoded is None else gaussians.encoded[:, :3]
+    opacities, good = gaussians.opacities, (gaussians.quats != 0).any(1)
+    tables = (gaussians.means, gaussians.quats, gaussians.scales, scales, gaussians.sh, opacities)
+    for values in tables:
         if not values.sum().isfinite():  # Looking at each of them takes ten times as long.
             good &= values.isfinite().reshape(len(values), -1).all(1)
     return good
+
+
+def note_infinite_opacities(gaussians: Gaussians) -> str | None:
+    """Say in a sentence how many logits of opacity were infinite; None where none was."""
+    logits = None if gaussians.encoded is None else gaussians.encoded[:, 3]
+    if logits is None or logits.sum().isfinite():
+        return None
+    opaque, clear = int(logits.isposinf().sum()), int(logits.isneginf().sum())
+    return (
+        f"Of {len(gaussians):,} Gaussians {opaque:,} have a logit of opacity of +infinity and "
+        f"{clear:,} of -infinity; they are taken as opaque and as transparent."
+    )
 
 
 def blocks(count: int) -> Iterator[slice]:
