@@ -13,6 +13,7 @@ from pathlib import Path
 import plyfile
 import pytest
 import torch
+from gsply import plyread
 
 from command import run
 from gscompleter import (
@@ -410,6 +411,27 @@ def test_convert_writes_once_and_says_what_it_wrote(tmp_path, monkeypatch, capsy
     assert run(monkeypatch, "convert", source, tmp_path / "b.glb") == 2
     assert run(monkeypatch, "convert", out, tmp_path / "c.ply") == 0
     assert load_splat(tmp_path / "c.ply").generated.tolist() == [1] * 30
+
+
+def test_convert_writes_the_plain_layout_of_all_gaussians(tmp_path, monkeypatch):
+    """As another reader takes it that misreads the label; beside other formats no labels lie."""
+    given = replace(plausible(30, 1), generated=(torch.arange(30) % 3).to(torch.uint8))
+    save_splat(tmp_path / "completed.ply", given)
+    for name in ("x.ply", "x.spz", "x.compressed.ply"):
+        out = tmp_path / name
+        assert run(monkeypatch, "convert", tmp_path / "completed.ply", out) == 0
+        assert load_splat(out).generated.any()
+        more = ("--plain", "--overwrite")
+        assert run(monkeypatch, "convert", tmp_path / "completed.ply", out, *more) == 0
+        assert len(load_splat(out)) == 30
+        assert not load_splat(out).generated.any()
+        assert not place_of_labels(out).exists()
+    save_ply(tmp_path / "expected.ply", given, provenance=False)
+    assert (tmp_path / "x.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
+    names = plyfile.PlyData.read(str(tmp_path / "x.ply"))["vertex"].data.dtype.names
+    assert names[:6] == ("x", "y", "z", "nx", "ny", "nz")
+    assert "generated" not in names
+    assert torch.allclose(torch.tensor(plyread(str(tmp_path / "x.ply")).means), given.means)
 
 
 # ------------------------------------------------------------------------------- third party
