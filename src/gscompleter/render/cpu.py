@@ -175,7 +175,7 @@ class Splats:
     columns: Float32[ndarray, "n 9"]
     opacities: Float32[ndarray, "n"]
     boxes: Integer[ndarray, "n 4"]
-    factors: Float32[ndarray, "n"] | None
+    factors: Float32[ndarray, "n"] | None = None
     """What the opacities of antialiased Gaussians were multiplied by; None for others."""
 
     def at_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
