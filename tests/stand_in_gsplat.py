@@ -6,6 +6,7 @@ tests how gsplat is called, and says nothing of gsplat itself.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -35,17 +36,20 @@ def rasterization(
     rasterize_mode: str,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """One camera, harmonics, colour and expected depth; the rows stay in their order."""
-    assert (eps2d, packed, render_mode, rasterize_mode) == (0.3, False, "RGB+ED", "classic")
+    assert (eps2d, packed, render_mode) == (0.3, False, "RGB+ED")
+    assert rasterize_mode in ("classic", "antialiased")
     assert colors.shape == (len(means), (sh_degree + 1) ** 2, 3)
     assert viewmats.shape == (1, 4, 4)
     camera = Camera(torch.linalg.inv(viewmats[0]), Ks[0], width, height, near=100 * near_plane)
     gaussians = observed(means, quats, scales, opacities, colors)
+    gaussians = replace(gaussians, is_antialiased=rasterize_mode == "antialiased")
     n = len(means)
     found = {
         "radii": torch.zeros(1, n, 2, dtype=torch.int32),
         "means2d": torch.full((1, n, 2), torch.nan),
         "conics": torch.full((1, n, 3), torch.nan),
         "depths": torch.full((1, n), torch.nan),
+        "opacities": opacities[None] * (rasterize_mode == "classic"),
         "tile_size": 16,
         "isect_offsets": torch.zeros(1, -(-height // 16), -(-width // 16), dtype=torch.int32),
     }
@@ -58,10 +62,12 @@ def rasterization(
         found["means2d"][0, i], found["depths"][0, i] = own.centers[0], own.depths[0]
         found["conics"][0, i] = own.precisions[0].flatten()[[0, 1, 3]]
         values[0, i] = torch.cat([own.colours[0], own.depths])
+        found["opacities"][0, i] = own.opacities[0]
     found["flatten_ids"] = found["radii"][0, :, 0].nonzero()[:, 0].to(torch.int32)
     tiles = (found["tile_size"], found["isect_offsets"], found["flatten_ids"])
     places = found["means2d"], found["conics"]
-    sums, alphas = rasterize_to_pixels(*places, values, opacities[None], width, height, *tiles)
+    seen = found["opacities"]
+    sums, alphas = rasterize_to_pixels(*places, values, seen, width, height, *tiles)
     depth = sums[..., 3:] / alphas.clamp_min(1e-10)
     return torch.cat([sums[..., :3], depth], dim=-1), alphas, found
 

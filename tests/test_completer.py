@@ -11,6 +11,7 @@ from gscompleter import (
     GSCompleter,
     InputError,
     load_generator,
+    load_ply,
     load_renderer,
 )
 from gscompleter.completer import STAGES
@@ -18,6 +19,7 @@ from gscompleter.config import HarmConfig
 from gscompleter.generators import Synthesis
 from gscompleter.geometry import project
 from gscompleter.metrics.image import psnr
+from gscompleter.render.antialiasing import in_mode_of
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.reports.completion import Target, at_photographs, compare, write_report
 from gscompleter.stages.anchor import lift
@@ -485,3 +487,52 @@ def test_nothing_is_added_before_what_an_earlier_target_sees(monkeypatch):
     knowing()(photographs(), [first, second])
     assert [len(centers) for centers in asked] == [2, 3]
     assert torch.equal(asked[1][2], first.center)
+
+
+@cache
+def antialiased_room() -> Gaussians:
+    """What the photographs show, in Gaussians for antialiased rendering."""
+    mode = replace(gaussians_of(photographs()[0])[:0], is_antialiased=True)
+    return merge([in_mode_of(mode, gaussians_of(v), v.camera) for v in photographs()])
+
+
+def test_what_was_made_for_classic_rendering_covers_as_much_antialiased():
+    """The sums over the image of what single Gaussians show, small ones and large ones."""
+    view, renderer = photographs()[0], load_renderer("cpu")
+    made = gaussians_of(view)[SIZE * SIZE // 2 + SIZE // 2 :][:1]
+    for factor, most in ((0.1, 0.2), (1.0, 0.7), (5.0, 0.98)):
+        sized = replace(made, scales=factor * made.scales)
+        marked = replace(sized, is_antialiased=True)
+        same = in_mode_of(marked[:0], sized, view.camera)
+        truth, ours, less = (
+            renderer.render(gaussians, view.camera).alpha.sum()
+            for gaussians in (sized, same, marked)
+        )
+        assert less < most * truth
+        assert ours == pytest.approx(truth.item(), rel=0.05)
+        assert in_mode_of(sized[:0], sized, view.camera) is sized
+        assert in_mode_of(marked[:0], marked, view.camera) is marked
+
+
+@pytest.mark.parametrize("doubted", [False, True])
+def test_an_antialiased_scene_is_completed_as_one(tmp_path, doubted):
+    """As well as the classic one of the same room, within what its wider low-pass costs."""
+    views, target = photographs(), cameras()[1]
+    witnesses = [view_of(Room(), camera_at(-0.1, size=SIZE))] if doubted else None
+    scene, truth = antialiased_room(), view_of(Room(), target).image
+    done = knowing()(views, target, scene, witnesses)
+    (result,) = done.targets
+    holes = result.hole_mask
+    assert 0.1 < holes.float().mean() < 0.7
+    assert result.after.alpha[holes].mean() > 0.9
+    before, after = (
+        psnr(r.image[holes][None], truth[holes][None]) for r in (result.before, result.after)
+    )
+    assert after > before + 5
+    assert after > 17
+    assert done.scene.is_antialiased
+    drawn = load_renderer("cpu").render(done.scene, target)
+    assert_close(drawn.image, result.after.image, "image", 1e-5)
+    write_report(tmp_path, done, [Target(target)], knowing(), {})
+    for name in ("context.ply", "completed.ply", "generated.ply"):
+        assert load_ply(tmp_path / name).is_antialiased, name

@@ -236,6 +236,24 @@ def test_rows_that_were_dropped_stay_out_of_the_users_layout(scene, chosen, tmp_
     assert labels == [n for n in range(len(gaussians)) if n not in (2, 9)]
 
 
+def test_a_splat_with_infinite_logits_keeps_its_bytes(scene, chosen, tmp_path, monkeypatch, capsys):
+    """It is opaque there, which is said once; its rows stay as they are, and so does the file."""
+    given = foreign(chosen[0] / "context.ply", tmp_path / "given.ply")
+    data = plyfile.PlyData.read(str(given), mmap=False)
+    data["vertex"].data["opacity"][[3, 8]] = np.inf, -np.inf
+    data.write(str(given))
+    out, back = tmp_path / "out", tmp_path / "back.ply"
+    aloud = [word for word in SMALL if word != "--quiet"]
+    assert run(monkeypatch, *complete(scene, out, *aloud, "--scene", given)) == 0
+    said = capsys.readouterr().err
+    assert said.count("1 have a logit of opacity of +infinity and 1 of -infinity") == 1
+    rows = plyfile.PlyData.read(str(out / "completed.ply"))["vertex"].data
+    assert rows["opacity"][rows["generated"] == 0].tobytes() == data["vertex"]["opacity"].tobytes()
+    assert load_ply(out / "context.ply").opacities[[3, 8]].tolist() == pytest.approx([1, 0])
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", back, "--quiet") == 0
+    assert back.read_bytes() == given.read_bytes()
+
+
 def test_an_interrupt_says_what_it_leaves(scene, tmp_path, monkeypatch, capsys):
     def stopped_after(*written: str):
         def open_scene(*_: object) -> None:

@@ -7,6 +7,7 @@ import math
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from unittest.mock import MagicMock, Mock
 
@@ -18,7 +19,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from command import run
-from gscompleter import save_ply
+from gscompleter import load_ply, save_ply
 from gscompleter.cli import parsed
 from gscompleter.commands import live
 from gscompleter.commands.options import LiveOptions
@@ -150,6 +151,21 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     assert torch.equal(session.place.read(session.steps[0].told).c2w, result.target.c2w)
     live.Saver(ready).save(session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--scene", options.scene)
+
+
+def test_an_antialiased_splat_is_named_so_and_saved_as_one(room, tmp_path):
+    scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[:2]])
+    save_ply(tmp_path / "splat.ply", replace(scene, is_antialiased=True))
+    options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
+    console = Console(file=StringIO())
+    ready = live.prepare(options, console)
+    said = console.file.getvalue().replace("\n", " ")
+    assert "antialiased Gaussians of SH degree 0" in said
+    assert "The page renders antialiased Gaussians as classic ones" in said
+    session, _ = completed(live.begin(ready), HOLES[0])
+    live.Saver(ready).save(session)
+    for name in ("context.ply", "completed.ply", "generated.ply"):
+        assert load_ply(tmp_path / "out" / name).is_antialiased, name
 
 
 def test_the_frames_that_were_chosen_are_named(room, tmp_path):

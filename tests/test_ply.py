@@ -13,6 +13,7 @@ import torch
 from gsply import plyread
 
 from gscompleter import Gaussians, InputError, load_ply, merge, save_ply
+from gscompleter.io.ply import note_infinite_opacities
 from scenes import random_gaussians
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated", "encoded")
@@ -225,6 +226,48 @@ def test_damaged_gaussians_are_counted_and_dropped_if_asked(tmp_path, name, valu
     assert len(load_ply(path, drop_nonfinite=True)) == 17
 
 
+def with_logits(path: Path, rows: dict[int, float]) -> Path:
+    """The file with other logits of opacity in some rows."""
+    data = plyfile.PlyData.read(str(path), mmap=False)
+    for row, logit in rows.items():
+        data["vertex"].data["opacity"][row] = logit
+    data.write(str(path))
+    return path
+
+
+def test_infinite_logits_are_opacities_of_one_and_zero(tmp_path):
+    """They are no damage, NaN still is; and what is written is finite."""
+    scene, infinity = random_gaussians(20), float("inf")
+    path = with_logits(saved(tmp_path, scene), {2: infinity, 5: -infinity, 7: infinity})
+    loaded = load_ply(path)
+    assert loaded.opacities[[2, 5, 7]].tolist() == [1, 0, 1]
+    others = [n for n in range(20) if n not in (2, 5, 7)]
+    assert torch.allclose(loaded.opacities[others], scene.opacities[others])
+    note = note_infinite_opacities(loaded)
+    assert note == (
+        "Of 20 Gaussians 2 have a logit of opacity of +infinity and 1 of -infinity; they are taken "
+        "as opaque and as transparent."
+    )
+    for finite in (scene, load_ply(saved(tmp_path, scene, "finite.ply"))):
+        assert note_infinite_opacities(finite) is None
+    again = load_ply(saved(tmp_path, loaded, "again.ply"))
+    assert again.encoded.isfinite().all()
+    assert again.opacities[[2, 5, 7]].tolist() == pytest.approx([1, 0, 1], abs=1e-7)
+    path = with_logits(path, {3: float("nan")})
+    refused(path, "1 of 20 Gaussians .* drop what is not finite")
+    kept = load_ply(path, drop_nonfinite=True)
+    assert kept.opacities[[2, 4, 6]].tolist() == [1, 0, 1]
+
+
+@pytest.mark.parametrize("value", [float("inf"), -float("inf"), float("nan")])
+def test_infinite_logarithms_of_scales_are_damage(tmp_path, value):
+    path = saved(tmp_path, random_gaussians(20))
+    data = plyfile.PlyData.read(str(path), mmap=False)
+    data["vertex"].data["scale_1"][4] = value
+    data.write(str(path))
+    refused(path, "1 of 20 Gaussians .* drop what is not finite")
+
+
 def test_rotations_of_zeros_count_as_damage(tmp_path):
     gaussians = random_gaussians(20)
     gaussians.quats[5] = 0
@@ -257,8 +300,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
 def test_community_files_are_read_or_refused(shared):
     folder = shared / "formats"
     guitar = folder / "gaussians" / "guitar.from-compressed.ply"
-    refused(guitar, "667 of 90,854 Gaussians")  # opaque ones, whose logit was written as infinity
-    assert len(load_ply(guitar, drop_nonfinite=True)) == 90_854 - 667
+    assert (load_ply(guitar).opacities == 1).sum() == 667  # whose logit was written as infinity
     assert load_ply(folder / "gaussians" / "playbot_lod4.from-sog.ply").sh_degree > 0
     with pytest.raises(InputError, match="compressed PLY"):
         load_ply(folder / "gaussians" / "biker.compressed.ply")
@@ -315,3 +357,37 @@ def test_rows_beyond_one_block_are_in_their_place(tmp_path):
     gaussians = random_gaussians(20_000, sh_degree=1)
     loaded = load_ply(saved(tmp_path, gaussians))
     assert same(loaded, gaussians, ("means", "quats", "sh"))
+
+
+@pytest.mark.parametrize(
+    ("comments", "antialiased"),
+    [
+        (["SplatRenderMode: mip"], True),
+        (["splatrendermode:MIP"], True),
+        (["SplatRenderMode  mip "], True),
+        (["antialiased 1"], True),
+        (["Antialiased = true"], True),
+        (["postshot.anti_aliasing=1"], True),
+        (["antialiased 0"], False),
+        (["SplatRenderMode: default"], False),
+        (["antialiased 1", "SplatRenderMode: default"], False),
+        (["Exported from Brush", "Vertical axis: y", "SplatRenderMode: mip", "SH degree: 0"], True),
+        (["mip", "antialiased", "not antialiased 1"], False),
+    ],
+)
+@pytest.mark.parametrize("ending", [b"\n", b"\r\n"])
+def test_comments_mark_antialiased_gaussians(tmp_path, comments, antialiased, ending):
+    path = saved(tmp_path, random_gaussians(5))
+    assert not load_ply(path).is_antialiased
+    header, _, rows = path.read_bytes().partition(b"end_header\n")
+    lines = header.splitlines()
+    lines[2:2] = [f"comment {text}".encode() for text in comments]
+    path.write_bytes(ending.join([*lines, b"end_header", rows]))
+    assert load_ply(path).is_antialiased == antialiased
+
+
+def test_antialiased_gaussians_are_written_as_such_and_others_as_ever(tmp_path):
+    scene = random_gaussians(5)
+    marked = saved(tmp_path, replace(scene, is_antialiased=True), "marked.ply").read_bytes()
+    plain = saved(tmp_path, scene, "plain.ply").read_bytes()
+    assert marked.replace(b"comment SplatRenderMode: mip\n", b"") == plain != marked

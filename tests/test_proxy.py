@@ -60,6 +60,15 @@ def test_a_crowd_is_drawn_with_few_and_looks_alike():
         assert (ours.alpha - truth.alpha).abs().mean() < 0.01
 
 
+def test_an_antialiased_crowd_is_drawn_as_one():
+    crowd = replace(CROWD, is_antialiased=True)
+    scene = run_by_run(crowd, CAMERAS).scene
+    assert scene.is_antialiased
+    assert thinned(crowd, 1000).is_antialiased
+    ours, truth = (RENDERER.render(drawn, TARGET) for drawn in (scene, crowd))
+    assert (ours.alpha - truth.alpha).abs().mean() < 0.01
+
+
 def test_runs_lie_within_half_a_pixel():
     assert (PROXY.run.diff() >= 0).all()
     first = torch.cat([torch.tensor([0]), 1 + PROXY.run.diff().nonzero()[:, 0]])

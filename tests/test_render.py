@@ -64,6 +64,11 @@ SCENES = {
     "strange-harmonics": strange(sh_degree=2),
     "room": smooth(gaussians_of(view_of(Room(), camera_at(0.2, size=24)))),
 }
+SCENES |= {
+    f"antialiased-{name}": replace(SCENES[name], is_antialiased=True)
+    for name in ("random", "harmonics", "strange", "room")
+}
+MODES = pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
 
 
 def assert_same_drawing(ours: Render, truth: Render) -> None:
@@ -135,6 +140,42 @@ def test_one_gaussian_on_a_pixel_centre_by_hand(renderer):
 
 
 @pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
+@pytest.mark.parametrize("scales", [(0.05, 0.05, 0.05), (0.05, 0.01, 0.3)], ids=["round", "thin"])
+def test_one_antialiased_gaussian_by_hand(renderer, scales):
+    """What the low-pass spreads it over more pixels, it lacks in opacity: the sum over the image is
+    that of a Gaussian without it."""
+    camera = camera_at(size=33, focal=1.0)
+    gaussian = replace(one((0.0, 0.0, 2.0)), scales=torch.tensor([scales]), is_antialiased=True)
+    across, down = (33 * scale / 2 for scale in scales[:2])
+    factor = across * down / ((across**2 + 0.3) * (down**2 + 0.3)) ** 0.5
+    render = renderer.render(gaussian, camera)
+    assert render.alpha[16, 16] == pytest.approx(0.8 * factor, rel=1e-5)
+    assert render.depth[16, 16] == pytest.approx(2.0, abs=1e-5)
+    assert render.alpha.sum() == pytest.approx(0.8 * 2 * torch.pi * across * down, rel=0.03)
+    classic = renderer.render(replace(gaussian, is_antialiased=False), camera)
+    assert classic.alpha[16, 16] == pytest.approx(0.8, rel=1e-5)
+
+
+@pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
+def test_what_is_too_thin_to_be_seen_antialiased_has_no_gradient(renderer):
+    """Of no extent, and so small that squares of its size underflow."""
+    for scale in (0.0, 1e-25):
+        thin = replace(one((0.0, 0.0, 2.0), scale=scale), is_antialiased=True)
+        thin = replace(thin, scales=thin.scales.requires_grad_())
+        render = renderer.render(merge([thin, SCENES["antialiased-random"]]), CAMERA)
+        render.image.sum().backward()
+        assert torch.equal(thin.scales.grad, torch.zeros(1, 3))
+
+
+def test_the_mode_of_gaussians_is_kept_and_not_mixed():
+    scene = SCENES["antialiased-harmonics"]
+    for same in (scene[:5], scene[scene.opacities > 0.5], scene.to("cpu"), merge([scene, scene])):
+        assert same.is_antialiased
+    with pytest.raises(ValueError, match="cannot be merged"):
+        merge([scene, SCENES["harmonics"]])
+
+
+@pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
 def test_the_nearer_gaussian_covers_the_farther_whatever_their_order(renderer):
     camera = camera_at(size=33, focal=1.0)
     near, far = one((0.0, 0.0, 2.0), 0.75), one((0.0, 0.0, 4.0), 0.5, colour=(0.0, 1.0, 0.0))
@@ -167,13 +208,17 @@ def test_any_image_size_is_drawn(size):
     assert_same_drawing(ours, REFERENCE.render(in_dtype(scene, torch.float64), camera))
 
 
-def context_and_new() -> tuple[Gaussians, Gaussians]:
-    return SCENES["random"], random_gaussians(200, seed=5)
+def context_and_new(antialiased: bool = False) -> tuple[Gaussians, Gaussians]:
+    return tuple(
+        replace(part, is_antialiased=antialiased)
+        for part in (SCENES["random"], random_gaussians(200, seed=5))
+    )
 
 
+@MODES
 @pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
-def test_a_composite_is_the_render_of_both_together(renderer):
-    context, new = context_and_new()
+def test_a_composite_is_the_render_of_both_together(renderer, antialiased):
+    context, new = context_and_new(antialiased)
     whole = renderer.render(merge([context, new]), CAMERA)
     parts = renderer.freeze(context, CAMERA).composite(new)
     assert_same_drawing(parts, whole)
@@ -185,10 +230,11 @@ def test_what_is_frozen_alone_is_its_own_render():
     assert_same_drawing(frozen, alone)
 
 
+@MODES
 @pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
-def test_an_extended_view_is_the_frozen_view_of_both(renderer):
-    context, new = context_and_new()
-    last = random_gaussians(50, seed=6)
+def test_an_extended_view_is_the_frozen_view_of_both(renderer, antialiased):
+    context, new = context_and_new(antialiased)
+    last = replace(random_gaussians(50, seed=6), is_antialiased=antialiased)
     extended = renderer.freeze(context, CAMERA).extended(new)
     frozen = renderer.freeze(merge([context, new]), CAMERA)
     for ours, truth in (
@@ -259,9 +305,10 @@ def opacity_gradient(function, opacities: torch.Tensor) -> tuple[Render, torch.T
     return render, torch.autograd.grad(loss, variable)[0]
 
 
+@MODES
 @pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
-def test_a_plan_is_the_composite_with_other_opacities(renderer):
-    context, new = context_and_new()
+def test_a_plan_is_the_composite_with_other_opacities(renderer, antialiased):
+    context, new = context_and_new(antialiased)
     frozen = renderer.freeze(context, CAMERA)
     plan = frozen.plan(new)
     for opacities in (new.opacities, 1 - new.opacities):
@@ -273,9 +320,10 @@ def test_a_plan_is_the_composite_with_other_opacities(renderer):
         assert_same_slopes({"opacities": slope}, {"opacities": expected})
 
 
-def test_a_plan_of_depths_is_the_composite_at_these_depths():
+@MODES
+def test_a_plan_of_depths_is_the_composite_at_these_depths(antialiased):
     """Where it is asked for; elsewhere tiles may show the context alone."""
-    context, new = context_and_new()
+    context, new = context_and_new(antialiased)
     frozen, left = CPU.freeze(context, CAMERA), torch.zeros(48, 48, dtype=torch.bool)
     left[:, :16] = True
     before = z_depths(new.means, CAMERA)
@@ -294,8 +342,9 @@ def test_a_plan_of_depths_is_the_composite_at_these_depths():
     assert torch.equal(before_the_lens.image, frozen.context.image)
 
 
-def test_a_plan_of_colours_tells_what_the_composite_in_these_colours_lacks():
-    context, new = context_and_new()
+@MODES
+def test_a_plan_of_colours_tells_what_the_composite_in_these_colours_lacks(antialiased):
+    context, new = context_and_new(antialiased)
     plans = [r.freeze(context, CAMERA).plan_colours(new) for r in (CPU, REFERENCE)]
     generator = torch.Generator().manual_seed(0)
     photograph = torch.rand(48, 48, 3, generator=generator)
@@ -307,10 +356,10 @@ def test_a_plan_of_colours_tells_what_the_composite_in_these_colours_lacks():
         assert true_weights.max() > 1
 
 
-@pytest.mark.parametrize("name", ["random", "harmonics", "room"])
+@pytest.mark.parametrize("name", ["random", "harmonics", "room", "antialiased-room"])
 def test_a_plan_of_appearances_is_the_composite_that_looks_like_this(name):
     """In front of the context, within it and behind it; to what a closed pixel may be off by."""
-    _, new = context_and_new()
+    _, new = context_and_new(SCENES[name].is_antialiased)
     frozen = CPU.freeze(SCENES[name], CAMERA)
     plan, generator = frozen.plan_appearance(new, EVERYWHERE), torch.Generator().manual_seed(0)
     for share in (1.0, 0.5, 0.1):
@@ -336,9 +385,10 @@ def image_gradients(function, values: dict[str, torch.Tensor]):
     return image.detach(), dict(zip(leaves, slopes, strict=True))
 
 
-def test_what_a_plan_compares_is_its_image():
+@MODES
+def test_what_a_plan_compares_is_its_image(antialiased):
     """Weights are 0 in places, and what nothing new shows in counts all the same."""
-    context, new = context_and_new()
+    context, new = context_and_new(antialiased)
     generator = torch.Generator().manual_seed(0)
     wanted = torch.rand(CAMERA.height, CAMERA.width, 3, generator=generator)
     weights = torch.rand(CAMERA.height, CAMERA.width, generator=generator).sub(0.3).clamp_min(0)
@@ -359,11 +409,11 @@ def test_what_a_plan_compares_is_its_image():
             assert_close(slopes[name] / 3, true_slopes[name], f"slope of {name}", 1e-3)
 
 
-@pytest.mark.parametrize("name", ["random", "room"])
+@pytest.mark.parametrize("name", ["random", "room", "antialiased-room"])
 def test_a_plan_of_appearances_has_fragments_only_where_it_is_asked_for(name):
     """A disk within four tiles, and a pixel far from it: there all is as in a plan of the whole
     image, and the rest is the frozen scene."""
-    _, new = context_and_new()
+    _, new = context_and_new(SCENES[name].is_antialiased)
     frozen = CPU.freeze(SCENES[name], CAMERA)
     rows, columns = torch.meshgrid(torch.arange(48), torch.arange(48), indexing="ij")
     where = (rows - 16) ** 2 + (columns - 18) ** 2 < 100
@@ -446,8 +496,9 @@ def depth_gradient(function, depths: torch.Tensor, where: torch.Tensor):
     return render, torch.autograd.grad((render.depth * weight * covered).sum(), variable)[0]
 
 
-def test_composites_have_the_gradients_of_the_render_of_both():
-    context, new = context_and_new()
+@MODES
+def test_composites_have_the_gradients_of_the_render_of_both(antialiased):
+    context, new = context_and_new(antialiased)
 
     class Composites:
         def render(self, gaussians, camera):
@@ -543,10 +594,11 @@ def slopes_of(draw, values: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return {**drawn, **dict(zip(variables, gradients, strict=True))}
 
 
-@pytest.mark.parametrize("name", ["harmonics", "strange-harmonics"])
+@pytest.mark.parametrize("name", ["harmonics", "strange-harmonics", "antialiased-harmonics"])
 def test_a_frozen_view_that_drops_what_its_camera_does_not_see_draws_the_same(name):
     beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
     context, new = merge([SCENES[name], beside]), random_gaussians(40, seed=5, sh_degree=1)
+    new = replace(new, is_antialiased=context.is_antialiased)
     view = frozen_by(SlowDrawing(), context, CAMERA)
     assert 0 < len(view.seen) < len(context) / 2 + 1
     assert view.seen.sh.shape[1] == 1
@@ -556,7 +608,7 @@ def test_a_frozen_view_that_drops_what_its_camera_does_not_see_draws_the_same(na
 
 
 @pytest.mark.parametrize("freeze", [CPU.freeze, partial(frozen_by, SlowDrawing())])
-@pytest.mark.parametrize("name", ["harmonics", "strange"])
+@pytest.mark.parametrize("name", ["harmonics", "strange", "antialiased-harmonics"])
 def test_a_frozen_view_tells_what_it_shows_of_each_gaussian(name, freeze):
     context, new = SCENES[name][::2], SCENES[name][1::2]
     view = freeze(context, CAMERA).extended(new[:0]).extended(new)
@@ -579,20 +631,21 @@ def test_a_frozen_view_of_nothing_draws_what_is_new():
     assert torch.equal(view.composite(new).image, REFERENCE.render(new, CAMERA).image)
 
 
-@pytest.mark.parametrize("name", ["harmonics", "strange"])
+@pytest.mark.parametrize("name", ["harmonics", "strange", "antialiased-strange"])
 def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", stand_in_gsplat.module())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     cuda = load_renderer("cuda")
     beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
     context, new = merge([SCENES[name], beside]), random_gaussians(40, seed=5, sh_degree=1)
+    new = replace(new, is_antialiased=context.is_antialiased)
     ours, truth = cuda.render(context, CAMERA), REFERENCE.render(context, CAMERA)
     assert_close(ours.depth, truth.depth, "depth", 1e-5)
     assert_close(ours.image, truth.image, "image", 1e-5)
     view = cuda.freeze(context, CAMERA)
     assert 0 < len(view.seen) < len(context)
     check_frozen(view, REFERENCE.freeze(context, CAMERA), new, 1e-4)
-    more = random_gaussians(30, seed=6)
+    more = replace(random_gaussians(30, seed=6), is_antialiased=context.is_antialiased)
     check_frozen(view.extended(new), REFERENCE.freeze(merge([context, new]), CAMERA), more, 1e-4)
     assert not cuda.render(new[:0], CAMERA).image.any()
     assert len(cuda.freeze(new[:0], CAMERA).seen) == 0
@@ -627,6 +680,7 @@ def test_a_frozen_view_on_a_gpu_draws_what_drawing_everything_anew_does(name):
     beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
     context = merge([SCENES[name], beside]).to("cuda")
     new = random_gaussians(200, seed=5, sh_degree=1).to("cuda")
+    new = replace(new, is_antialiased=context.is_antialiased)
     view = cuda.freeze(context, camera)
     assert 0 < len(view.seen) < len(context) / 2 + 1
     check_frozen(view, ReferenceView(cuda, context, camera), new, 1e-3)

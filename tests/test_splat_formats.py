@@ -10,8 +10,10 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import plyfile
 import pytest
 import torch
+from gsply import plyread
 
 from command import run
 from gscompleter import (
@@ -242,6 +244,43 @@ def test_what_was_generated_is_known_after_every_conversion(tmp_path, name):
     assert place_of_labels(tmp_path / name).exists() == (name != "scene.ply")
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_mode_of_gaussians_is_known_after_every_conversion(tmp_path, antialiased):
+    given = replace(plausible(60), is_antialiased=antialiased)
+    for name in ("a.ply", "b.spz", "c.compressed.ply", "d.ply"):
+        save_splat(tmp_path / name, given)
+        given = load_splat(tmp_path / name)
+        assert given.is_antialiased == antialiased, name
+    assert load_splat(write_spz_4(tmp_path / "4.spz", tmp_path / "b.spz")).is_antialiased == (
+        antialiased
+    )
+    save_splat(tmp_path / "scene.splat", given)
+    assert not load_splat(tmp_path / "scene.splat").is_antialiased
+
+
+@pytest.mark.parametrize(
+    ("entry", "antialiased"),
+    [
+        ({"model": "antialiased"}, True),
+        ({"antialias": True}, True),
+        ({"model": "default", "antialias": False}, False),
+        ({"model": "2dgs"}, False),
+    ],
+)
+def test_a_sog_marks_antialiased_gaussians(tmp_path, entry, antialiased):
+    files = sog_files(plausible(30, 0))
+    files["meta.json"] = json.dumps(json.loads(files["meta.json"]) | entry).encode()
+    assert load_splat(write_sog(tmp_path / "scene.sog", files)).is_antialiased == antialiased
+
+
+def test_convert_says_where_the_mode_is_lost(tmp_path, monkeypatch, capsys):
+    save_splat(tmp_path / "a.ply", replace(plausible(30, 0), is_antialiased=True))
+    assert run(monkeypatch, "convert", tmp_path / "a.ply", tmp_path / "b.spz") == 0
+    assert "antialiased" not in capsys.readouterr().out
+    assert run(monkeypatch, "convert", tmp_path / "b.spz", tmp_path / "c.splat") == 0
+    assert "A .splat file cannot mark Gaussians as antialiased" in capsys.readouterr().out
+
+
 def test_labels_of_another_file_are_not_believed(tmp_path):
     path, other = tmp_path / "scene.spz", tmp_path / "other.spz"
     gaussians = plausible(20, 0)
@@ -374,6 +413,27 @@ def test_convert_writes_once_and_says_what_it_wrote(tmp_path, monkeypatch, capsy
     assert load_splat(tmp_path / "c.ply").generated.tolist() == [1] * 30
 
 
+def test_convert_writes_the_plain_layout_of_all_gaussians(tmp_path, monkeypatch):
+    """As another reader takes it that misreads the label; beside other formats no labels lie."""
+    given = replace(plausible(30, 1), generated=(torch.arange(30) % 3).to(torch.uint8))
+    save_splat(tmp_path / "completed.ply", given)
+    for name in ("x.ply", "x.spz", "x.compressed.ply"):
+        out = tmp_path / name
+        assert run(monkeypatch, "convert", tmp_path / "completed.ply", out) == 0
+        assert load_splat(out).generated.any()
+        more = ("--plain", "--overwrite")
+        assert run(monkeypatch, "convert", tmp_path / "completed.ply", out, *more) == 0
+        assert len(load_splat(out)) == 30
+        assert not load_splat(out).generated.any()
+        assert not place_of_labels(out).exists()
+    save_ply(tmp_path / "expected.ply", given, provenance=False)
+    assert (tmp_path / "x.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
+    names = plyfile.PlyData.read(str(tmp_path / "x.ply"))["vertex"].data.dtype.names
+    assert names[:6] == ("x", "y", "z", "nx", "ny", "nz")
+    assert "generated" not in names
+    assert torch.allclose(torch.tensor(plyread(str(tmp_path / "x.ply")).means), given.means)
+
+
 # ------------------------------------------------------------------------------- third party
 
 
@@ -383,13 +443,29 @@ def test_files_of_others_are_read_as_a_third_party_reads_them(shared):
         ("guitar.compressed.ply", "guitar.from-compressed.ply"),
         ("playbot_sog", "playbot_lod4.from-sog.ply"),
     ]:
-        loaded = load_splat(folder / ours)
-        finite = loaded.opacities < 1  # whose logit a .ply cannot hold
-        expected = load_splat(folder / theirs, drop_nonfinite=True)
+        loaded, expected = load_splat(folder / ours), load_splat(folder / theirs)
         for field in ("means", "scales", "opacities", "sh"):
-            a, b = getattr(loaded[finite], field), getattr(expected, field)
+            a, b = getattr(loaded, field), getattr(expected, field)
             assert torch.allclose(a, b, atol=2e-5, rtol=1e-5), (ours, field)
-        assert torch.allclose(covariances(loaded[finite]), covariances(expected), atol=1e-6)
+        assert torch.allclose(covariances(loaded), covariances(expected), atol=1e-6)
+
+
+def test_opaque_gaussians_that_a_third_party_decoded_are_kept(
+    shared, tmp_path, monkeypatch, capsys
+):
+    """Their logits are infinite in its .ply; that is said, and written anew they are finite."""
+    folder, out = shared / "formats" / "gaussians", tmp_path / "out.ply"
+    assert run(monkeypatch, "convert", folder / "guitar.from-compressed.ply", out) == 0
+    said = capsys.readouterr().out.replace("\n", " ")
+    assert "Of 90,854 Gaussians 667 have a logit of opacity of +infinity and 0 of" in said
+    camera = camera_at(0.29, -1.13, -1.5, size=96)
+    truth, ours = (
+        CPU.render(load_splat(path), camera).image
+        for path in (folder / "guitar.compressed.ply", out)
+    )
+    assert truth.std() > 0.05
+    assert -10 * (truth - ours).square().mean().log10() > 60
+    assert plyfile.PlyData.read(str(out))["vertex"]["opacity"].max() < 17
 
 
 def test_a_scene_in_two_formats_of_others_is_one_scene(shared):

@@ -12,7 +12,7 @@ from command import run
 from gscompleter import Gaussians, load_ply, load_splat, merge, save_ply, save_splat
 from gscompleter.splats.layout import save_like
 from gscompleter.splats.removed import save_removed
-from scenes import random_gaussians
+from scenes import labelled, random_gaussians
 
 
 def added(count: int = 20, sh_degree: int = 0) -> Gaussians:
@@ -73,6 +73,36 @@ def test_a_file_of_another_program_comes_back(tmp_path, monkeypatch):
     assert stripped(monkeypatch, tmp_path / "completed.ply") == given.read_bytes()
 
 
+@pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "antialiased 1"])
+@pytest.mark.parametrize("aside", [0, 7])
+def test_an_antialiased_scene_is_completed_as_one_and_comes_back(
+    tmp_path, monkeypatch, comment, aside
+):
+    given = labelled(tmp_path / "given.ply", random_gaussians(40, sh_degree=1))
+    line = f"comment {comment}\nelement vertex".encode()
+    given.write_bytes(given.read_bytes().replace(b"element vertex", line, 1))
+    scene, rows = load_ply(given), torch.arange(aside)
+    kept = torch.ones(len(scene), dtype=torch.bool)
+    kept[rows] = False
+    new = replace(added(sh_degree=1), is_antialiased=True)
+    save_like(tmp_path / "completed.ply", scene[kept], new, given, kept)
+    if aside:
+        save_removed(tmp_path / "removed.ply", scene[rows], rows, given)
+        assert load_ply(tmp_path / "removed.ply").is_antialiased
+    assert load_ply(tmp_path / "completed.ply").is_antialiased
+    assert stripped(monkeypatch, tmp_path / "completed.ply") == given.read_bytes()
+
+
+def test_a_removed_ply_of_another_mode_is_refused(tmp_path, monkeypatch, capsys):
+    scene = random_gaussians(20)
+    save_ply(tmp_path / "completed.ply", replace(scene, is_antialiased=True))
+    save_removed(tmp_path / "removed.ply", scene[:2], torch.arange(2))
+    out = tmp_path / "out.ply"
+    assert run(monkeypatch, "strip", tmp_path / "completed.ply", "--out", out) == 2
+    assert "only one of the two is antialiased" in capsys.readouterr().err.replace("\n", " ")
+    assert not out.exists()
+
+
 @pytest.mark.parametrize("options", [{"text": True}, {"byte_order": ">"}])
 def test_ascii_and_big_endian_scenes(tmp_path, monkeypatch, options):
     save_ply(tmp_path / "ours.ply", random_gaussians(30))
@@ -89,17 +119,20 @@ def test_ascii_and_big_endian_scenes(tmp_path, monkeypatch, options):
 
 @pytest.mark.parametrize("case", ["labelled", "fewer harmonics", "another scene", "spz"])
 def test_where_the_layout_cannot_be_kept_ours_is_written(tmp_path, case):
-    given, context = tmp_path / "given.ply", random_gaussians(30)
+    given, context = tmp_path / "given.ply", replace(random_gaussians(30), is_antialiased=True)
     if case == "labelled":
         context = replace(context, generated=torch.ones(30, dtype=torch.uint8))
     if case == "spz":
         given = tmp_path / "given.spz"
     save_splat(given, context)
-    first = random_gaussians(30, seed=4) if case == "another scene" else load_splat(given)
-    more = added(sh_degree=1 if case == "fewer harmonics" else 0)
+    first = load_splat(given)
+    if case == "another scene":
+        first = replace(random_gaussians(30, seed=4), is_antialiased=True)
+    more = replace(added(sh_degree=1 if case == "fewer harmonics" else 0), is_antialiased=True)
     save_like(tmp_path / "completed.ply", first, more, given)
     save_ply(tmp_path / "ours.ply", merge([first, more]), provenance=True)
     assert (tmp_path / "completed.ply").read_bytes() == (tmp_path / "ours.ply").read_bytes()
+    assert load_ply(tmp_path / "completed.ply").is_antialiased
 
 
 @pytest.mark.parametrize("harmonics", [0, 2])

@@ -203,6 +203,14 @@ def test_what_did_not_change_is_held_once():
     assert layers == {"before": "observed", "observed": "observed", "generated": "generated"}
 
 
+def test_the_page_knows_which_layers_are_antialiased():
+    exhibit = room_exhibit()
+    marked = replace(exhibit, after=replace(exhibit.after, is_antialiased=True))
+    content = content_of(make_page(marked, NONE))
+    assert content["antialiased"] == {"before": False, "observed": True, "generated": True}
+    assert content["layers"]["before"] == "before"
+
+
 def test_what_changed_is_held_beside_what_it_became(tmp_path):
     exhibit = room_exhibit()
     assert exhibit.before is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -234,6 +235,27 @@ def test_parts_beside_the_page_are_read_from_its_folder(
     (tmp_path / next(iter(page.parts))).unlink()
     with pytest.raises(Exception, match="files that have to lie beside this page are missing"):
         Window(browser, tmp_path / "my #page.html", 320, 240)
+
+
+def test_antialiased_gaussians_are_those_of_our_renderer(browser, libraries, tmp_path):
+    """Both pictures, beside which those of the classic mode are something else."""
+    room = room_exhibit()
+    small = [replace(g, scales=0.7 * g.scales) for g in (room.before, room.after)]
+    before, after = (replace(gaussians, is_antialiased=True) for gaussians in small)
+    exhibit = replace(room, before=before, after=after)
+    (tmp_path / "page.html").write_bytes(make_page(exhibit, libraries).html)
+    tab = Window(browser, tmp_path / "page.html", 2 * SIDE, SIDE)
+    tab.page.add_style_tag(content=BARE)
+    tab.do("gsc.setMode('side')")
+    tab.do("gsc.goTo('target-1')")
+    shown = tab.picture()
+    for half, marked, classic in zip(
+        (slice(SIDE), slice(SIDE, None)), (before, after), small, strict=True
+    ):
+        found = psnr(shown[:, half], rendered(marked, TARGET))
+        assert found > 25
+        assert found > psnr(shown[:, half], rendered(classic, TARGET)) + 3
+    tab.context.close()
 
 
 def test_text_from_outside_stays_text(browser, libraries, tmp_path):

@@ -29,6 +29,7 @@ from gscompleter.render import (
     in_colours,
     load_renderer,
 )
+from gscompleter.render.antialiasing import in_mode_of
 from gscompleter.render.proxy import proxy_of
 from gscompleter.stages.anchor import (
     AnchorChoice,
@@ -389,10 +390,12 @@ class GSCompleter:
         return context if sight.stereo is None else corrected(context, sight.stereo)
 
     def lift(self, sight: Sight, reference: Synthesized) -> Lift:
-        """Stage 2: the image as Gaussians, those that lie near a hole."""
+        """Stage 2: the image as Gaussians, those that lie near a hole, in the mode of the scene."""
         radius = self.config.holes.neighbourhood
         wanted = None if radius is None else dilate(self.holes(sight), radius)
-        return lift(self.reconstructor, reference, sight.anchor_view, wanted)
+        lifted = lift(self.reconstructor, reference, sight.anchor_view, wanted)
+        scene, made = sight.completion.drawn, lifted.gaussians
+        return replace(lifted, gaussians=in_mode_of(scene, made, reference.camera))
 
     def register(
         self,

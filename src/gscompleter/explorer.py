@@ -14,6 +14,7 @@ from gscompleter.config import ExplorationConfig
 from gscompleter.geometry import same_camera
 from gscompleter.progress import stage, track
 from gscompleter.render import each_view
+from gscompleter.render.antialiasing import in_mode_of
 from gscompleter.stages.anchor import select_anchor
 from gscompleter.stages.candidates import (
     Candidate,
@@ -162,8 +163,9 @@ class Explorer:
     def with_stand_ins(self, completion: Completion, camera: Camera) -> Completion:
         """`completion` with stand-ins in the holes that it has at a camera."""
         look = self.look(completion, self.completer.window(completion, camera).wide)
-        added = stand_ins(look.render, look.holes, look.camera)
-        return replace(completion, drawn=merge([completion.drawn, added]))
+        drawn, made = completion.drawn, stand_ins(look.render, look.holes, look.camera)
+        added = in_mode_of(drawn, made, look.camera)
+        return replace(completion, drawn=merge([drawn, added]))
 
 
 def with_bystanders(completion: Completion, cameras: Sequence[Camera]) -> Completion:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Int64, Shaped, UInt8
@@ -170,13 +170,17 @@ class Gaussians(Movable):
     Exponential and logarithm are not exact inverses in float32. Writing uses these values
     wherever they still stand for `scales` and `opacities`, which makes round trips exact.
     """
+    is_antialiased: bool = False
+    """True for Gaussians that were made for antialiased rendering (Mip-Splatting): a renderer then
+    multiplies each opacity by `sqrt(det S / det(S + 0.3 I))`, S the covariance in the image in px².
+    """
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """The Gaussians at `index`: a boolean mask [n], integers [m] or a slice."""
-        tensors = {name: part for name, part in vars(self).items() if part is not None}
+        tensors: dict[str, Any] = {n: p for n, p in vars(self).items() if isinstance(p, Tensor)}
         if isinstance(index, Tensor) and index.dtype == torch.int64:
             index = index.to(self.means.device)  # in the way that is twice as fast as indexing
             return replace(self, **{n: part.index_select(0, index) for n, part in tensors.items()})
@@ -203,9 +207,14 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
     """All Gaussians of `parts`, in order, each with its provenance.
 
     Spherical harmonics of a lower degree are padded with zeros, which changes no colour.
+
+    Raises:
+        ValueError: no parts, or antialiased ones among others: no renderer draws both alike.
     """
     if not parts:
         raise ValueError("merge needs at least one set of Gaussians, got none")
+    if len({part.is_antialiased for part in parts}) > 1:
+        raise ValueError("antialiased Gaussians cannot be merged with others")
     k = max(part.sh.shape[1] for part in parts)
     sh = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
     unknown = float("nan")  # equal to nothing: the writer encodes these anew
@@ -221,6 +230,7 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
         torch.cat(sh),
         torch.cat([part.generated for part in parts]),
         torch.cat(encoded) if any(part.encoded is not None for part in parts) else None,
+        parts[0].is_antialiased,
     )
 
 

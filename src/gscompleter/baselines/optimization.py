@@ -115,6 +115,7 @@ class Parameters:
     logits: Tensor
     sh: Tensor
     generated: Tensor
+    is_antialiased: bool
     optimizer: torch.optim.Adam
 
     @staticmethod
@@ -133,12 +134,14 @@ class Parameters:
         ]
         optimizer = torch.optim.Adam(groups, eps=1e-15)
         means, quats, log_scales, logits, sh = leaves
-        return Parameters(means, quats, log_scales, logits, sh, scene.generated, optimizer)
+        kept = scene.generated, scene.is_antialiased
+        return Parameters(means, quats, log_scales, logits, sh, *kept, optimizer)
 
     def gaussians(self) -> Gaussians:
         """The scene, differentiable in the leaves."""
         scales, opacities = self.log_scales.exp(), self.logits.sigmoid()
-        return Gaussians(self.means, self.quats, scales, opacities, self.sh, self.generated)
+        leaves = self.means, self.quats, scales, opacities, self.sh, self.generated
+        return Gaussians(*leaves, is_antialiased=self.is_antialiased)
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:

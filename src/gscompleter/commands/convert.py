@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from gscompleter.config.settings import Settings
 from gscompleter.errors import InputError
+
+if TYPE_CHECKING:
+    from gscompleter.types import Gaussians
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +26,9 @@ class ConvertOptions(Settings):
     """The file to write."""
     drop_nonfinite: bool = False
     """Leave out Gaussians that hold NaN or infinity."""
+    plain: bool = False
+    """Keep what was generated but not the labels: a .ply without the property `generated`, which
+    some programs misread, and no labels beside other files."""
     overwrite: bool = False
     """Replace the file where there is one."""
     quiet: bool = False
@@ -38,8 +44,9 @@ def run_convert(options: ConvertOptions) -> None:
     # Here, so that `--help` does not wait for torch.
     from rich.console import Console
 
+    from gscompleter.io.ply import note_infinite_opacities
     from gscompleter.progress import preparing, shown_on
-    from gscompleter.splats.formats import load_splat, save_splat, writable_format
+    from gscompleter.splats.formats import load_splat, loss_of_mode, save_splat, writable_format
 
     writable_format(options.out)
     check_free(options.out, options.overwrite)
@@ -47,10 +54,18 @@ def run_convert(options: ConvertOptions) -> None:
         with preparing("reading"):
             gaussians = load_splat(options.source, options.drop_nonfinite)
         with preparing("writing"):
-            save_splat(options.out, gaussians)
+            save_splat(options.out, unlabelled(gaussians) if options.plain else gaussians)
     if not options.quiet:
         generated = int((gaussians.generated > 0).sum())
+        notes = note_infinite_opacities(gaussians), loss_of_mode(options.out, gaussians)
+        for note in filter(None, notes):
+            print(note)
         print(f"{len(gaussians):,} Gaussians, {generated:,} of them generated: {options.out}")
+
+
+def unlabelled(gaussians: Gaussians) -> Gaussians:
+    """Drop the labels of what was generated; all Gaussians stay."""
+    return replace(gaussians, generated=gaussians.generated.new_zeros(len(gaussians)))
 
 
 def check_free(path: Path, overwrite: bool) -> None:

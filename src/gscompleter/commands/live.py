@@ -40,6 +40,11 @@ SHOWN = 40
 """Photographs that the page shows at most, besides those that the work starts from."""
 THUMBNAIL = 160
 """Their longer side, in pixels."""
+CLASSIC = (
+    "The page renders antialiased Gaussians as classic ones, small ones too opaque; what is saved "
+    "is right, and `view` shows it as it is."
+)
+"""Of the page, which viser renders."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,8 @@ def prepare(options: LiveOptions, console: Console) -> Prepared:
     asked = as_complete(options)
     opened, task, explorer, seconds = prepared(asked, console)
     say(console, *found_out(asked, opened, task))
+    if task.scene is not None and task.scene.is_antialiased:
+        say(console, CLASSIC)
     frames = frames_of(task)
     asked = replace(asked, context=frames, target=(str(options.out / TARGETS),))
     return Prepared(asked, opened, task, explorer, cameras_of(asked, opened, task), seconds)

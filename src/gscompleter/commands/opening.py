@@ -441,7 +441,8 @@ def check_scene(task: Task, scene: Gaussians) -> None:
 def scene_needs(task: Task, scene: Gaussians) -> int:
     """About how much memory a scene that is brought to a task takes besides, in bytes."""
     cameras = [view.camera for view in (*task.views, *(task.witnesses or ()))]
-    numbers = sum(part[0].numel() for part in vars(scene).values() if part is not None)
+    parts = [part for part in vars(scene).values() if isinstance(part, Tensor)]
+    numbers = sum(part[0].numel() for part in parts)
     sizes = [camera.width * camera.height for camera in cameras]
     return scene_bytes(len(scene), numbers, sizes)
 

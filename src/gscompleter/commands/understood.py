@@ -10,6 +10,7 @@ from gscompleter.commands.options import CompleteOptions, SceneOptions, most
 from gscompleter.data.formats import FORMATS
 from gscompleter.data.frame import Frame
 from gscompleter.errors import quoted
+from gscompleter.io.ply import note_infinite_opacities
 from gscompleter.memory import gigabytes, memory_bytes, needed_bytes
 from gscompleter.types import Camera, Gaussians
 
@@ -41,11 +42,13 @@ def understood(options: CompleteOptions, opened: Opened, task: Task) -> list[str
 
 def found_out(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
     """The lines on what was opened and found out."""
-    splat = ""
+    splat, note = "", None
     if task.scene is not None and options.scene is not None:
         splat = f"; {splat_line(options.scene, task.scene)}"
+        note = note_infinite_opacities(task.scene)
     return [
         f"Opened: {quoted(options.folder)}, {photographs_line(opened)}{splat}.",
+        *([] if note is None else [note]),
         f"Found: {found_line(options, opened, task)}.",
     ]
 
@@ -72,7 +75,8 @@ def cameras_line(frames: Sequence[Frame]) -> str:
 
 def splat_line(path: Path, scene: Gaussians) -> str:
     """The splat that was brought."""
-    return f"{quoted(path)}, {len(scene):,} Gaussians of SH degree {scene.sh_degree}"
+    mode = "antialiased " if scene.is_antialiased else ""
+    return f"{quoted(path)}, {len(scene):,} {mode}Gaussians of SH degree {scene.sh_degree}"
 
 
 def found_line(options: SceneOptions, opened: Opened, task: Task) -> str:

@@ -3,7 +3,8 @@
 Written: the standard 3DGS layout (binary little-endian float32: x y z nx ny nz f_dc_* f_rest_*
 opacity scale_* rot_*), then `uchar generated`. Read: the same properties in any order, type and
 byte order, ASCII too, among other properties and elements. Inside the file scales are logarithms,
-opacities logits, and f_rest_* runs through all coefficients of red, then green, then blue.
+opacities logits, and f_rest_* runs through all coefficients of red, then green, then blue. A
+comment marks antialiased Gaussians: ours is that of Brush, and those of Postshot are known too.
 """
 
 from __future__ import annotations
@@ -53,6 +54,15 @@ _MAX_LOGIT = 30.0
 
 _MAX_SCALE = 1e38
 """Larger scales are written as this one, so that what is read back is finite in float32."""
+
+MODE = "comment SplatRenderMode: mip"
+"""The line of a header that marks antialiased Gaussians."""
+_MODE_LINE = re.compile(
+    r"(?:comment|obj_info)\s+(?:SplatRenderMode|(?:postshot[._])?anti[-_ ]?alias(?:ed|ing)?)"
+    r"\s*[:=\s]\s*(\w+)\s*",
+    re.IGNORECASE,
+)
+_ANTIALIASED = ("mip", "antialiased", "1", "true")
 
 BLOCK = 8192
 """Rows copied or written at a time: few enough to stay in the cache while one column follows
@@ -126,6 +136,18 @@ def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
             "binary_little_endian and binary_big_endian are known."
         )
     return file_format, elements
+
+
+def read_mode(file: BinaryIO) -> bool:
+    """Read from a header, which ends where the file stands, if the Gaussians are antialiased.
+
+    Of several comments that name the mode the last one counts.
+    """
+    end = file.tell()
+    file.seek(0)
+    lines = file.read(end).decode("latin-1").splitlines()
+    modes = [found[1].lower() for line in lines if (found := _MODE_LINE.fullmatch(line.strip()))]
+    return bool(modes) and modes[-1] in _ANTIALIASED
 
 
 def _count(word: str) -> int:
@@ -229,7 +251,8 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """The Gaussians of a 3DGS .ply, of SH degree 0 to 3.
 
     With `drop_nonfinite`, Gaussians that hold NaN or infinity, or a rotation of zeros, are left
-    out; else the file is refused.
+    out; else the file is refused. A logit of opacity may be infinite, which is how converters write
+    opacities of 1 and 0, and stands for these.
 
     Raises:
         InputError: no such file, not a PLY, truncated, empty, not 3DGS, or with damaged values.
@@ -254,12 +277,13 @@ def _read(path: Path) -> Gaussians:
             raise InputError(f"{quoted(path)} is a directory or a device; a 3DGS .ply is needed.")
         with path.open("rb") as file:
             file_format, elements = read_header(file, path)
+            is_antialiased = read_mode(file)
             vertex = _gaussian_element(elements, path)
             ahead = elements[: elements.index(vertex)]
             vertices = read_vertices(file, file_format, ahead, vertex, path)
     except OSError as error:
         raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
-    return _gaussians(vertices, vertex)
+    return _gaussians(vertices, vertex, is_antialiased)
 
 
 def _gaussian_element(elements: list[Element], path: Path) -> Element:
@@ -300,7 +324,7 @@ def _gaussian_element(elements: list[Element], path: Path) -> Element:
     return vertex
 
 
-def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
+def _gaussians(vertices: np.ndarray, vertex: Element, is_antialiased: bool) -> Gaussians:
     def columns(names: tuple[str, ...]) -> Float[Tensor, "n c"]:
         table = np.empty((len(vertices), len(names)), np.float32)
         # A double beyond the range of float32 becomes infinite, and is counted as such.
@@ -328,6 +352,7 @@ def _gaussians(vertices: np.ndarray, vertex: Element) -> Gaussians:
         sh=torch.cat([dc[:, None], rest], dim=1).contiguous(),
         generated=torch.from_numpy(generated),
         encoded=encoded,
+        is_antialiased=is_antialiased,
     )
 
 
@@ -356,13 +381,27 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
 
 
 def drawable(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    """Which Gaussians hold neither NaN nor infinity nor a rotation of zeros."""
-    opacities = gaussians.opacities if gaussians.encoded is None else gaussians.encoded
-    good = (gaussians.quats != 0).any(1)
-    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh, opacities):
+    """Which Gaussians hold neither NaN nor infinity nor a rotation of zeros. An opacity is finite
+    where its logit is not."""
+    scales = gaussians.scales if gaussians.encoded is None else gaussians.encoded[:, :3]
+    opacities, good = gaussians.opacities, (gaussians.quats != 0).any(1)
+    tables = (gaussians.means, gaussians.quats, gaussians.scales, scales, gaussians.sh, opacities)
+    for values in tables:
         if not values.sum().isfinite():  # Looking at each of them takes ten times as long.
             good &= values.isfinite().reshape(len(values), -1).all(1)
     return good
+
+
+def note_infinite_opacities(gaussians: Gaussians) -> str | None:
+    """Say in a sentence how many logits of opacity were infinite; None where none was."""
+    logits = None if gaussians.encoded is None else gaussians.encoded[:, 3]
+    if logits is None or logits.sum().isfinite():
+        return None
+    opaque, clear = int(logits.isposinf().sum()), int(logits.isneginf().sum())
+    return (
+        f"Of {len(gaussians):,} Gaussians {opaque:,} have a logit of opacity of +infinity and "
+        f"{clear:,} of -infinity; they are taken as opaque and as transparent."
+    )
 
 
 def blocks(count: int) -> Iterator[slice]:
@@ -412,7 +451,9 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
         provenance = bool((gaussians.generated > 0).any())
     gaussians = gaussians.to("cpu")
     kinds = {"<f4": "float", "|u1": "uchar"}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [MODE] if gaussians.is_antialiased else []
+    lines += [f"element vertex {len(gaussians)}"]
     dtype = rows_of(gaussians[:0], provenance).dtype
     lines += [f"property {kinds[dtype[name].str]} {name}" for name in dtype.names or ()]
     header = "\n".join([*lines, "end_header", ""])

@@ -715,11 +715,13 @@ def _basis_slope(x, y, z, g):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def project(begin, end, gaussians, pinhole, splats, boxes):
+def project(begin, end, gaussians, pinhole, splats, boxes, factors):
     """Project the Gaussians begin..end; those that cannot be seen get an empty box.
 
     gaussians: GaussianArrays of n. splats [n, 9] float32 and boxes [n, 4] are written. The
     box encloses the pixels where the alpha of a splat of this opacity reaches 1/255.
+    factors: [n] float32 for antialiased Gaussians, written: what their opacities are multiplied
+        by here. None for others, which are compiled on their own.
     """
     means, quats, scales, opacities, sh = gaussians
     view, center, near = pinhole.rotation, pinhole.center, pinhole.near
@@ -761,9 +763,15 @@ def project(begin, end, gaussians, pinhole, splats, boxes):
             continue
         deviation_x = np.float32(math.sqrt(aa + BLUR))
         deviation_y = np.float32(math.sqrt(bb + BLUR))
+        opacity = opacities[i]
+        if factors is not None:
+            factors[i] = math.sqrt((c0 * c0 + c1 * c1 + c2 * c2) / determinant)
+            opacity *= factors[i]
+            if not opacity >= MIN_ALPHA:
+                continue
 
         center_x, center_y = fx * tan_x + cx, fy * tan_y + cy
-        sigmas = math.sqrt(np.float32(2) * math.log(opacities[i] / MIN_ALPHA)) + np.float32(1e-3)
+        sigmas = math.sqrt(np.float32(2) * math.log(opacity / MIN_ALPHA)) + np.float32(1e-3)
         radius_x, radius_y = sigmas * deviation_x, sigmas * deviation_y
         left = max(math.ceil(center_x - radius_x - half), zero)
         right = min(math.floor(center_x + radius_x + half), width)
@@ -1121,13 +1129,34 @@ def composite_backward(
 # ---- From gradients of entries to gradients of Gaussians ---------------------------------------
 
 
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _compensation_backward(flat, q):
+    """Gradient of the flattened axes (see `_flattened`) from that of the logarithm of the factor
+    `sqrt(P / D)`, P being the squared area that they span and D the determinant with the blur."""
+    a0, a1, a2 = np.float64(flat[0]), np.float64(flat[1]), np.float64(flat[2])
+    b0, b1, b2 = np.float64(flat[3]), np.float64(flat[4]), np.float64(flat[5])
+    c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    squares = a0 * a0 + a1 * a1 + a2 * a2 + b0 * b0 + b1 * b1 + b2 * b2
+    area, added = c0 * c0 + c1 * c1 + c2 * c2, BLUR * squares + BLUR * BLUR
+    of_area = q * added / (area * (area + added))
+    of_squares = q * BLUR / (area + added)
+    return (
+        np.float32(of_area * (b1 * c2 - b2 * c1) - of_squares * a0),
+        np.float32(of_area * (b2 * c0 - b0 * c2) - of_squares * a1),
+        np.float32(of_area * (b0 * c1 - b1 * c0) - of_squares * a2),
+        np.float32(of_area * (c1 * a2 - c2 * a1) - of_squares * b0),
+        np.float32(of_area * (c2 * a0 - c0 * a2) - of_squares * b1),
+        np.float32(of_area * (c0 * a1 - c1 * a0) - of_squares * b2),
+    )
+
+
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def project_backward(
-    begin, end, gaussians, pinhole, splats, slot_start, gradients, written, slopes
+    begin, end, gaussians, pinhole, factors, splats, slot_start, gradients, written, slopes
 ):
     """Gradients of the Gaussians begin..end from those of their entries in the tiles.
 
-    gaussians, pinhole, splats: as in `project`.
+    gaussians, pinhole, factors, splats: as in `project`.
     gradients [slots, 10] float32, where written [slots]: the slots from slot_start[i] to
         slot_start[i + 1] belong to Gaussian i.
     slopes: GaussianArrays of gradients, written where one arrives.
@@ -1194,6 +1223,10 @@ def project_backward(
         d_y0 = four * (v * a0 + w * b0)
         d_y1 = four * (v * a1 + w * b1)
         d_y2 = four * (v * a2 + w * b2)
+        if factors is not None:
+            more = _compensation_backward(flat, sums[SUM])
+            d_x0, d_x1, d_x2 = d_x0 + more[0], d_x1 + more[1], d_x2 + more[2]
+            d_y0, d_y1, d_y2 = d_y0 + more[3], d_y1 + more[4], d_y2 + more[5]
 
         # F = J axes
         xx, xz, yy, yz = jacobian
@@ -1353,7 +1386,8 @@ def _by_pixel(
 def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
     """The Fragments of tiles[begin:end] of two layers, where what is frozen is folded.
 
-    context, new: Layer; the opacities of `new` are 1. new_slots [entries] int32: their slots.
+    context, new: Layer; the opacities of `new` are those of opaque Gaussians.
+    new_slots [entries] int32: their slots.
     where [h, w] bool: the pixels that are to have fragments. behind [h, w, 3] float32 is written
         in these tiles.
     """

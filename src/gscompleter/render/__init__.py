@@ -2,7 +2,8 @@
 
 All of them draw the 3DGS image formation of gsplat's classic mode: perspective EWA splatting with
 0.3 px² added to the 2D covariance, contributions under alpha 1/255 dropped, alpha capped at 0.999,
-compositing stopped when transmittance falls to 1e-4, colour over black.
+compositing stopped when transmittance falls to 1e-4, colour over black. Antialiased Gaussians are
+drawn as in gsplat's antialiased mode: what that addition makes larger, it makes fainter.
 """
 
 from __future__ import annotations

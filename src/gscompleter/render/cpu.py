@@ -81,7 +81,7 @@ class CpuView:
 
     def extended(self, new: Gaussians) -> CpuView:
         """The same as freezing context and `new` together, in that order."""
-        splats = self.viewpoint.project(arrays_of(new))
+        splats = self.viewpoint.project(arrays_of(new), new.is_antialiased)
         added, order = by_use(self.viewpoint.enter(splats, self.depth_limits))
         count = self.count + len(new)
         if len(added.entries) == 0:
@@ -124,11 +124,11 @@ class CpuView:
     def composite(self, new: Gaussians) -> Render:
         """Context and `new` together; only `new` is projected, sorted and binned."""
         tensors = (getattr(new, name).to("cpu", torch.float32) for name in GaussianArrays._fields)
-        return Render(*_Composite.apply(self, *tensors))
+        return Render(*_Composite.apply(self, new.is_antialiased, *tensors))
 
     def plan(self, new: Gaussians) -> OpacityRender:
         """Project, sort and bin `new` once, with boxes that hold for every opacity."""
-        binned = self.viewpoint.bin(opaque(new), self.depth_limits)
+        binned = self.viewpoint.bin(opaque(new), new.is_antialiased, self.depth_limits)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
             return Render(*_Planned.apply(self, binned, opacities.to("cpu", torch.float32)))
@@ -139,12 +139,12 @@ class CpuView:
         """Project, sort and bin `new` once, and fold what is frozen around it."""
         arrays = opaque(new)
         limits = np.minimum(self.viewpoint.limits_within(where), self.depth_limits)
-        binned = self.viewpoint.bin(arrays, limits)
+        binned = self.viewpoint.bin(arrays, new.is_antialiased, limits)
         return folded(self, binned, arrays.means, where)
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
         """Project, sort and bin `new` once."""
-        binned = self.viewpoint.bin(arrays_of(new), self.depth_limits)
+        binned = self.viewpoint.bin(arrays_of(new), new.is_antialiased, self.depth_limits)
 
         def errors(colours: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColourSums:
             binned.layer.splats[:, rasterizer.RED :] = np.maximum(float32(colours), 0)
@@ -155,7 +155,7 @@ class CpuView:
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Project `new` once, as far as it touches a tile that is asked for."""
-        splats = self.viewpoint.project(arrays_of(new))
+        splats = self.viewpoint.project(arrays_of(new), new.is_antialiased)
         anywhere = self.viewpoint.limits_within(where)
         asked = np.zeros(len(splats.boxes), np.bool_)
         asked[self.viewpoint.enter(splats, anywhere).entries] = True
@@ -175,6 +175,8 @@ class Splats:
     columns: Float32[ndarray, "n 9"]
     opacities: Float32[ndarray, "n"]
     boxes: Integer[ndarray, "n 4"]
+    factors: Float32[ndarray, "n"] | None = None
+    """What the opacities of antialiased Gaussians were multiplied by; None for others."""
 
     def at_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
         """The same at other z-depths; what comes nearer than `near` gets an empty box."""
@@ -248,17 +250,25 @@ class Viewpoint:
         limits = np.full(self.tiles, np.inf, np.float32)
         return CpuView(self, layer, frame, limits, np.empty(0, np.int32), 0)
 
-    def bin(self, gaussians: GaussianArrays, depth_limits: Float32[ndarray, "tiles"]) -> Binned:
+    def bin(
+        self,
+        gaussians: GaussianArrays,
+        is_antialiased: bool,
+        depth_limits: Float32[ndarray, "tiles"],
+    ) -> Binned:
         """Project the Gaussians, sort them and enter them into the lists of the tiles."""
-        return by_splat(self.enter(self.project(gaussians), depth_limits))
+        return by_splat(self.enter(self.project(gaussians, is_antialiased), depth_limits))
 
-    def project(self, gaussians: GaussianArrays) -> Splats:
-        """The Gaussians as splats; those that cannot be seen get an empty box."""
+    def project(self, gaussians: GaussianArrays, is_antialiased: bool) -> Splats:
+        """The Gaussians as splats with the opacities that they have here; those that cannot be seen
+        get an empty box."""
         n = length_of(gaussians)
         columns = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
         boxes = np.empty((n, 4), self.box_type)
-        self.share(rasterizer.project, n, gaussians, self.pinhole, columns, boxes)
-        return Splats(columns, gaussians.opacities, boxes)
+        factors = np.zeros(n, np.float32) if is_antialiased else None
+        self.share(rasterizer.project, n, gaussians, self.pinhole, columns, boxes, factors)
+        opacities = gaussians.opacities if factors is None else gaussians.opacities * factors
+        return Splats(columns, opacities, boxes, factors)
 
     def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Layer:
         """Enter the splats into the lists of the tiles, and sort these."""
@@ -342,12 +352,15 @@ class _Composite(torch.autograd.Function):
     """Image, depth and alpha of a frozen context with new Gaussians in it."""
 
     @staticmethod
-    def forward(ctx: Any, view: CpuView, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, view: CpuView, is_antialiased: bool, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
         gaussians = GaussianArrays(*map(float32, tensors))
-        binned = view.viewpoint.bin(gaussians, view.depth_limits)
+        splats = view.viewpoint.project(gaussians, is_antialiased)
+        binned = by_splat(view.viewpoint.enter(splats, view.depth_limits))
         frame = view.viewpoint.composite(view, binned.layer)
         render = render_of(frame)
-        ctx.scene = (view, binned, frame)
+        ctx.scene = (view, splats.factors, binned, frame)
         # Saving tensors makes torch notice if one of them is written to before the backward pass.
         ctx.save_for_backward(*tensors, render.depth, render.alpha)
         return render.image, render.depth, render.alpha
@@ -355,14 +368,15 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        view, binned, frame = ctx.scene
+        view, factors, binned, frame = ctx.scene
         gaussians = GaussianArrays(*map(float32, ctx.saved_tensors[:5]))
         gradients = view.viewpoint.composite_backward(view.layer, binned, frame, slopes)
         result = GaussianArrays(*map(np.zeros_like, gaussians))
-        drawn = (gaussians, view.viewpoint.pinhole, binned.layer.splats, binned.slot_start)
+        seen = (gaussians, view.viewpoint.pinhole, factors)
+        drawn = (*seen, binned.layer.splats, binned.slot_start)
         n = len(gaussians.means)
         view.viewpoint.share(rasterizer.project_backward, n, *drawn, *gradients, result)
-        return None, *map(torch.from_numpy, result)
+        return None, None, *map(torch.from_numpy, result)
 
 
 class _Planned(torch.autograd.Function):
@@ -370,7 +384,8 @@ class _Planned(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, view: CpuView, binned: Binned, opacities: Tensor) -> tuple[Tensor, ...]:
-        layer = binned.layer._replace(opacities=float32(opacities))
+        seen = float32(opacities) * binned.layer.opacities  # those of opaque ones, here
+        layer = binned.layer._replace(opacities=seen)
         frame = view.viewpoint.composite(view, layer)
         render = render_of(frame)
         ctx.scene = (view, replace(binned, layer=layer), frame)

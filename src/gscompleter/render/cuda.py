@@ -87,6 +87,8 @@ class CudaRenderer:
 
         with torch.no_grad():
             _, _, seen = self.rasterized(gaussians, camera)
+            given, drawn = gaussians.opacities, seen["opacities"].reshape(-1)
+            factors = torch.where(given > 0, drawn / given, 0.0)  # 1 for all but antialiased ones
             center = camera.center.to(gaussians.means.device)
             colours = colours_from(gaussians.sh, gaussians.means, center)
             values = torch.cat([colours[None], seen["depths"][..., None]], dim=-1)
@@ -96,7 +98,7 @@ class CudaRenderer:
                 seen["means2d"],
                 seen["conics"],
                 values,
-                opacities[None],
+                (factors * opacities)[None],
                 camera.width,
                 camera.height,
                 seen["tile_size"],
@@ -130,7 +132,7 @@ class CudaRenderer:
             sh_degree=gaussians.sh_degree,
             packed=False,
             render_mode="RGB+ED",  # the depth is already divided by alpha
-            rasterize_mode="classic",
+            rasterize_mode="antialiased" if gaussians.is_antialiased else "classic",
         )
         return colour_and_depth, alpha, found
 

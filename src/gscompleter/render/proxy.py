@@ -57,7 +57,8 @@ def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
     first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
     looks = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
-    return Proxy(Gaussians(means, quats, scales, *looks), run)
+    drawn = Gaussians(means, quats, scales, *looks, is_antialiased=scene.is_antialiased)
+    return Proxy(drawn, run)
 
 
 def starts_of_runs(

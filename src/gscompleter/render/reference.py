@@ -144,11 +144,14 @@ def project(gaussians: Gaussians, camera: Camera) -> Splats:
     axes = rotations_from(gaussians.quats) * gaussians.scales[:, None, :]
     flat = jacobians(points, K, camera.width, camera.height) @ camera_from_world @ axes
     covariances = flat @ flat.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype, device=device)
+    opacities = gaussians.opacities
+    if gaussians.is_antialiased:
+        opacities = opacities * compensations(flat, covariances)
     return Splats(
         centers=points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2],
         precisions=inverses(covariances),
         depths=points[:, 2],
-        opacities=gaussians.opacities,
+        opacities=opacities,
         colours=colours_from(gaussians.sh, gaussians.means, c2w[:3, 3]),
     )
 
@@ -181,6 +184,20 @@ def inverses(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     adjugates = torch.stack([c, -b, -b, a], dim=-1).view(-1, 2, 2)
     return adjugates / (a * c - b * b)[:, None, None]
+
+
+def compensations(
+    flat: Float[Tensor, "n 2 3"], covariances: Float[Tensor, "n 2 2"]
+) -> Float[Tensor, "n"]:
+    """Factors of the opacities by which antialiased rendering makes up for the low-pass.
+
+    Args:
+        flat: Axes of the Gaussians in the image, whose squares are the covariances before it.
+        covariances: The same after it.
+    """
+    # Lagrange's identity gives the determinant of `flat @ flat.T` without cancellation.
+    area = torch.linalg.cross(flat[:, 0], flat[:, 1]).norm(dim=-1)
+    return area / torch.linalg.det(covariances).sqrt()
 
 
 def composite(

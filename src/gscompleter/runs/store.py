@@ -232,7 +232,8 @@ def _arrays_of(gaussians: Gaussians) -> Arrays:
 
 def _gaussians_of(arrays: Mapping[str, np.ndarray], device: torch.device | str) -> Gaussians:
     """Copies, which lie in memory as torch's own tensors do: how a sum is rounded depends on it."""
-    return Gaussians(*(torch.from_numpy(arrays[name]).clone().to(device) for name in _FIELDS))
+    tensors: list[Any] = [torch.from_numpy(arrays[name]).clone().to(device) for name in _FIELDS]
+    return Gaussians(*tensors)
 
 
 def load_arrays(path: Path) -> Arrays | None:

@@ -8,6 +8,7 @@ opacity, and a rotation in 2 + 3 x 10 bits. Harmonics lie in an element of their
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy import ndarray
 
 from gscompleter.errors import quoted
 from gscompleter.io.files import replacing
-from gscompleter.io.ply import Element, encode, read_header
+from gscompleter.io.ply import MODE, Element, encode, read_header, read_mode
 from gscompleter.splats.decoding import check_size, damaged, gaussians_of, harmonics
 from gscompleter.splats.packing import fraction, quantized, with_largest, without_largest
 from gscompleter.types import SH_C0, Gaussians
@@ -41,7 +42,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
     Raises:
         InputError: where it cannot be read, is truncated, or contradicts itself.
     """
-    tables = _tables(path)
+    tables, is_antialiased = _tables(path)
     if not {"chunk", "vertex"} <= tables.keys():
         raise damaged(path, "it has no chunks or no vertices")
     chunk, vertex = tables["chunk"], tables["vertex"]
@@ -57,13 +58,17 @@ def read_compressed_ply(path: Path) -> Gaussians:
     has_colours = set(BOUNDS) <= set(bounds)
     rgb = _within(chunk, "", CHANNELS, rgba[:, :3]) if has_colours else rgba[:, :3]
     rest = _rest(path, tables.get("sh"), len(vertex))
-    return gaussians_of(means, _quats(rotation), scales, rgba[:, 3], harmonics(rgb, rest))
+    sh = harmonics(rgb, rest)
+    gaussians = gaussians_of(means, _quats(rotation), scales, rgba[:, 3], sh)
+    return replace(gaussians, is_antialiased=is_antialiased)
 
 
-def _tables(path: Path) -> dict[str, ndarray]:
-    """The elements of a binary little-endian .ply of plain properties, by name."""
+def _tables(path: Path) -> tuple[dict[str, ndarray], bool]:
+    """The elements of a binary little-endian .ply of plain properties, by name, and if its
+    Gaussians are antialiased."""
     with path.open("rb") as file:
         file_format, elements = read_header(file, path)
+        is_antialiased = read_mode(file)
         data = file.read()
     if file_format != "binary_little_endian":
         raise damaged(path, f"a compressed .ply is binary_little_endian, not {file_format}")
@@ -75,7 +80,7 @@ def _tables(path: Path) -> dict[str, ndarray]:
         count = element.count if row.itemsize else 0
         tables[element.name] = np.frombuffer(data, row, count, start) if count else np.empty(0, row)
         start += count * row.itemsize
-    return tables
+    return tables, is_antialiased
 
 
 def _row(path: Path, element: Element) -> np.dtype:
@@ -151,7 +156,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
     )
     rest = _packed_rest(gaussians)
     with replacing(path) as file:
-        file.write(_header(len(gaussians), len(columns[0]), rest.shape[1]))
+        file.write(_header(gaussians, len(columns[0]), rest.shape[1]))
         file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
         file.write(packed.astype("<u4").tobytes())
         file.write(rest.tobytes())
@@ -193,8 +198,11 @@ def _packed_rest(gaussians: Gaussians) -> UInt8[ndarray, "n m"]:
     return np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
 
 
-def _header(count: int, chunks: int, num_rest: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
+def _header(gaussians: Gaussians, chunks: int, num_rest: int) -> bytes:
+    count = len(gaussians)
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [MODE] if gaussians.is_antialiased else []
+    lines += [f"element chunk {chunks}"]
     lines += [f"property float {name}" for name in BOUNDS]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
     if num_rest:

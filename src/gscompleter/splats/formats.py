@@ -39,6 +39,8 @@ class Format:
     write: Callable[[Path, Gaussians], None] | None = None
     arrange: Callable[[Gaussians], Gaussians] | None = None
     """The order that files of this kind hold their Gaussians in; None keeps the given one."""
+    has_mode: bool = False
+    """Whether files of this kind can mark Gaussians as antialiased."""
 
 
 FORMATS = {
@@ -48,10 +50,13 @@ FORMATS = {
         read_compressed_ply,
         write_compressed_ply,
         near_together,
+        has_mode=True,
     ),
-    "ply": Format((".ply",), lambda head: head.startswith(b"ply"), load_ply, save_ply),
-    "spz": Format((".spz",), is_spz, read_spz, write_spz),
-    "sog": Format((".sog", META), is_sog, read_sog),
+    "ply": Format(
+        (".ply",), lambda head: head.startswith(b"ply"), load_ply, save_ply, has_mode=True
+    ),
+    "spz": Format((".spz",), is_spz, read_spz, write_spz, has_mode=True),
+    "sog": Format((".sog", META), is_sog, read_sog, has_mode=True),
     "glb": Format((".glb",), is_glb, read_glb),
     "splat": Format((".splat",), None, read_splat, write_splat),
     "ksplat": Format((".ksplat",), None, read_ksplat),
@@ -107,6 +112,18 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
         gaussians = format_.arrange(gaussians)
     format_.write(path, gaussians)
     save_labels(path, gaussians.generated)
+
+
+def loss_of_mode(path: Path, gaussians: Gaussians) -> str | None:
+    """Say in a sentence that the format of `path` cannot mark antialiased Gaussians; None where it
+    can, or they are not."""
+    format_ = writable_format(path)
+    if format_.has_mode or not gaussians.is_antialiased:
+        return None
+    return (
+        f"A {format_.extensions[0]} file cannot mark Gaussians as antialiased: viewers will draw "
+        "these as classic ones, which makes small ones too opaque."
+    )
 
 
 def format_of(path: Path) -> str:

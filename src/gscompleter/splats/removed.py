@@ -96,6 +96,10 @@ def put_back(kept: Gaussians, removed: Gaussians, rows: Int[Tensor, "n"], path: 
             f"{quoted(path)} belongs to another scene: it names row {int(rows.max()):,} of one "
             f"that has {total:,} Gaussians."
         )
+    if kept.is_antialiased != removed.is_antialiased:
+        raise InputError(
+            f"{quoted(path)} belongs to another scene: only one of the two is antialiased."
+        )
     taken: Bool[Tensor, "n"] = torch.zeros(total, dtype=torch.bool)
     taken[rows] = True
     order = torch.empty(total, dtype=torch.int64)

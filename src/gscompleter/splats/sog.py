@@ -3,7 +3,8 @@
 `meta.json` names lossless WebP images that hold a Gaussian in each pixel: two images for 16 bits
 of position in a logarithmic scale, one for the rotation (2 + 3 x 8 bits), one of scales, one of
 colour and opacity; harmonics are rows of a palette. Bytes stand for entries of a codebook
-(version 2) or for steps between a lowest and a highest value (version 1).
+(version 2) or for steps between a lowest and a highest value (version 1). Antialiased Gaussians are
+marked by `"model": "antialiased"`, in early files of version 2 by `"antialias": true`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -146,7 +147,8 @@ def _read(parts: Parts, meta: str = META) -> Gaussians:
         version = table.get("version", 1)
         if version not in (1, 2):
             raise InputError(f"{parts.path} is .sog version {version}; 1 and 2 are known.")
-        return _decoded(parts, table, version)
+        marked = table.get("model") == "antialiased" or table.get("antialias") is True
+        return replace(_decoded(parts, table, version), is_antialiased=marked)
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:

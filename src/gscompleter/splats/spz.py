@@ -11,7 +11,7 @@ from __future__ import annotations
 import gzip
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,8 @@ HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams."""
 TABLE = struct.Struct("<I12x")
 """Version 4 goes on with the offset of its table of sizes."""
+ANTIALIASED = 0x1
+"""The flag of antialiased Gaussians."""
 COEFFICIENTS = (0, 3, 8, 15)
 MOST_GROWTH = 256
 """How many times its size a file may unpack to. Real ones reach two."""
@@ -58,6 +60,7 @@ class Header:
     count: int
     degree: int
     fractional_bits: int
+    flags: int
     streams: int
 
     @property
@@ -86,12 +89,13 @@ def read_spz(path: Path) -> Gaussians:
         header = _header(path, data)
         plain = header.version < 4
         streams = _split(path, header, data[HEADER.size :]) if plain else _from_zstd(path, data)
-    return half_turned(_decoded(header, streams), ABOUT_X)
+    turned = half_turned(_decoded(header, streams), ABOUT_X)
+    return replace(turned, is_antialiased=bool(header.flags & ANTIALIASED))
 
 
 def _header(path: Path, data: bytes) -> Header:
     check_size(path, len(data), HEADER.size)
-    magic, version, count, degree, bits, _, streams = HEADER.unpack_from(data)
+    magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(data)
     if magic != MAGIC:
         raise InputError(f"{quoted(path)} is no .spz: it holds something else that is compressed.")
     if version not in (2, 3, 4):
@@ -105,7 +109,7 @@ def _header(path: Path, data: bytes) -> Header:
             f"{quoted(path)} has harmonics of degree {degree} and {bits} fractional bits; a .spz "
             "of degree 0 to 3 and at most 24 bits is needed."
         )
-    return Header(version, count, degree, bits, streams)
+    return Header(version, count, degree, bits, flags, streams)
 
 
 def _from_gzip(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
@@ -231,7 +235,8 @@ def packed_spz(path: Path, gaussians: Gaussians) -> bytes:
     """
     turned = half_turned(gaussians, ABOUT_X)
     bits = _fractional_bits(path, turned)
-    header = HEADER.pack(MAGIC, 3, len(turned), turned.sh_degree, bits, 0, 0)
+    flags = ANTIALIASED if gaussians.is_antialiased else 0
+    header = HEADER.pack(MAGIC, 3, len(turned), turned.sh_degree, bits, flags, 0)
     constant = 0.5 + COLOUR_SCALE * turned.sh[:, 0].numpy()
     rest = turned.sh[:, 1:].reshape(len(turned), -1).numpy()
     log_scales = encode(gaussians)[:, :3].numpy()

@@ -22,6 +22,7 @@ from gscompleter.frames.similarity import moved_camera
 from gscompleter.io.files import COMPLETED, CONTEXT, SUMMARY, TARGETS
 from gscompleter.io.image import jpeg_of, read_pixels
 from gscompleter.io.json_file import read_json
+from gscompleter.io.ply import note_infinite_opacities
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.sog import META
 from gscompleter.types import Camera, Gaussians
@@ -75,7 +76,7 @@ class Exhibit:
     """None where there is nothing to compare with."""
     shots: tuple[Shot, ...] = ()
     remarks: tuple[str, ...] = ()
-    """What is missing of it, a sentence each."""
+    """What is missing of it, or not as in its file, a sentence each."""
     place: Place = SAME
     """Where the frame lies that further cameras are given in."""
 
@@ -92,10 +93,13 @@ def exhibit_of_files(after: Path, before: Path | None, drop_nonfinite: bool) -> 
         InputError: where a file cannot be read.
     """
     scene = load_splat(after, drop_nonfinite)
+    note = note_infinite_opacities(scene)
+    remarks = () if note is None else (note,)
     if before is not None:
-        return Exhibit(after.name, scene, load_splat(before, drop_nonfinite))
+        return Exhibit(after.name, scene, load_splat(before, drop_nonfinite), remarks=remarks)
     given = scene[scene.generated == 0]
-    return Exhibit(after.name, scene, given if 0 < len(given) < len(scene) else None)
+    shown = given if 0 < len(given) < len(scene) else None
+    return Exhibit(after.name, scene, shown, remarks=remarks)
 
 
 def is_completion(path: Path) -> bool:

@@ -114,6 +114,7 @@ def make_page(exhibit: Exhibit, libraries: Libraries, name: str = "page") -> Pag
         "frame": {"centre": frame.centre.tolist(), "unit": frame.unit},
         "counts": {key: len(part) for key, part in shown.items()},
         "layers": layer_sources,
+        "antialiased": {key: part.is_antialiased for key, part in layers.items()},
         "parts": {key: len(part_starts(source)) for key, source in sources.items()},
         "shots": [described(shot, frame, means) for shot in shots_of(exhibit)],
         **vars(libraries),

@@ -19,6 +19,8 @@ const AS_3DGS = {
   preBlurAmount: 0.3, blurAmount: 0, minAlpha: 1 / 255, maxStdDev: Math.sqrt(11.1),
   maxPixelRadius: 4096, sortRadial: false, accumExtSplats: true, enableLod: false,
 };
+/* The same of antialiased Gaussians: what is added takes as much of their opacity. */
+const AS_ANTIALIASED = { ...AS_3DGS, preBlurAmount: 0, blurAmount: 0.3 };
 /* Radians that a drag over the whole height turns, and that a second of an arrow key does. */
 const TURN_BY_DRAG = Math.PI;
 const TURN_BY_KEY = 0.8;
@@ -94,7 +96,8 @@ class Picture {
     this.camera = new THREE.PerspectiveCamera();
     this.camera.matrixAutoUpdate = false;
     this.scene = new THREE.Scene();
-    this.spark = new SPARK.SparkRenderer({ renderer: this.renderer, autoUpdate: false, ...AS_3DGS });
+    const shape = layers.some((layer) => content.antialiased[layer]) ? AS_ANTIALIASED : AS_3DGS;
+    this.spark = new SPARK.SparkRenderer({ renderer: this.renderer, autoUpdate: false, ...shape });
     this.scene.add(this.spark);
     this.meshes = {};
     this.stale = false;
