@@ -24,7 +24,7 @@ from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sparse_points import with_depth_range
-from gscompleter.data.structure_from_motion import find_poses, holds_photographs
+from gscompleter.data.structure_from_motion import POSES, find_poses, holds_photographs
 from gscompleter.errors import InputError, quoted
 from gscompleter.frames.beside import GivenSplat
 from gscompleter.frames.placing import frame_of_splat
@@ -50,8 +50,6 @@ from gscompleter.types import Camera, Gaussians, View
 
 MIN_SIZE = 16
 """Shorter side of an image, in pixels, under which there is nothing to match and to score."""
-POSES = "colmap"
-"""The folder of the output with the cameras that were found."""
 MAX_DIGITS = 9
 """Characters of the longest number of a frame."""
 CHOSEN, CHOSEN_WITH_SCENE = 3, 8

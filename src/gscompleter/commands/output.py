@@ -9,10 +9,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gscompleter.commands.opening import POSES, Opened, Task
+from gscompleter.commands.opening import Opened, Task
 from gscompleter.commands.options import SceneOptions
 from gscompleter.config import CompleterConfig
 from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.data.structure_from_motion import POSES
 from gscompleter.io.files import SUMMARY
 
 

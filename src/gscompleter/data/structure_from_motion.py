@@ -33,6 +33,8 @@ ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Of photographs, in any case."""
 NO_PHOTOGRAPHS = (MASKS, *(f"images_{n}" for n in DOWNSCALED))
 """Folders beside those of photographs."""
+POSES = "colmap"
+"""The folder of a completion's output with the cameras that were found for it."""
 MIN_PHOTOGRAPHS = 3
 """With two, neither the focal length nor a wrong match can be told."""
 MIN_SHARE = 0.25
