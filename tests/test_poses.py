@@ -316,7 +316,7 @@ def test_names_that_colmap_cannot_list_are_changed(tmp_path):
 
 def test_masks_hidden_files_and_our_own_results_are_no_photographs(tmp_path):
     folder = blank(tmp_path / "p", 3)
-    for name in ("masks", "images_2", ".cache", "out"):
+    for name in ("masks", "images_2", "depth", ".cache", "out"):
         blank(folder / name, 1)
     (folder / "out" / "summary.json").write_text("{}")
     Image.new("RGB", (64, 48)).save(folder / ".hidden.png")

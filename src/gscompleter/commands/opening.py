@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gscompleter.commands.options import CompleteOptions, SceneOptions, most, working_size
 from gscompleter.completer import ranged
-from gscompleter.data.formats import open_photographs, recognised
+from gscompleter.data.formats import open_photographs, recognised, refuse_scenes_below
 from gscompleter.data.framing import Resolution
 from gscompleter.data.origin import frame_from_photographs, origin_of, told_from
 from gscompleter.data.other_exports import refuse_other_exports
@@ -131,6 +131,7 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     folder, poses, number = options.folder, options.out / POSES, None
     if options.format is None and holds_photographs(folder) and recognised(folder) is None:
         refuse_other_exports(folder)
+        refuse_scenes_below(folder)
         ours = options.overwrite or os.path.isfile(poses / SUMMARY)
         found = find_poses(folder, poses, overwrite=ours)
         say(console, *found.notes)

@@ -6,7 +6,7 @@ A format is a file of this package and a line in `FORMATS`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
@@ -16,6 +16,7 @@ from gscompleter.data.camera_list import holds_camera_list, open_camera_list
 from gscompleter.data.chunks import holds_chunks, open_chunks
 from gscompleter.data.colmap.scene import holds_colmap, open_colmap
 from gscompleter.data.dgp import holds_dgp, open_dgp
+from gscompleter.data.image_folders import FOLDERS
 from gscompleter.data.kitti import holds_kitti, open_kitti
 from gscompleter.data.kitti_raw import holds_kitti_raw, open_kitti_raw
 from gscompleter.data.limits import check_planes
@@ -25,6 +26,7 @@ from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.pandaset import holds_pandaset, open_pandaset
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import holds_camera_files, open_camera_files
+from gscompleter.data.structure_from_motion import ENDINGS, is_own
 from gscompleter.data.transforms import holds_transforms, open_transforms
 from gscompleter.data.waymo import holds_waymo, open_waymo
 from gscompleter.errors import InputError, quoted
@@ -43,6 +45,11 @@ class Format:
     unit: str | None = None
     """What the coordinates are in, where the format says."""
 
+
+SCENE_DEPTH = 2
+"""How far below a folder scenes are looked for, for an error message that names them."""
+MAX_NAMED = 4
+"""Scenes that it names."""
 
 FORMATS = {
     "chunks": Format(
@@ -134,10 +141,55 @@ def format_of(path: Path, name: str | None = None) -> str:
     found = recognised(path) if name is None else name
     if found is None:
         refuse_other_exports(path)
+        refuse_scenes_below(path)
         raise InputError(
             f"There are no posed photographs in {quoted(str(path))}; name {accepted()}."
         )
     return found
+
+
+def refuse_scenes_below(path: Path) -> None:
+    """Refuse a folder without photographs of its own that has scenes in folders below it.
+
+    Raises:
+        InputError: where it has one with cameras, or several with a folder of photographs each; it
+            names them.
+    """
+    if not os.path.isdir(path) or _holds_own_photographs(path):
+        return
+    found = list(_scenes_below(path, lambda folder: recognised(folder) is not None))
+    if not found:
+        homes = list(_scenes_below(path, lambda folder: _holds_own_photographs(folder, False)))
+        found = homes if len(homes) > 1 else []
+    if not found:
+        return
+    names = ", ".join(quoted(str(one.relative_to(path)), 20) for one in found[:MAX_NAMED])
+    more = f" and {len(found) - MAX_NAMED} more" if len(found) > MAX_NAMED else ""
+    scenes = "one" if len(found) == 1 else f"{len(found)} scenes"
+    raise InputError(
+        f"{quoted(str(path), 50)} is no scene itself, but holds {scenes} below it: {names}{more}; "
+        f"name one of them, as in {quoted(str(found[0]), 60)}."
+    )
+
+
+def _holds_own_photographs(path: Path, files: bool = True) -> bool:
+    """Whether a folder has one for photographs in it, or with `files` photographs themselves."""
+    if any(os.path.isdir(path / name) for name in FOLDERS):
+        return True
+    return files and any(name.lower().endswith(ENDINGS) for name in os.listdir(path))
+
+
+def _scenes_below(
+    path: Path, is_scene: Callable[[Path], bool], depth: int = SCENE_DEPTH
+) -> Iterator[Path]:
+    """List the scenes at most `depth` folders below one, by their names; no results of ours."""
+    for folder in sorted(path.iterdir()):
+        if not folder.is_dir() or not is_own(folder):
+            continue
+        if is_scene(folder):
+            yield folder
+        elif depth > 1:
+            yield from _scenes_below(folder, is_scene, depth - 1)
 
 
 def recognised(path: Path) -> str | None:

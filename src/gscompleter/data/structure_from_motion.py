@@ -31,7 +31,7 @@ from gscompleter.threads import threads
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Of photographs, in any case."""
-NO_PHOTOGRAPHS = (MASKS, *(f"images_{n}" for n in DOWNSCALED))
+NO_PHOTOGRAPHS = (MASKS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALED))
 """Folders beside those of photographs."""
 POSES = "colmap"
 """The folder of a completion's output with the cameras that were found for it."""
@@ -167,15 +167,15 @@ def _listed(folder: Path) -> list[str]:
     """All photographs below a folder that are the user's own."""
     found: list[Path] = []
     for home, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if _is_own(Path(home, name))]
+        folders[:] = [name for name in folders if is_own(Path(home, name))]
         shown = (Path(home, name) for name in files if not name.startswith("."))
         found += [path.relative_to(folder) for path in shown if path.suffix.lower() in ENDINGS]
     return sorted((path.as_posix() for path in found), key=in_order)
 
 
-def _is_own(folder: Path) -> bool:
-    """Whether photographs are looked for in a folder: not where it is hidden, holds masks or
-    smaller copies, or is a result of ours."""
+def is_own(folder: Path) -> bool:
+    """Whether photographs are looked for in a folder: not where it is hidden, holds masks, depth
+    maps or smaller copies, or is a result of ours."""
     if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
         return False
     return not os.path.isfile(folder / SUMMARY)
