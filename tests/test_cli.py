@@ -184,6 +184,7 @@ def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
         ({"target": (9,)}, "no frame 9"),
         ({"target": (-1,)}, "-1"),
         ({"target": ("nowhere.json",)}, "nowhere.json"),
+        ({"target": ("abc",)}, "a target is the number of a frame, from 0 to "),
         ({"target": ("²",)}, "²"),
         ({"target": ("--2",)}, "--2"),
         ({"target": ("9" * 5000,)}, "no frame 999"),
@@ -219,7 +220,10 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--seed", -1), "seed must be greater than or equal to 0, got -1 (--seed)."),
         (("--seed", 2**64), "seed must be less than 4611686018427387904"),
         (("--seed", 1.5), "'1.5'; give --seed INT (see gscompleter complete --help)."),
-        (("--sed", 1), "Unrecognized options: --sed, 1 (see gscompleter complete --help)."),
+        (("--sed", 1), "no option --sed; the nearest is --seed (see gscompleter complete --help)."),
+        (("--drop_nonfinit",), "no option --drop_nonfinit; the nearest is --drop-nonfinite (see"),
+        (("--qwertz", 1), "Unrecognized options: --qwertz, 1 (see gscompleter complete --help)."),
+        (("--config.registration.stepp", 1), "the nearest is --config.registration.step (see"),
         (("--device", "tpu"), "invalid choice 'tpu' for argument '--device'."),
         (("--near", "a" * 5000), "aaa…aaa"),
         (("--config",), "Missing value for argument '--config'."),
@@ -261,6 +265,27 @@ def test_what_is_no_command_gets_a_sentence_too(monkeypatch, capsys, words):
     assert said.err.count("\n") == 1
     assert "--help)." in said.err
     assert said.out == ""
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("compleat", "no command compleat; the nearest is complete ("),
+        ("bach", "no command bach; the nearest is batch ("),
+        ("--verson", "no option --verson; the nearest is --version ("),
+    ],
+)
+def test_the_nearest_command_is_named(monkeypatch, capsys, word, told):
+    assert run(monkeypatch, word) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_splat_in_place_of_the_photographs_is_sent_to_its_option(tmp_path, monkeypatch, capsys):
+    splat, out = tmp_path / "a.ply", tmp_path / "out"
+    splat.write_bytes(b"ply\n")
+    told = "which goes to --scene; SCENE has to be the folder of its photographs"
+    refused(monkeypatch, capsys, out, ("complete", splat, "--out", out), told)
+    refused(monkeypatch, capsys, out, ("live", splat, "--out", out, "--no-open"), told)
 
 
 def config_of(scene, tmp_path, monkeypatch, *more) -> CompleterConfig:

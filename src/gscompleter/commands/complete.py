@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.expected import expected
+from gscompleter.commands.expected import expecting_completion
 from gscompleter.commands.exploring import (
     cameras_of,
     completed,
@@ -50,7 +50,7 @@ from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.video import check_writer
 from gscompleter.kernels.sharing import meanwhile
-from gscompleter.progress import expecting, preparing, shown_on, stage
+from gscompleter.progress import preparing, shown_on, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.render.proxy import WORTH
@@ -91,7 +91,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         opened, task, explorer, before = prepared(options, console)
         say(console, *understood(options, opened, task))
         cameras = cameras_of(options, opened, task)
-        expectation = expecting(expected(options, task, task.views[0].image.device.type))
+        expectation = expecting_completion(options, task, task.views[0].image.device.type)
         with output_folder(options.out, replaceable(options)) as folder, expectation:
             completion, task = completed(options, task, cameras, explorer)
             completion = replace(completion, seconds=total(completion.seconds, before))
