@@ -83,6 +83,7 @@ def test_what_was_added_lies_beside_the_scene_alone(completed):
 def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(completed):
     summary = json.loads((completed / "summary.json").read_text())
     assert set(summary) >= {"version", "settings", "seed", "device", "context", "targets"}
+    assert summary["held_out"] == []  # all three are used
     scores = {"psnr_before", "psnr_after", "ssim_before", "ssim_after"}
     assert [row["frame"] for row in summary["context"]] == [0, 1]
     assert all(set(row) == {"frame", "gain", "contradicted", *scores} for row in summary["context"])
@@ -101,6 +102,39 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
     assert summary["gaussians"] == {"context": len(context), "added": len(whole) - len(context)}
     assert (whole.generated[: len(context)] == 0).all()
     assert (whole.generated[len(context) :] == 1).all()
+
+
+def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch, capsys):
+    folder, out = tmp_path / "scene", tmp_path / "out"
+    folder.mkdir()
+    content = json.loads((scene / "transforms.json").read_text())
+    entries = []
+    for number in range(13):  # from 2 on, all stand where the target does
+        shutil.copy(scene / f"{min(number, 2)}.png", folder / f"{number:02}.png")
+        entries.append({**content["frames"][min(number, 2)], "file_path": f"{number:02}.png"})
+    (folder / "transforms.json").write_text(json.dumps({**content, "frames": entries}))
+    (folder / "03.png").write_bytes(b"damaged")
+
+    words = complete(folder, out, "--resolution", 48, 48, "--near", 0.5, "--far", 20)
+    assert run(monkeypatch, *words) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    rows, (target,) = summary["held_out"], summary["targets"]
+    assert [row["frame"] for row in rows] == [*range(4, 12)]  # the closest that are whole
+    for row in rows:
+        assert not row["is_check"]
+        for score in ("psnr_before", "psnr_after", "ssim_before", "ssim_after"):
+            assert row[score] == pytest.approx(target[score], abs=1e-4)
+    assert "not used (8 scored) the mean PSNR was" in capsys.readouterr().out
+    page = (out / "report.html").read_text()
+    assert "At photographs that were not used" in page
+    assert ">mean<" in page
+
+    splat = ("--scene", out / "context.ply", *SMALL)
+    assert run(monkeypatch, *complete(folder, tmp_path / "again", *splat)) == 0
+    again = json.loads((tmp_path / "again" / "summary.json").read_text())
+    assert [(row["frame"], row["is_check"]) for row in again["held_out"]] == [
+        (frame, True) for frame in range(4, 12)
+    ]
 
 
 def test_the_same_command_gives_the_same_bytes(scene, completed, tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from rich.console import Console
@@ -36,6 +37,7 @@ from gscompleter.commands.opening import (
 from gscompleter.commands.options import CompleteOptions, most
 from gscompleter.commands.output import (
     opened_as,
+    read_held_out,
     replaceable,
     saying_what_stays,
     settings_of,
@@ -137,6 +139,7 @@ def write_done(
             said,
             task.brought,
             lambda: Around(tuple(looks()), cameras),
+            read_held_out(options, done.opened, task, done.cameras),
         )
     write_page(folder, completion_page(folder))
     return summary
@@ -297,6 +300,15 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         f"{100 * covered['after']:.1f} % is now.",
         soft_wrap=True,
     )
+    unused = summary["held_out"]
+    if unused:
+        before = fmean(row["psnr_before"] for row in unused)
+        after = fmean(row["psnr_after"] for row in unused)
+        console.print(
+            f"At photographs that were not used ({len(unused)} scored) the mean PSNR was "
+            f"{before:.2f} dB before, and is {after:.2f} dB now.",
+            soft_wrap=True,
+        )
     counts = summary["gaussians"]
     seconds = summary["seconds"]["total"]
     console.print(
