@@ -216,8 +216,9 @@ def _find(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
     result = _mapped(copies, folder)
     if not result["registered"]:
         raise InputError(
-            f"COLMAP found no cameras for the {len(names)} photographs in {quoted(photographs)}; "
-            "add photographs of the same scene that overlap by two thirds and are sharp."
+            f"COLMAP found no cameras for the {len(names)} photographs in "
+            f"{quoted(str(photographs))}; add photographs of the same scene that overlap by "
+            "two thirds and are sharp."
         )
     registered = set(result["registered"])
     found = FoundPoses(
@@ -243,7 +244,7 @@ def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> 
     lens = "" if defect is None else f", {defect}"
     raise InputError(
         f"COLMAP placed {found.registered} of {found.photographs} photographs in "
-        f"{quoted(str(photographs), 60)}, with {found.points:,} points{lens}, which is too little "
+        f"{quoted(str(photographs), 40)}, with {found.points:,} points{lens}, which is too little "
         "at any focal length; add sharp ones that overlap by two thirds, or name their cameras."
     )
 
