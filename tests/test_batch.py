@@ -242,7 +242,7 @@ def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("row", "sentence"),
     [
-        ({"targt": 2}, "Unrecognized options: --targt"),
+        ({"targt": 2}, "no option --targt; the nearest is --target"),
         ({"resolution": "wide"}, "resolution"),
         ({"out": "elsewhere"}, "no say in 'out'"),
         ({"film": "perhaps"}, "must be true or false"),
@@ -278,7 +278,7 @@ def same_results(out: Path, other: Path, name: str) -> None:
 
 
 def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
-    manifest, tmp_path, monkeypatch
+    manifest, tmp_path, monkeypatch, capsys
 ):
     out = tmp_path / "out"
     words = ("batch", manifest, "--out", out, "--workers", 1, "--threads", 1, "--quiet")
@@ -306,7 +306,10 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     assert 'href="jobs/room-0/report.html"' in page
     assert (out / "jobs" / "room-0" / "report.html").is_file()
     before = {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")}
-    assert run(monkeypatch, *words) == 0
+    capsys.readouterr()
+    assert run(monkeypatch, *words[:-1]) == 0
+    told = capsys.readouterr().err
+    assert "Done 0, failed 0, there before 4, 2 of them failed (--again failures does" in told
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")} == before
 
 

@@ -83,6 +83,7 @@ def test_what_was_added_lies_beside_the_scene_alone(completed):
 def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(completed):
     summary = json.loads((completed / "summary.json").read_text())
     assert set(summary) >= {"version", "settings", "seed", "device", "context", "targets"}
+    assert summary["held_out"] == []  # all three are used
     scores = {"psnr_before", "psnr_after", "ssim_before", "ssim_after"}
     assert [row["frame"] for row in summary["context"]] == [0, 1]
     assert all(set(row) == {"frame", "gain", "contradicted", *scores} for row in summary["context"])
@@ -101,6 +102,39 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
     assert summary["gaussians"] == {"context": len(context), "added": len(whole) - len(context)}
     assert (whole.generated[: len(context)] == 0).all()
     assert (whole.generated[len(context) :] == 1).all()
+
+
+def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch, capsys):
+    folder, out = tmp_path / "scene", tmp_path / "out"
+    folder.mkdir()
+    content = json.loads((scene / "transforms.json").read_text())
+    entries = []
+    for number in range(13):  # from 2 on, all stand where the target does
+        shutil.copy(scene / f"{min(number, 2)}.png", folder / f"{number:02}.png")
+        entries.append({**content["frames"][min(number, 2)], "file_path": f"{number:02}.png"})
+    (folder / "transforms.json").write_text(json.dumps({**content, "frames": entries}))
+    (folder / "03.png").write_bytes(b"damaged")
+
+    words = complete(folder, out, "--resolution", 48, 48, "--near", 0.5, "--far", 20)
+    assert run(monkeypatch, *words) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    rows, (target,) = summary["held_out"], summary["targets"]
+    assert [row["frame"] for row in rows] == [*range(4, 12)]  # the closest that are whole
+    for row in rows:
+        assert not row["is_check"]
+        for score in ("psnr_before", "psnr_after", "ssim_before", "ssim_after"):
+            assert row[score] == pytest.approx(target[score], abs=1e-4)
+    assert "not used (8 scored) the mean PSNR was" in capsys.readouterr().out
+    page = (out / "report.html").read_text()
+    assert "At photographs that were not used" in page
+    assert ">mean<" in page
+
+    splat = ("--scene", out / "context.ply", *SMALL)
+    assert run(monkeypatch, *complete(folder, tmp_path / "again", *splat)) == 0
+    again = json.loads((tmp_path / "again" / "summary.json").read_text())
+    assert [(row["frame"], row["is_check"]) for row in again["held_out"]] == [
+        (frame, True) for frame in range(4, 12)
+    ]
 
 
 def test_the_same_command_gives_the_same_bytes(scene, completed, tmp_path, monkeypatch):
@@ -184,6 +218,7 @@ def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
         ({"target": (9,)}, "no frame 9"),
         ({"target": (-1,)}, "-1"),
         ({"target": ("nowhere.json",)}, "nowhere.json"),
+        ({"target": ("abc",)}, "a target is the number of a frame, from 0 to "),
         ({"target": ("²",)}, "²"),
         ({"target": ("--2",)}, "--2"),
         ({"target": ("9" * 5000,)}, "no frame 999"),
@@ -219,7 +254,10 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--seed", -1), "seed must be greater than or equal to 0, got -1 (--seed)."),
         (("--seed", 2**64), "seed must be less than 4611686018427387904"),
         (("--seed", 1.5), "'1.5'; give --seed INT (see gscompleter complete --help)."),
-        (("--sed", 1), "Unrecognized options: --sed, 1 (see gscompleter complete --help)."),
+        (("--sed", 1), "no option --sed; the nearest is --seed (see gscompleter complete --help)."),
+        (("--drop_nonfinit",), "no option --drop_nonfinit; the nearest is --drop-nonfinite (see"),
+        (("--qwertz", 1), "Unrecognized options: --qwertz, 1 (see gscompleter complete --help)."),
+        (("--config.registration.stepp", 1), "the nearest is --config.registration.step (see"),
         (("--device", "tpu"), "invalid choice 'tpu' for argument '--device'."),
         (("--near", "a" * 5000), "aaa…aaa"),
         (("--config",), "Missing value for argument '--config'."),
@@ -261,6 +299,27 @@ def test_what_is_no_command_gets_a_sentence_too(monkeypatch, capsys, words):
     assert said.err.count("\n") == 1
     assert "--help)." in said.err
     assert said.out == ""
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("compleat", "no command compleat; the nearest is complete ("),
+        ("bach", "no command bach; the nearest is batch ("),
+        ("--verson", "no option --verson; the nearest is --version ("),
+    ],
+)
+def test_the_nearest_command_is_named(monkeypatch, capsys, word, told):
+    assert run(monkeypatch, word) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_splat_in_place_of_the_photographs_is_sent_to_its_option(tmp_path, monkeypatch, capsys):
+    splat, out = tmp_path / "a.ply", tmp_path / "out"
+    splat.write_bytes(b"ply\n")
+    told = "which goes to --scene; SCENE has to be the folder of its photographs"
+    refused(monkeypatch, capsys, out, ("complete", splat, "--out", out), told)
+    refused(monkeypatch, capsys, out, ("live", splat, "--out", out, "--no-open"), told)
 
 
 def config_of(scene, tmp_path, monkeypatch, *more) -> CompleterConfig:

@@ -20,6 +20,7 @@ from gscompleter.progress import shown_on
 from gscompleter.render import load_renderer
 from gscompleter.reports.film import GAP, RATE, even, frame, frames, labelled, stops, write_film
 from gscompleter.reports.film_path import path_through, roll
+from gscompleter.stages.candidates import resized
 from gscompleter.types import Camera, Completion, DepthAffine, TargetCompletion, merge
 from scenes import Room, camera_at, half_a_room_of
 
@@ -97,6 +98,17 @@ def test_the_way_goes_around_what_was_photographed_and_not_through_it():
     around, straight = path_through(ends, photographs, 48), path_through(ends, [], 48)
     assert min(camera.center.norm().item() for camera in around) > 0.9
     assert min(camera.center.norm().item() for camera in straight) < 0.1
+
+
+@pytest.mark.parametrize("size", [(48, 32), (256, 256), (200, 600), (640, 480)])
+def test_a_film_is_wide_enough(completion, size):
+    width, height = size
+    target = resized(completion.targets[0].target, width, height)
+    result = replace(completion.targets[0], target=target)
+    lens = stops(replace(completion, targets=(result,)))[0]
+    assert 2 * lens.width + GAP >= 720
+    assert lens.width / lens.height == pytest.approx(width / height, rel=0.02)
+    assert max(lens.width, lens.height) <= max(640, 720 * max(height / width, 1))
 
 
 def test_sides_are_even():
@@ -202,7 +214,7 @@ def test_the_same_completion_gives_the_same_bytes(completion, tmp_path):
     first, second = ((tmp_path / name / "film.mp4").read_bytes() for name in ("a", "b"))
     assert first == second
     _, found = decoded(tmp_path / "a" / "film.mp4")
-    assert found.shape == (144, SIZE, 2 * SIZE + GAP, 3)
+    assert found.shape == (144, 358, 720, 3)
 
 
 SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "--far", 20)
@@ -212,7 +224,7 @@ def test_a_completion_writes_a_film_where_it_is_asked(room, tmp_path, monkeypatc
     out = tmp_path / "out"
     assert run(monkeypatch, "complete", room, *SMALL, "--film", "--out", out) == 0
     meta, found = decoded(out / "film.mp4")
-    assert meta["size"] == (68, 32)
+    assert meta["size"] == (720, 358)
     assert len(found) == 144
     said = capfd.readouterr()
     assert "film 1 of 73" in said.err

@@ -13,11 +13,12 @@ from command import run
 from gscompleter import InputError
 from gscompleter.data.cases import read_cases
 from gscompleter.data.datasets import open_clips
-from gscompleter.data.formats import FORMATS, open_photographs
+from gscompleter.data.formats import FORMATS, open_photographs, refuse_scenes_below
 from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.data.scene import write_cameras
 from gscompleter.types import View
+from pose_files import write_colmap_binary, write_photographs
 
 
 def save_camera_file(path: Path, frames: str | None = None, views: list[View] = VIEWS) -> Path:
@@ -186,6 +187,35 @@ def test_a_forced_format_and_several_scenes_get_a_sentence(tmp_path, monkeypatch
     assert complete(monkeypatch, save_dataset(tmp_path / "data"), out) == 2
     assert "holds several scenes, such as a and b" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_scenes_below_a_folder_are_named(tmp_path, monkeypatch, capsys):
+    parent, out = tmp_path / "parent", tmp_path / "out"
+    for name in ("a", "group/b", "out"):
+        write_colmap_binary(write_photographs(parent / name / "images").parent / "sparse" / "0")
+    (parent / "out" / "summary.json").write_text("{}")  # a result of ours
+    assert run(monkeypatch, "complete", parent, "--out", out, "--quiet") == 2
+    said = capsys.readouterr().err
+    assert "is no scene itself, but holds 2 scenes below it: a, group/b; name one of them" in said
+    assert len(said) < 300
+    with pytest.raises(InputError, match="holds 2 scenes below it: a, group/b"):
+        open_photographs(parent)
+    assert not out.exists()
+
+
+def test_several_folders_of_photographs_without_cameras_are_named(tmp_path):
+    for name in "abcdef":
+        write_photographs(tmp_path / name / "images")
+    with pytest.raises(InputError, match="6 scenes below it: a, b, c, d and 2 more; name one"):
+        open_photographs(tmp_path)
+
+
+def test_photographs_beside_a_scene_are_completed_by_themselves(tmp_path):
+    write_colmap_binary(write_photographs(tmp_path / "old" / "images").parent / "sparse" / "0")
+    write_photographs(tmp_path)
+    refuse_scenes_below(tmp_path)
+    with pytest.raises(InputError, match="There are no posed photographs"):
+        open_photographs(tmp_path)
 
 
 def test_opening_reads_cameras_only(tmp_path):

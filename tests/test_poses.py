@@ -84,8 +84,8 @@ def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatc
 
 
 def test_the_next_run_keeps_what_was_found(tmp_path, monkeypatch):
-    given, out = blank(tmp_path / "photos", 3), tmp_path / "poses"
-    stand_in(monkeypatch, tmp_path, MODEL_OF_TWO)
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "poses"
+    stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"]))
     first = find_poses(given, out)
     stand_in(monkeypatch, tmp_path, "raise SystemExit('asked again')")
     again = find_poses(given, out)
@@ -95,17 +95,29 @@ def test_the_next_run_keeps_what_was_found(tmp_path, monkeypatch):
     os.utime(given / "0.png", ns=(1, 1))
     with pytest.raises(InputError, match="asked again"):
         find_poses(given, out, overwrite=True)
-    assert find_poses_summary(out)["found"]["models"] == [2]  # what was there survives
+    assert find_poses_summary(out)["found"]["models"] == [3]  # what was there survives
 
 
-MODEL_OF_TWO = """
+def model_script(
+    registered: list[str], points: int = 90, defect: str | None = None, focal: float | None = None
+) -> str:
+    """A stand-in that says that these photographs were registered."""
+    result = {
+        "registered": registered,
+        "models": [len(registered)],
+        "points": points,
+        "error": 0.5,
+        "defect": defect,
+        "focal": focal,
+    }
+    begun = {"begin": "Placing cameras", "steps": 3}
+    lines = [begun, {"step": 1}, {"end": "Placing cameras"}, {"result": result}]
+    told = "\n".join(map(json.dumps, lines))
+    return f"""
 import json, pathlib, sys
 job = json.loads(pathlib.Path(sys.argv[1]).read_text())
 pathlib.Path(job["model"]).mkdir(parents=True)
-for line in ({"begin": "Placing cameras", "steps": 3}, {"step": 1}, {"end": "Placing cameras"}):
-    print(json.dumps(line))
-print(json.dumps({"result": {"registered": ["0.png", "2.png"], "models": [2], "points": 9,
-    "error": 0.5}}))
+print({told!r})
 """
 
 
@@ -114,11 +126,89 @@ def find_poses_summary(out: Path) -> dict:
 
 
 def test_photographs_without_a_camera_are_named(tmp_path, monkeypatch, capsys):
-    stand_in(monkeypatch, tmp_path, MODEL_OF_TWO)
-    assert run(monkeypatch, "poses", blank(tmp_path / "p", 3), "--out", tmp_path / "out") == 0
+    stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"]))
+    assert run(monkeypatch, "poses", blank(tmp_path / "p", 4), "--out", tmp_path / "out") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "No camera was found for 1.png; they are left out."
-    assert said[1].startswith("2 of 3 cameras and 9 points, 0.50 px off on average: ")
+    assert said[1].startswith("3 of 4 cameras and 90 points, 0.50 px off on average: ")
+
+
+@pytest.mark.parametrize(
+    ("count", "points", "defect", "told"),
+    [
+        (3, 1, None, "placed 3 of 4 photographs"),
+        (2, 90, None, "placed 2 of 4 photographs"),
+        (4, 90, "a focal length of 1549 px", "90 points, a focal length of 1549 px, which"),
+    ],
+)
+@pytest.mark.parametrize("command", ["poses", "complete"])
+def test_a_failed_reconstruction_is_refused(
+    tmp_path, monkeypatch, capsys, count, points, defect, told, command
+):
+    found = [f"{number}.png" for number in range(count)]
+    stand_in(monkeypatch, tmp_path, model_script(found, points, defect))
+    given, out = blank(tmp_path / "p", 4), tmp_path / "out"
+    assert run(monkeypatch, command, given, "--out", out, "--quiet") == 2
+    said = capsys.readouterr().err
+    assert told in said
+    assert "add sharp ones" in said
+    assert len(said) < 300
+    assert not out.exists()
+
+
+def test_a_part_of_many_photographs_is_refused_where_it_is_small(tmp_path, monkeypatch):
+    stand_in(monkeypatch, tmp_path, model_script(["0.png", "1.png", "2.png"]))
+    with pytest.raises(InputError, match="placed 3 of 13 photographs"):
+        find_poses(blank(tmp_path / "p", 13), tmp_path / "out")
+
+
+def test_a_failure_that_an_older_version_kept_is_not_used_again(tmp_path, monkeypatch):
+    given, out = blank(tmp_path / "p", 4), tmp_path / "out"
+    stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"]))
+    find_poses(given, out)
+    content = find_poses_summary(out)
+    content["found"]["points"] = 1
+    (out / "summary.json").write_text(json.dumps(content))
+    assert not find_poses(given, out, overwrite=True).reused
+
+
+def test_a_focal_length_that_was_held_is_told(tmp_path, monkeypatch):
+    found = [f"{number}.png" for number in range(4)]
+    stand_in(monkeypatch, tmp_path, model_script(found, focal=344.2))
+    (note,) = find_poses(blank(tmp_path / "p", 4), tmp_path / "out").notes
+    assert "4 of 4 cameras" in note
+    assert "344 px" in note
+
+
+def test_lenses_that_no_camera_has_are_told():
+    pycolmap = pytest.importorskip("pycolmap")
+    from gscompleter.data.mapping_process import _defect_of
+
+    def camera(focal: float, distortion: float) -> object:
+        return pycolmap.Camera(
+            model="SIMPLE_RADIAL", width=640, height=193, params=[focal, 320, 96.5, distortion]
+        )
+
+    assert _defect_of(camera(344, -0.1)) is None
+    assert _defect_of(camera(1488, 0)) is None  # a telephoto lens
+    assert "corners by 638 %" in _defect_of(camera(1549, 137))
+    assert "(2° across)" in _defect_of(camera(22530, 0))
+    assert "focal length of 0 px" in _defect_of(camera(0, 0))
+
+
+def test_a_drive_is_placed_with_its_focal_length_held(shared, tmp_path):
+    pytest.importorskip("pycolmap")
+    given = tmp_path / "drive"
+    given.mkdir()
+    for source in list_photographs(shared, "kitti_city", 30)[20:]:
+        shutil.copy(source, given)
+    found = find_poses(given, tmp_path / "out")
+    assert found.registered == 10
+    assert found.points > 300
+    focal = float(open_photographs(tmp_path / "out").camera(0).K[0, 0])
+    true = float(open_photographs(shared / "data" / "kitti_city").camera(0).K[0, 0])
+    assert 0.5 < focal / true < 2
+    assert found.focal == pytest.approx(focal, rel=0.02)
 
 
 def test_parts_that_do_not_connect_are_told():
@@ -226,7 +316,7 @@ def test_names_that_colmap_cannot_list_are_changed(tmp_path):
 
 def test_masks_hidden_files_and_our_own_results_are_no_photographs(tmp_path):
     folder = blank(tmp_path / "p", 3)
-    for name in ("masks", "images_2", ".cache", "out"):
+    for name in ("masks", "images_2", "depth", ".cache", "out"):
         blank(folder / name, 1)
     (folder / "out" / "summary.json").write_text("{}")
     Image.new("RGB", (64, 48)).save(folder / ".hidden.png")

@@ -30,6 +30,9 @@ CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f]")
 """Characters that have no place in a log."""
 
 
+SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "--far", 20)
+
+
 class Clock:
     """A time that passes when it is told to."""
 
@@ -186,6 +189,48 @@ def test_the_share_that_is_done_never_goes_back(clock):
     assert first < work.share() < 1
 
 
+def test_stages_that_were_not_timed_tell_the_share_that_is_done(clock):
+    work = Work()
+    inside = [("context", 2.0), ("generate", 1.0), ("register", 1.0)]
+    work.expect([("context", 2.0), *inside, ("report", 2.0)], is_timed=False)
+    shares, target = [], Activity("target", 1)
+    for name in ("context", "generate", "register", "report"):
+        if name == "generate":
+            work.begin(target)
+        activity = Activity(name)
+        work.begin(activity)
+        shares.append(work.share())
+        clock.pass_by(3.0)
+        work.end(activity)
+    assert shares == pytest.approx([0.0, 0.5, 0.625, 0.75])
+    assert work.share() == pytest.approx(1.0)
+
+
+def test_steps_inside_of_a_stage_count_for_the_share(clock):
+    work = Work()
+    work.expect([("generate", 1.0), ("register", 3.0)], is_timed=False)
+    work.begin(Activity("register"))
+    steps = Activity("Registering", 10)
+    work.begin(steps)
+    for _ in range(5):
+        clock.pass_by(1.0)
+        steps.stepped()
+    assert work.share() == pytest.approx(0.25 + 0.75 * 0.5)
+    assert work.left() == pytest.approx(5.0)
+
+
+def test_progress_on_a_given_splat_advances_over_the_stages(room, tmp_path, monkeypatch, capfd):
+    first, out = tmp_path / "first", tmp_path / "out"
+    assert run(monkeypatch, "complete", room, *SMALL, "--out", first, "--quiet") == 0
+    splat = ("--scene", first / "context.ply")
+    assert run(monkeypatch, "complete", room, *SMALL, *splat, "--out", out) == 0
+    log = capfd.readouterr().err
+    shares = [int(n) for n in re.findall(r"^target 1 of 1: \w+: (\d+)%", log, re.MULTILINE)]
+    assert len(set(shares)) > 3
+    assert shares == sorted(shares)
+    assert shares[0] > 0
+
+
 def test_a_library_call_says_nothing(capfd):
     work_at_target()
     assert track([1, 2], "numbers") == [1, 2]
@@ -213,9 +258,6 @@ def test_times_in_words():
         "2 min 5 s",
         "1 h 20 min",
     ]
-
-
-SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "--far", 20)
 
 
 def test_a_completion_names_the_stages_of_the_paper(room, tmp_path, monkeypatch, capfd):

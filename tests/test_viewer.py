@@ -6,6 +6,7 @@ import http.client
 import io
 import json
 import re
+import shutil
 import tarfile
 import threading
 from collections.abc import Iterator
@@ -45,6 +46,7 @@ from gscompleter.viewer.packages import (
 )
 from gscompleter.viewer.page import Page, make_page
 from gscompleter.viewer.server import serving
+from pose_files import CAMERAS, NAMES, write_colmap_binary, write_photographs
 from scenes import camera_at
 from viewer_pages import LEFT, SIDE, TARGET, room_exhibit, room_from
 
@@ -354,6 +356,30 @@ def test_photographs_of_a_completion_are_jumped_to(tmp_path):
     assert exhibit.remarks == ()
 
 
+def completion_of_photographs_in(folder: Path) -> Path:
+    """An output folder of `complete` for photographs without cameras, which lies elsewhere now."""
+    completion_in(folder, np.eye(4), np.zeros(3))
+    summary = json.loads((folder / "summary.json").read_text())
+    summary["scene"] = {"format": "photographs"}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    write_photographs(folder / "colmap" / "images")
+    write_colmap_binary(folder / "colmap" / "sparse" / "0")
+    return folder
+
+
+def test_photographs_whose_cameras_were_found_are_jumped_to(tmp_path):
+    folder = completion_of_photographs_in(tmp_path / "out")
+    exhibit = exhibit_of_completion(folder, False)
+    assert [shot.name for shot in exhibit.shots] == ["target-1", "photograph-0"]
+    assert exhibit.shots[1].thumbnail is not None
+    assert (exhibit.shots[1].camera.c2w - CAMERAS[0].c2w).abs().max() < 1e-5
+    assert exhibit.remarks == ()
+
+    shutil.rmtree(folder / "colmap")
+    (remark,) = exhibit_of_completion(folder, False).remarks
+    assert str(folder / "colmap") in remark
+
+
 def test_a_folder_that_is_no_completion_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"has no completed\.ply"):
         exhibit_of_completion(tmp_path, False)
@@ -405,6 +431,17 @@ def test_cameras_bring_their_photographs_as_thumbnails(packed, tmp_path, monkeyp
     ]
     assert shots[0]["thumbnail"] is not None
     assert shots[1]["thumbnail"] is None
+
+
+def test_cameras_of_a_colmap_folder_are_jumped_to(packed, tmp_path, monkeypatch):
+    folder, page = completion_of_photographs_in(tmp_path / "out"), tmp_path / "page.html"
+    (folder / "colmap" / "images" / NAMES[1]).unlink()
+    cameras = ("--cameras", folder / "colmap")
+    assert run(monkeypatch, "view", folder, *cameras, "--save", page) == 0
+    shots = content_of(Page(page.read_bytes(), {}, 0))["shots"]
+    found = [shot for shot in shots if shot["name"].startswith("camera-")]
+    assert [shot["title"] for shot in found] == NAMES
+    assert [shot["thumbnail"] is None for shot in found] == [False, True, False, False, False]
 
 
 def header_only(path: Path) -> None:

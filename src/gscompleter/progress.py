@@ -75,6 +75,8 @@ class Work:
     going: list[Activity] = field(default_factory=list)
     expected: Sequence[tuple[str, float]] = ()
     """Stages in their order, and the seconds that each is expected to take."""
+    is_timed: bool = True
+    """Whether these are seconds, or tell only how the stages share the time."""
     position: int = 0
     """How many of these are behind."""
     planned: Activity | None = None
@@ -86,8 +88,9 @@ class Work:
     reached: float = 0.0
     """The largest share of what is expected that was told to be done: it never goes back."""
 
-    def expect(self, expected: Sequence[tuple[str, float]]) -> None:
+    def expect(self, expected: Sequence[tuple[str, float]], is_timed: bool = True) -> None:
         """From now on, these stages are expected."""
+        self.is_timed = is_timed
         self.expected, self.position, self.planned = expected, 0, None
         self.begun, self.pace, self.reached = time.monotonic(), 1.0, 0.0
 
@@ -119,7 +122,7 @@ class Work:
 
     def counted(self) -> Activity | None:
         """The outermost of what goes on whose steps are counted."""
-        return next((a for a in self.going if a.total is not None), None)
+        return outermost_counted(self.going)
 
     def spent(self) -> float:
         """Seconds since it began: what was expected, or else the outermost of what goes on."""
@@ -129,7 +132,7 @@ class Work:
     def left(self) -> float | None:
         """About how many seconds all of it still takes; None where nothing tells."""
         now = time.monotonic()
-        if not self.expected:
+        if not (self.expected and self.is_timed):
             counted = self.counted()
             return None if counted is None else counted.left(now)
         ahead = [self.pace * seconds for _, seconds in self.expected[self.position :]]
@@ -139,12 +142,24 @@ class Work:
 
     def share(self) -> float | None:
         """How much of it is done, from 0 to 1; None where nothing tells."""
-        if self.expected:
+        if not self.expected:
+            return counted_share(self.going)
+        if self.is_timed:
             spent, left = self.spent(), self.left() or 0.0
-            self.reached = max(self.reached, spent / max(spent + left, 1e-9))
-            return self.reached
-        counted = self.counted()
-        return None if counted is None else counted.done / max(counted.total or 0, 1)
+            share = spent / max(spent + left, 1e-9)
+        else:
+            share = self.share_of_stages()
+        self.reached = max(self.reached, share)
+        return self.reached
+
+    def share_of_stages(self) -> float:
+        """Return the share of the expected stages that is done, counted steps inside included."""
+        seconds = [seconds for _, seconds in self.expected]
+        done = sum(seconds[: self.position])
+        if self.planned is not None:
+            inside = self.going[self.going.index(self.planned) :]
+            done += seconds[self.position] * (counted_share(inside) or 0.0)
+        return done / max(sum(seconds), 1e-9)
 
     def sentence(self) -> str:
         """All of this in a line."""
@@ -155,6 +170,17 @@ class Work:
             *([] if left is None else [f"about {in_words(left)} left"]),
         ]
         return ": ".join([self.description(), *([", ".join(told)] if told else [])])
+
+
+def outermost_counted(activities: Sequence[Activity]) -> Activity | None:
+    """Return the outermost of `activities` whose steps are counted; None where there is none."""
+    return next((a for a in activities if a.total is not None), None)
+
+
+def counted_share(activities: Sequence[Activity]) -> float | None:
+    """Return the share of its steps that this one has done; None where there is none."""
+    counted = outermost_counted(activities)
+    return None if counted is None else counted.done / max(counted.total or 0, 1)
 
 
 @runtime_checkable
@@ -350,17 +376,19 @@ def counted(items: Sequence[T], description: str, shown: Shown) -> Iterator[T]:
 
 
 @contextmanager
-def expecting(seconds: Sequence[tuple[str, float]]) -> Iterator[None]:
-    """Tell by the stages that are to come how long all of them take.
+def expecting(seconds: Sequence[tuple[str, float]], is_timed: bool = True) -> Iterator[None]:
+    """Tell by the stages that are to come how much is done, and how long all of them take.
 
     Args:
         seconds: By their names, the stages or counted steps that follow inside, in their order,
             and about how many seconds each takes; one that is left out takes none. Once some are
             over, the others are taken to be as much faster or slower. Empty where nothing tells.
+        is_timed: Whether these are seconds. Else only their ratios count, for the share that is
+            done, and how long it takes is told by counted steps alone.
     """
     shown = _shown.get()
     if shown is not None:
-        shown.work.expect(seconds)
+        shown.work.expect(seconds, is_timed)
     try:
         yield
     finally:

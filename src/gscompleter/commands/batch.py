@@ -55,6 +55,15 @@ class Counts:
     """Of those that have a row now, how many say why they came to nothing."""
     skipped: int
     """Had a row before."""
+    skipped_failed: int = 0
+    """Of those, how many say that they came to nothing."""
+
+    def sentence(self) -> str:
+        """Say all of it, and how to do again what failed before."""
+        before = f"there before {self.skipped}"
+        if self.skipped_failed:
+            before += f", {self.skipped_failed} of them failed (--again failures does these again)"
+        return f"Done {self.done}, failed {self.failed}, {before}."
 
 
 def run_batch(options: BatchOptions) -> None:
@@ -80,6 +89,8 @@ def run_batch(options: BatchOptions) -> None:
             claim_folder(place)
             share = jobs[number::count]
             left = missing(share, place, options.again == "failures")
+            names = {job.name for job in left}
+            failed_before = count_failed(place, [job for job in share if job.name not in names])
         rounds = Rounds(place, BatchRows(place), left, options.retries)
         perform = CompletingJob(absolute(options.out), options.retries)
         failed = sum(
@@ -88,9 +99,17 @@ def run_batch(options: BatchOptions) -> None:
         )
         with preparing("table"):
             show(place, jobs)
-    counts = Counts(len(left) - failed, failed, len(share) - len(left))
-    told = f"Done {counts.done}, failed {counts.failed}, there before {counts.skipped}."
-    console.print(f"{told} All results: {options.out}/index.html", markup=False, soft_wrap=True)
+    counts = Counts(len(left) - failed, failed, len(share) - len(left), failed_before)
+    told = f"{counts.sentence()} All results: {options.out}/index.html"
+    console.print(told, markup=False, soft_wrap=True)
+
+
+def count_failed(place: Place, jobs: Iterable[Job]) -> int:
+    """Count the jobs whose row says that they came to nothing."""
+    from gscompleter.batch.jobs import read_row
+
+    rows = (read_row(place, job.name) for job in jobs)
+    return sum(row is not None and row["state"] == "failed" for row in rows)
 
 
 def absolute(out: str) -> str:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.expected import expected
+from gscompleter.commands.expected import expecting_completion
 from gscompleter.commands.exploring import (
     cameras_of,
     completed,
@@ -36,6 +37,7 @@ from gscompleter.commands.opening import (
 from gscompleter.commands.options import CompleteOptions, most
 from gscompleter.commands.output import (
     opened_as,
+    read_held_out,
     replaceable,
     saying_what_stays,
     settings_of,
@@ -50,7 +52,7 @@ from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, output_folder
 from gscompleter.io.video import check_writer
 from gscompleter.kernels.sharing import meanwhile
-from gscompleter.progress import expecting, preparing, shown_on, stage
+from gscompleter.progress import preparing, shown_on, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.render.proxy import WORTH
@@ -91,7 +93,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         opened, task, explorer, before = prepared(options, console)
         say(console, *understood(options, opened, task))
         cameras = cameras_of(options, opened, task)
-        expectation = expecting(expected(options, task, task.views[0].image.device.type))
+        expectation = expecting_completion(options, task, task.views[0].image.device.type)
         with output_folder(options.out, replaceable(options)) as folder, expectation:
             completion, task = completed(options, task, cameras, explorer)
             completion = replace(completion, seconds=total(completion.seconds, before))
@@ -137,6 +139,7 @@ def write_done(
             said,
             task.brought,
             lambda: Around(tuple(looks()), cameras),
+            read_held_out(options, done.opened, task, done.cameras),
         )
     write_page(folder, completion_page(folder))
     return summary
@@ -297,6 +300,15 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         f"{100 * covered['after']:.1f} % is now.",
         soft_wrap=True,
     )
+    unused = summary["held_out"]
+    if unused:
+        before = fmean(row["psnr_before"] for row in unused)
+        after = fmean(row["psnr_after"] for row in unused)
+        console.print(
+            f"At photographs that were not used ({len(unused)} scored) the mean PSNR was "
+            f"{before:.2f} dB before, and is {after:.2f} dB now.",
+            soft_wrap=True,
+        )
     counts = summary["gaussians"]
     seconds = summary["seconds"]["total"]
     console.print(

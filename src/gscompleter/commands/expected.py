@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from contextlib import AbstractContextManager
 
 from gscompleter.commands.exploring import LIFTED_VIEWS
 from gscompleter.commands.opening import Task
 from gscompleter.commands.options import CompleteOptions, most
 from gscompleter.commands.understood import SECONDS_PER_PIXEL
-from gscompleter.reports.film import FRAMES, MAX_SIDE
+from gscompleter.progress import expecting
+from gscompleter.reports.film import FRAMES, MAX_SIDE, MIN_WIDTH
 from gscompleter.types import View
 
 FINDING = 1.0
@@ -22,18 +23,39 @@ FILM_PER_PIXEL = 1.2e-6
 """Seconds that a frame of the film takes for each pixel of one of its halves."""
 
 
-def expected(options: CompleteOptions, task: Task, device: str) -> Sequence[tuple[str, float]]:
-    """By the names that they are shown by, what comes after the scene is opened, in seconds; empty
-    where it was not measured: with other models, on a GPU, or with a scene that was brought."""
+CONTEXT = "context", 2.0
+STAGES = ("generate", 1.0), ("lift", 1.0), ("register", 1.0), ("integrate", 2.0)
+"""Stages of a target and how they share its time about, where nothing was measured. What sees the
+context comes first, once for all of them and for each; report and film take as long."""
+
+
+def expecting_completion(
+    options: CompleteOptions, task: Task, device: str
+) -> AbstractContextManager[None]:
+    """Show inside how much of a completion is done, and how long it takes where that was measured:
+    neither with other models, nor on a GPU, nor with a scene that was given."""
     embedded = options.reconstructor == "plane-sweep" and options.synthesis.name == "warp-inpaint"
-    if task.scene is not None or not embedded or device != "cpu":
-        return ()
+    if task.scene is None and embedded and device == "cpu":
+        return expecting(timed_stages(options, task))
+    return expecting(stages_in_order(options, task), is_timed=False)
+
+
+def stages_in_order(options: CompleteOptions, task: Task) -> list[tuple[str, float]]:
+    """List what comes after the scene is opened, by the names that it is shown by, with its part of
+    the time."""
+    count = len(task.targets) or most(options)
+    ends = [("report", CONTEXT[1]), *([("film", CONTEXT[1])] if options.film else [])]
+    return [CONTEXT, *((CONTEXT, *STAGES) * count), *ends]
+
+
+def timed_stages(options: CompleteOptions, task: Task) -> list[tuple[str, float]]:
+    """List what comes after the scene is opened, by the names that it is shown by, in seconds."""
     count = len(task.targets) or most(options)
     context = SECONDS_PER_PIXEL * sum(pixels(view) for view in task.views)
     each = LIFTED_VIEWS * context / len(task.views) + (0 if task.targets else FINDING)
     pixel = pixels(task.views[0])
     report = REPORT + REPORT_PER_PIXEL * pixel * (len(task.views) + count)
-    film = FILM_PER_PIXEL * min(pixel, MAX_SIDE**2) * FRAMES
+    film = FILM_PER_PIXEL * max(min(pixel, MAX_SIDE**2), (MIN_WIDTH // 2) ** 2) * FRAMES
     stages = [("context", context), ("target", count * each), ("report", report)]
     return [*stages, ("film", film)] if options.film else stages
 

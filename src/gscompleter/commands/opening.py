@@ -17,14 +17,14 @@ from torch import Tensor
 
 from gscompleter.commands.options import CompleteOptions, SceneOptions, most, working_size
 from gscompleter.completer import ranged
-from gscompleter.data.formats import open_photographs, recognised
+from gscompleter.data.formats import open_photographs, recognised, refuse_scenes_below
 from gscompleter.data.framing import Resolution
 from gscompleter.data.origin import frame_from_photographs, origin_of, told_from
 from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sparse_points import with_depth_range
-from gscompleter.data.structure_from_motion import find_poses, holds_photographs
+from gscompleter.data.structure_from_motion import POSES, find_poses, holds_photographs
 from gscompleter.errors import InputError, quoted
 from gscompleter.frames.beside import GivenSplat
 from gscompleter.frames.placing import frame_of_splat
@@ -41,6 +41,7 @@ from gscompleter.memory import (
 )
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.reports.completion import Brought, Target
+from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import format_of
 from gscompleter.stages.candidates import spread_cameras
 from gscompleter.stages.context import working_range
@@ -50,8 +51,8 @@ from gscompleter.types import Camera, Gaussians, View
 
 MIN_SIZE = 16
 """Shorter side of an image, in pixels, under which there is nothing to match and to score."""
-POSES = "colmap"
-"""The folder of the output with the cameras that were found."""
+SPLATS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
+"""Endings of files of Gaussians."""
 MAX_DIGITS = 9
 """Characters of the longest number of a frame."""
 CHOSEN, CHOSEN_WITH_SCENE = 3, 8
@@ -131,8 +132,10 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
             lie beside the photographs.
     """
     folder, poses, number = options.folder, options.out / POSES, None
+    refuse_splat(folder)
     if options.format is None and holds_photographs(folder) and recognised(folder) is None:
         refuse_other_exports(folder)
+        refuse_scenes_below(folder)
         ours = options.overwrite or os.path.isfile(poses / SUMMARY)
         found = find_poses(folder, poses, overwrite=ours)
         say(console, *found.notes)
@@ -143,6 +146,19 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     if number is None:
         return Opened(given, given.format, len(given))
     return Opened(given, "photographs", number)
+
+
+def refuse_splat(path: Path) -> None:
+    """Refuse a file of Gaussians where photographs are needed.
+
+    Raises:
+        InputError: where `path` has the ending of such a file.
+    """
+    if not os.path.isdir(path) and path.name.lower().endswith(SPLATS):
+        raise InputError(
+            f"{quoted(str(path), 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
+            "be the folder of its photographs, with or without cameras."
+        )
 
 
 def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
@@ -400,11 +416,27 @@ def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
     for word in options.target:
         frame = frame_number(word)
         if frame is None:
+            check_target_file(word, given)
             cameras = load_cameras(word, resolution, origin=given.origin.tolist())
             targets += [Target(camera) for camera in cameras]
         else:
             targets.append(Target(given.camera(frame, resolution), frame))
     return targets
+
+
+def check_target_file(word: str, given: Photographs) -> None:
+    """Refuse a target that is neither the number of a frame nor a file.
+
+    Raises:
+        InputError: where nothing lies at the path `word`.
+    """
+    if not os.path.exists(word):
+        raise InputError(
+            f"'{quoted(word, 60)}' is no target: a target is the number of a frame, from 0 to "
+            f"{len(given) - 1}, or a file of cameras (transforms.json, cameras.json, COLMAP's "
+            "images.txt, SuperSplat's poses), and there is no such file.",
+            "target",
+        )
 
 
 def with_planes(camera: Camera, photographs: Photographs) -> Camera:

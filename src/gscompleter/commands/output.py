@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gscompleter.commands.opening import POSES, Opened, Task
-from gscompleter.commands.options import SceneOptions
+from gscompleter.commands.opening import Opened, Task, closest
+from gscompleter.commands.options import SceneOptions, working_size
 from gscompleter.config import CompleterConfig
 from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.data.structure_from_motion import POSES
+from gscompleter.errors import InputError
 from gscompleter.io.files import SUMMARY
+from gscompleter.reports.completion import HeldOut
+from gscompleter.types import Camera, View
+
+MAX_HELD_OUT = 8
+"""Photographs that were not used whose scores are told: each is drawn twice, like a target."""
 
 
 def opened_as(options: SceneOptions, opened: Opened, task: Task) -> dict[str, Any]:
@@ -55,6 +62,31 @@ def settings_of(
         "far": options.far,
         "config": asdict(config),
     }
+
+
+def read_held_out(
+    options: SceneOptions, opened: Opened, task: Task, cameras: Mapping[int, Camera]
+) -> list[HeldOut]:
+    """Read the photographs that are neither of the context nor of a target: at most `MAX_HELD_OUT`,
+    those closest to the targets, or to the context where there is none; none that is damaged.
+
+    Args:
+        options: What was asked for.
+        opened: Where the photographs lie.
+        task: What was completed.
+        cameras: Those of all photographs that can be used, in the frame of the result.
+    """
+    taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
+    others = {frame: camera for frame, camera in cameras.items() if frame not in taken}
+    wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
+    checks = {view.frame for view in task.witnesses or ()}
+    held_out, device = list[HeldOut](), task.views[0].image.device
+    for frame in closest([camera.to(device) for camera in wanted], others, MAX_HELD_OUT):
+        with suppress(InputError):
+            (view,) = opened.photographs.views([frame], working_size(options.resolution))
+            view = View(view.image.to(device), others[frame], frame)
+            held_out.append(HeldOut(view, frame in checks))
+    return held_out
 
 
 def replaceable(options: SceneOptions) -> bool:

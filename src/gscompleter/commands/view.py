@@ -30,8 +30,8 @@ class ViewOptions(Settings):
     generated."""
     cameras: Path | None = None
     """Cameras to jump to: a file of cameras, as `complete --target` takes it, or a folder with a
-    transforms.json. They are in the frame of the photographs where A is an OUT, and else in that of
-    A."""
+    transforms.json or a COLMAP model. They are in the frame of the photographs where A is an OUT,
+    and else in that of A."""
     resolution: tuple[int, int] | None = None
     """Height and width of the images of cameras whose file does not tell them."""
     save: Path | None = None

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from contextlib import redirect_stderr
+import re
+from collections.abc import Callable, Collection, Sequence
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import partial
 from io import StringIO
 from itertools import dropwhile, takewhile
 from typing import Any
@@ -16,6 +19,9 @@ from gscompleter.commands.generator_options import generator_flags
 from gscompleter.commands.options import FOUND
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.errors import InputError, quoted
+
+NEAR = 0.75
+"""Likeness from which on an option is near enough to be named, from 0 to 1."""
 
 
 def sentence_of(error: InputError) -> str:
@@ -33,22 +39,69 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
         SystemExit: where they ask for help, which is printed.
     """
     check_once(words)
-    said = StringIO()
+    check_command(words, names)
+    said, config = StringIO(), CompleterConfig()
+    read = partial(
+        tyro.cli,
+        command,
+        prog="gscompleter",
+        description="Complete 3D Gaussian Splatting scenes: generate, then register.",
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
     try:
         with redirect_stderr(said):
             config, words = config_named(auto_counted(words))
-            return tyro.cli(
-                command,
-                prog="gscompleter",
-                description="Complete 3D Gaussian Splatting scenes: generate, then register.",
-                args=words,
-                config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-                registry=registry_from(config),
-            )
+            return read(args=words, registry=registry_from(config))
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise InputError(unboxed(said.getvalue(), words, names)) from None
+        options = options_in(lambda words: read(args=words, registry=registry_from(config)), words)
+        told = misspelt(words, options, names) or unboxed(said.getvalue(), words, names)
+        raise InputError(told) from None
+
+
+def check_command(words: Sequence[str], names: Collection[str]) -> None:
+    """Refuse a command that does not exist, and name the nearest one.
+
+    Raises:
+        InputError: where the first of `words` is like one of `names`, but none of them.
+    """
+    near = get_close_matches(words[0], names, 1) if words else []
+    if near and words[0] not in names:
+        raise InputError(
+            f"There is no command {quoted(words[0])}; the nearest is {near[0]} (see gscompleter "
+            "--help)."
+        )
+
+
+def options_in(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> list[str]:
+    """List the options that the help of the command in `words` begins its lines with, or those that
+    stand without one."""
+    if not words or words[0].startswith("--"):
+        return ["--help", "--version"]
+    help_text = StringIO()
+    with redirect_stdout(help_text), suppress(SystemExit):
+        read([*words[:1], "--help"])
+    return re.findall(r"^[ │]*(?:-h, )?(--[a-z][\w.-]*)", help_text.getvalue(), re.MULTILINE)
+
+
+def misspelt(words: Sequence[str], options: Sequence[str], names: Collection[str]) -> str | None:
+    """Name the option that is nearest to one that does not exist; None where there is none."""
+    given = [word.split("=")[0] for word in words if word.startswith("--")]
+    for word in given:
+        near = get_close_matches(word.replace("_", "-"), options, 1, NEAR)
+        if near and near[0] != word.replace("_", "-"):
+            command = command_in(words, names)
+            return (
+                f"There is no option {quoted(word)}; the nearest is {near[0]} (see {command} "
+                "--help)."
+            )
+    return None
+
+
+def command_in(words: Sequence[str], names: Collection[str]) -> str:
+    """Return what one types to call the command that `words` name, if any."""
+    return " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
 
 
 def check_once(words: Sequence[str]) -> None:
@@ -117,5 +170,5 @@ def unboxed(box: str, words: Sequence[str], names: Collection[str]) -> str:
     sentence = " ".join(line.strip() for line in said if not line.startswith(" " * 5))
     usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
     needed = "" if usage is None else f"; give {lines[usage].strip()}"
-    command = " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
+    command = command_in(words, names)
     return f"{quoted(sentence, 200).removesuffix('.')}{needed} (see {command} --help)."

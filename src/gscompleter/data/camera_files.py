@@ -6,7 +6,12 @@ import os
 from pathlib import Path
 
 from gscompleter.data.camera_list import read_camera_list
-from gscompleter.data.colmap.scene import is_image_file, read_image_file
+from gscompleter.data.colmap.scene import (
+    holds_colmap,
+    is_image_file,
+    read_cameras_of,
+    read_image_file,
+)
 from gscompleter.data.frame import Frame
 from gscompleter.data.framing import Resolution
 from gscompleter.data.other_exports import refuse_other_exports
@@ -20,8 +25,8 @@ def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
 
     Args:
         path: A JSON file of the form of nerfstudio's `transforms.json`, of Inria's `cameras.json`
-            or of SuperSplat's poses, a folder with a `transforms.json`, or the images.txt or
-            images.bin of a COLMAP model.
+            or of SuperSplat's poses, a folder with a `transforms.json` or a COLMAP model, or the
+            images.txt or images.bin of such a model.
         resolution: Of images whose size the file does not tell: their height and width in pixels.
 
     Raises:
@@ -30,7 +35,8 @@ def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
     if is_image_file(path):
         return read_image_file(path)
     if os.path.isdir(path):
-        return read_frames(path / NAME)
+        is_colmap = not os.path.isfile(path / NAME) and holds_colmap(path)
+        return read_cameras_of(path) if is_colmap else read_frames(path / NAME)
     refuse_other_exports(path)
     content = read_json(path, "name a file of cameras")
     if is_supersplat(content):

@@ -6,7 +6,7 @@ A format is a file of this package and a line in `FORMATS`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
@@ -16,6 +16,7 @@ from gscompleter.data.camera_list import holds_camera_list, open_camera_list
 from gscompleter.data.chunks import holds_chunks, open_chunks
 from gscompleter.data.colmap.scene import holds_colmap, open_colmap
 from gscompleter.data.dgp import holds_dgp, open_dgp
+from gscompleter.data.image_folders import FOLDERS
 from gscompleter.data.kitti import holds_kitti, open_kitti
 from gscompleter.data.kitti_raw import holds_kitti_raw, open_kitti_raw
 from gscompleter.data.limits import check_planes
@@ -25,6 +26,7 @@ from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.pandaset import holds_pandaset, open_pandaset
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import holds_camera_files, open_camera_files
+from gscompleter.data.structure_from_motion import ENDINGS, is_own
 from gscompleter.data.transforms import holds_transforms, open_transforms
 from gscompleter.data.waymo import holds_waymo, open_waymo
 from gscompleter.errors import InputError, quoted
@@ -34,8 +36,6 @@ from gscompleter.errors import InputError, quoted
 class Format:
     """A layout of posed photographs on disk."""
 
-    layout: str
-    """What a file or folder of it is, for error messages."""
     holds: Callable[[Path], bool]
     """Whether a file or folder is of it, by names and first bytes."""
     open: Callable[[Path], Iterable[Photographs]]
@@ -44,48 +44,24 @@ class Format:
     """What the coordinates are in, where the format says."""
 
 
+SCENE_DEPTH = 2
+"""How far below a folder scenes are looked for, for an error message that names them."""
+MAX_NAMED = 4
+"""Scenes that it names."""
+
 FORMATS = {
-    "chunks": Format(
-        "chunks of pixelSplat (a .torch file, a folder of them, or one with an index.json in it or "
-        "in its folder test)",
-        holds_chunks,
-        open_chunks,
-    ),
-    "dgp": Format("a scene file of DGP or DDAD beside its calibration", holds_dgp, open_dgp, "m"),
-    "nerfstudio": Format(
-        "a folder with nerfstudio's transforms.json", holds_transforms, open_transforms
-    ),
-    "colmap": Format(
-        "a folder with photographs and a COLMAP model (sparse/0, as .bin or .txt)",
-        holds_colmap,
-        open_colmap,
-    ),
-    "cameras-json": Format(
-        "a cameras.json of a 3DGS trainer beside its photographs",
-        holds_camera_list,
-        open_camera_list,
-    ),
-    "llff": Format("a folder with LLFF's poses_bounds.npy", holds_llff, open_llff),
-    "kitti": Format("a sequence of KITTI odometry", holds_kitti, open_kitti, "m"),
-    "kitti-raw": Format(
-        "a drive of raw KITTI (with oxts and image_02)", holds_kitti_raw, open_kitti_raw, "m"
-    ),
-    "pandaset": Format("a sequence of PandaSet", holds_pandaset, open_pandaset, "m"),
-    "mmdet3d": Format(
-        "infos of mmdetection3d for nuScenes or Waymo (.pkl)", holds_infos, open_infos, "m"
-    ),
-    "waymo": Format(
-        "segments of the Waymo Open Dataset 2 (a folder with camera_image/SEGMENT.parquet, or that "
-        "file)",
-        holds_waymo,
-        open_waymo,
-        "m",
-    ),
-    "real-estate-10k": Format(
-        "RealEstate10K camera files (.txt, with the frames of each in the folder of its name)",
-        holds_camera_files,
-        open_camera_files,
-    ),
+    "chunks": Format(holds_chunks, open_chunks),
+    "dgp": Format(holds_dgp, open_dgp, "m"),
+    "nerfstudio": Format(holds_transforms, open_transforms),
+    "colmap": Format(holds_colmap, open_colmap),
+    "cameras-json": Format(holds_camera_list, open_camera_list),
+    "llff": Format(holds_llff, open_llff),
+    "kitti": Format(holds_kitti, open_kitti, "m"),
+    "kitti-raw": Format(holds_kitti_raw, open_kitti_raw, "m"),
+    "pandaset": Format(holds_pandaset, open_pandaset, "m"),
+    "mmdet3d": Format(holds_infos, open_infos, "m"),
+    "waymo": Format(holds_waymo, open_waymo, "m"),
+    "real-estate-10k": Format(holds_camera_files, open_camera_files),
 }
 """By the names that `open_photographs` takes, in the order in which they are tried."""
 
@@ -130,14 +106,57 @@ def format_of(path: Path, name: str | None = None) -> str:
             f"There is no format '{quoted(name)}'; choose one of {', '.join(FORMATS)}."
         )
     if not os.path.exists(path):
-        raise InputError(f"There is no {quoted(str(path))}; name {accepted()}.")
+        raise InputError(f"There is no {quoted(str(path))}; {accepted()}.")
     found = recognised(path) if name is None else name
     if found is None:
         refuse_other_exports(path)
-        raise InputError(
-            f"There are no posed photographs in {quoted(str(path))}; name {accepted()}."
-        )
+        refuse_scenes_below(path)
+        raise InputError(f"There are no posed photographs in {quoted(str(path))}; {accepted()}.")
     return found
+
+
+def refuse_scenes_below(path: Path) -> None:
+    """Refuse a folder without photographs of its own that has scenes in folders below it.
+
+    Raises:
+        InputError: where it has one with cameras, or several with a folder of photographs each; it
+            names them.
+    """
+    if not os.path.isdir(path) or _holds_own_photographs(path):
+        return
+    found = list(_scenes_below(path, lambda folder: recognised(folder) is not None))
+    if not found:
+        homes = list(_scenes_below(path, lambda folder: _holds_own_photographs(folder, False)))
+        found = homes if len(homes) > 1 else []
+    if not found:
+        return
+    names = ", ".join(quoted(str(one.relative_to(path)), 20) for one in found[:MAX_NAMED])
+    more = f" and {len(found) - MAX_NAMED} more" if len(found) > MAX_NAMED else ""
+    scenes = "one" if len(found) == 1 else f"{len(found)} scenes"
+    raise InputError(
+        f"{quoted(str(path), 50)} is no scene itself, but holds {scenes} below it: {names}{more}; "
+        f"name one of them, as in {quoted(str(found[0]), 60)}."
+    )
+
+
+def _holds_own_photographs(path: Path, files: bool = True) -> bool:
+    """Whether a folder has one for photographs in it, or with `files` photographs themselves."""
+    if any(os.path.isdir(path / name) for name in FOLDERS):
+        return True
+    return files and any(name.lower().endswith(ENDINGS) for name in os.listdir(path))
+
+
+def _scenes_below(
+    path: Path, is_scene: Callable[[Path], bool], depth: int = SCENE_DEPTH
+) -> Iterator[Path]:
+    """List the scenes at most `depth` folders below one, by their names; no results of ours."""
+    for folder in sorted(path.iterdir()):
+        if not folder.is_dir() or not is_own(folder):
+            continue
+        if is_scene(folder):
+            yield folder
+        elif depth > 1:
+            yield from _scenes_below(folder, is_scene, depth - 1)
 
 
 def recognised(path: Path) -> str | None:
@@ -146,6 +165,8 @@ def recognised(path: Path) -> str | None:
 
 
 def accepted() -> str:
-    """What can be opened, in words."""
-    *others, last = (format.layout for format in FORMATS.values())
-    return f"{', '.join(others)}, or {last}"
+    """Describe what can be opened, for error messages."""
+    return (
+        "name photographs with cameras, in one of these formats (docs/formats.md): "
+        f"{', '.join(FORMATS)}"
+    )

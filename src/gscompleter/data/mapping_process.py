@@ -49,6 +49,18 @@ MIN_FOR_CENTRE = 10
 """Photographs by one camera that its principal point can be told from."""
 MAX_OFF_CENTRE = 0.1
 """Distance of a believable principal point from the centre, in longer sides of the image."""
+FOV = 10.0, 150.0
+"""Smallest and largest plausible field of view along the longer side of an image, in degrees."""
+MAX_SHIFT = 0.5
+"""Largest plausible displacement of a corner of the image by the distortion of the lens, as a share
+of the distance from the centre."""
+HELD_FOVS = (75.0, 60.0, 90.0, 45.0)
+"""Fields of view along the longer side, in degrees, at which the focal length is held where COLMAP
+fails to find it, in the order in which they are tried."""
+MAX_ROUNDS = 4
+"""How often cameras are placed with a focal length held, each time at the value fitted before."""
+SETTLED = 0.02
+"""Relative change of a focal length under which it is not held at its new value again."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +76,10 @@ class Job:
     photographs: list[Upright]
     """In the order of their names."""
     threads: int
+    wanted: int
+    """Photographs that a model must have for the focal length not to be held at other values."""
+    min_points: int
+    """Points that it must have for that."""
 
     @property
     def database(self) -> Path:
@@ -96,7 +112,7 @@ def main() -> None:
     told = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     photographs = [Upright(**one) for one in told["photographs"]]
     images, work, model = (Path(told[name]) for name in ("images", "work", "model"))
-    job = Job(images, work, model, photographs, told["threads"])
+    job = Job(images, work, model, photographs, told["threads"], told["wanted"], told["min_points"])
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(SEED)
     find_features(job, teller)
@@ -178,26 +194,138 @@ def _batches(pairs: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
     return (pairs[i : i + BATCH] for i in range(0, len(pairs), BATCH))
 
 
+@dataclass(frozen=True)
+class Attempt:
+    """Models from one way of treating the focal length."""
+
+    models: list[Any]
+    """The largest first; they do not connect."""
+    was_held: bool = False
+    """Whether the focal length was held at first."""
+
+    @property
+    def quality(self) -> tuple[bool, int, int]:
+        """Sorts attempts: plausible lenses, then photographs, then points of the largest model."""
+        if not self.models:
+            return False, 0, 0
+        model = self.models[0]
+        return lens_defect(model) is None, model.num_reg_images(), model.num_points3D()
+
+
 def map_all(job: Job, teller: Teller) -> dict[str, Any]:
-    """Cameras and points from the matches. The largest model is written.
+    """Find cameras and points from the matches, and write the largest model.
 
     Returns:
         The `registered` photographs of it by the names of their copies, how many each of the
         `models` has, the largest first, its number of `points` and its mean reprojection `error`
-        in pixels.
+        in pixels, what is implausible of its lens (`defect`, None where nothing is), and the
+        `focal` length in pixels where it was held at first, else None.
     """
-    models = sorted(_models(job, teller), key=lambda model: -model.num_reg_images())
-    if not models:
+    attempt = select_attempt(job, teller)
+    if not attempt.models:
         return {"registered": [], "models": [], "points": 0, "error": 0.0}
-    largest_one = with_principal_points(models[0])
+    largest_one = with_principal_points(attempt.models[0])
     job.model.mkdir(parents=True)
     largest_one.write(job.model)
     return {
         "registered": sorted(largest_one.images[i].name for i in largest_one.reg_image_ids()),
-        "models": parts([set(model.reg_image_ids()) for model in models]),
+        "models": parts([set(model.reg_image_ids()) for model in attempt.models]),
         "points": largest_one.num_points3D(),
         "error": largest_one.compute_mean_reprojection_error(),
+        "defect": lens_defect(largest_one),
+        "focal": used_cameras(largest_one)[0].mean_focal_length() if attempt.was_held else None,
     }
+
+
+def select_attempt(job: Job, teller: Teller) -> Attempt:
+    """Return the first attempt with as much as is wanted, or else the best of all."""
+    best = Attempt([])
+    for attempt in attempts(job, teller):
+        best = max(best, attempt, key=lambda one: one.quality)
+        is_plausible, photographs, points = best.quality
+        if is_plausible and photographs >= job.wanted and points >= job.min_points:
+            break
+    return best
+
+
+def attempts(job: Job, teller: Teller) -> Iterator[Attempt]:
+    """Map with a free focal length, then with it held at each of the plausible values."""
+    yield Attempt(_models(job, teller))
+    for focals in focals_to_hold(job):
+        yield Attempt(map_held(job, teller, focals), was_held=True)
+
+
+def focals_to_hold(job: Job) -> list[dict[int, float]]:
+    """List focal lengths in pixels by the number of the camera: from EXIF, where all have one, then
+    those of `HELD_FOVS`."""
+    with pycolmap.Database.open(job.database) as database:
+        cameras = database.read_all_cameras()
+    told = {one.camera_id: one.focal_length for one in cameras if one.has_prior_focal_length}
+    sides = {one.camera_id: max(one.width, one.height) for one in cameras}
+    return [
+        *([told] if len(told) == len(cameras) else []),
+        *(
+            {number: side / 2 / math.tan(math.radians(fov / 2)) for number, side in sides.items()}
+            for fov in HELD_FOVS
+        ),
+    ]
+
+
+def map_held(job: Job, teller: Teller, focals: dict[int, float]) -> list[Any]:
+    """Map with the focal lengths held, fit them to the model, and map again until they settle.
+
+    With a wrong focal length the mapper still connects photographs that it fails to connect with
+    a free one, and all of them together tell what it is.
+    """
+    best = list[Any]()
+    for _ in range(MAX_ROUNDS):
+        hold(job, focals)
+        models = _models(job, teller, is_held=True)
+        if not models or (best and models[0].num_reg_images() < best[0].num_reg_images()):
+            break
+        best = [with_fitted_lenses(models[0], refine_extra_params=False), *models[1:]]
+        fitted = {one.camera_id: one.mean_focal_length() for one in used_cameras(best[0])}
+        if all(abs(fitted[n] / focals[n] - 1) < SETTLED for n in fitted):
+            break
+        focals = focals | fitted
+    return [with_fitted_lenses(best[0]), *best[1:]] if best else []
+
+
+def hold(job: Job, focals: dict[int, float]) -> None:
+    """Write focal lengths in pixels to the database, as known, and no distortion."""
+    with pycolmap.Database.open(job.database) as database:
+        for camera in database.read_all_cameras():
+            known = pycolmap.Camera.create_from_model_name(
+                camera.camera_id, LENS, focals[camera.camera_id], camera.width, camera.height
+            )
+            known.has_prior_focal_length = True
+            database.update_camera(known)
+
+
+def used_cameras(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
+    """List the cameras that took photographs of the model, that of most photographs first."""
+    numbers = Counter(model.images[i].camera_id for i in model.reg_image_ids())
+    return [model.cameras[number] for number, _ in numbers.most_common()]
+
+
+def lens_defect(model: pycolmap.Reconstruction) -> str | None:
+    """Describe the first lens of the model that no camera has; None where all are plausible."""
+    return next(filter(None, map(_defect_of, used_cameras(model))), None)
+
+
+def _defect_of(camera: pycolmap.Camera) -> str | None:
+    focal = camera.mean_focal_length()
+    if not (math.isfinite(focal) and focal > 0):
+        return f"a focal length of {focal:g} px"
+    fov = math.degrees(2 * math.atan(max(camera.width, camera.height) / 2 / focal))
+    corner = (camera.width**2 + camera.height**2) / 4 / focal**2
+    shift = camera.params[camera.extra_params_idxs()[0]] * corner
+    if FOV[0] <= fov <= FOV[1] and abs(shift) <= MAX_SHIFT:
+        return None
+    return (
+        f"a focal length of {focal:.0f} px ({fov:.0f}° across) and a distortion that moves corners "
+        f"by {100 * abs(shift):.0f} %"
+    )
 
 
 def parts(models: list[set[int]]) -> list[int]:
@@ -224,11 +352,18 @@ def with_principal_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruc
     numbers = Counter(model.images[i].camera_id for i in model.reg_image_ids())
     if min(numbers.values()) < MIN_FOR_CENTRE:
         return model
+    refined = with_fitted_lenses(model, refine_principal_point=True)
+    return refined if all(map(_is_centred, used_cameras(refined))) else model
+
+
+def with_fitted_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.Reconstruction:
+    """Adjust a copy of the model with the focal lengths free, and what `options` say besides;
+    return the model itself where that makes a lens implausible."""
     refined = deepcopy(model)
-    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
-    pycolmap.bundle_adjustment(refined, options)
+    adjustment = pycolmap.BundleAdjustmentOptions(print_summary=False, **options)
+    pycolmap.bundle_adjustment(refined, adjustment)
     refined.update_point_3d_errors()
-    return refined if all(map(_is_centred, (refined.cameras[n] for n in numbers))) else model
+    return refined if lens_defect(refined) is None else model
 
 
 def _is_centred(camera: pycolmap.Camera) -> bool:
@@ -237,25 +372,30 @@ def _is_centred(camera: pycolmap.Camera) -> bool:
     return bool(off <= MAX_OFF_CENTRE * max(camera.width, camera.height))
 
 
-def _models(job: Job, teller: Teller) -> list[Any]:
-    """All models; they do not connect."""
+def _models(job: Job, teller: Teller, is_held: bool = False) -> list[Any]:
+    """All models, the largest first; they do not connect."""
 
     def first_pair() -> None:
         teller.step()
         teller.step()
 
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=job.threads,
+        random_seed=SEED,
+        min_model_size=MIN_MODEL,
+        ba_refine_focal_length=not is_held,
+        ba_refine_extra_params=not is_held,
+    )
     with teller.phase("Placing cameras", len(job.photographs)):
         found = pycolmap.incremental_mapping(
             job.database,
             job.images,
             job.work,
-            pycolmap.IncrementalPipelineOptions(
-                num_threads=job.threads, random_seed=SEED, min_model_size=MIN_MODEL
-            ),
+            options,
             initial_image_pair_callback=first_pair,
             next_image_callback=teller.step,
         )
-    return list(found.values())
+    return sorted(found.values(), key=lambda model: -model.num_reg_images())
 
 
 if __name__ == "__main__":

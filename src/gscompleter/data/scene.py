@@ -91,8 +91,8 @@ def load_cameras(
 
     Args:
         path: A JSON file of the form of nerfstudio's `transforms.json`, of Inria's `cameras.json`
-            or of SuperSplat's poses, a folder with a `transforms.json`, or the images.txt or
-            images.bin of a COLMAP model.
+            or of SuperSplat's poses, a folder with a `transforms.json` or a COLMAP model, or the
+            images.txt or images.bin of such a model.
         resolution: As in `load_views`, and so `near` and `far`. SuperSplat's poses need height
             and width.
         origin: Where the coordinates of the scene are counted from, which is

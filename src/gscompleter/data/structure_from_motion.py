@@ -8,6 +8,7 @@ run need not find them again. COLMAP runs in a process of its own (`mapping_proc
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -30,10 +31,18 @@ from gscompleter.threads import threads
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Of photographs, in any case."""
-NO_PHOTOGRAPHS = (MASKS, *(f"images_{n}" for n in DOWNSCALED))
+NO_PHOTOGRAPHS = (MASKS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALED))
 """Folders beside those of photographs."""
+POSES = "colmap"
+"""The folder of a completion's output with the cameras that were found for it."""
 MIN_PHOTOGRAPHS = 3
 """With two, neither the focal length nor a wrong match can be told."""
+MIN_SHARE = 0.25
+"""Of the photographs: with fewer in the model it is a failure rather than a part of the scene."""
+WANTED_SHARE = 0.5
+"""With fewer, other focal lengths are tried."""
+MIN_POINTS = 30
+"""As many as COLMAP wants in common with a photograph before it places its camera."""
 MAX_THREADS = 4
 MAX_NAMED = 5
 """Photographs that a note names at most."""
@@ -54,6 +63,9 @@ class FoundPoses:
     """Points of the model."""
     error: float
     """Mean distance of a point to its features, in pixels of the copies."""
+    focal: float | None = None
+    """Focal length in pixels of the copies where it was held at first, because COLMAP failed with
+    a free one; else None."""
     reused: bool = False
     """Whether an earlier run had found them."""
 
@@ -63,9 +75,21 @@ class FoundPoses:
         return self.photographs - len(self.missing)
 
     @property
+    def is_too_little(self) -> bool:
+        """Whether so few photographs or points were placed that there is nothing to go on with."""
+        enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * self.photographs)
+        return self.registered < enough or self.points < MIN_POINTS
+
+    @property
     def notes(self) -> list[str]:
         """What the user should know, in sentences."""
         notes, place = [], ""
+        if self.focal is not None:
+            notes.append(
+                "COLMAP failed with a free focal length, so it was held at plausible values first: "
+                f"{self.registered} of {self.photographs} cameras were found so, and a focal "
+                f"length of {self.focal:.0f} px fits them."
+            )
         if len(self.models) > 1:
             *others, last = map(str, self.models)
             notes.append(
@@ -87,8 +111,9 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
     """Find the cameras of the `photographs` in a folder and write them to the folder `out`.
 
     Raises:
-        InputError: where there are too few photographs or one is damaged, no cameras are found,
-            pycolmap is not installed or gives up, or `out` cannot be written.
+        InputError: where there are too few photographs or one is damaged, too few cameras or points
+            are found or the lens is implausible, pycolmap is not installed or gives up, or `out`
+            cannot be written.
     """
     names = photographs_in(photographs)
     known = _fingerprint(photographs, names)
@@ -142,15 +167,15 @@ def _listed(folder: Path) -> list[str]:
     """All photographs below a folder that are the user's own."""
     found: list[Path] = []
     for home, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if _is_own(Path(home, name))]
+        folders[:] = [name for name in folders if is_own(Path(home, name))]
         shown = (Path(home, name) for name in files if not name.startswith("."))
         found += [path.relative_to(folder) for path in shown if path.suffix.lower() in ENDINGS]
     return sorted((path.as_posix() for path in found), key=in_order)
 
 
-def _is_own(folder: Path) -> bool:
-    """Whether photographs are looked for in a folder: not where it is hidden, holds masks or
-    smaller copies, or is a result of ours."""
+def is_own(folder: Path) -> bool:
+    """Whether photographs are looked for in a folder: not where it is hidden, holds masks, depth
+    maps or smaller copies, or is a result of ours."""
     if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
         return False
     return not os.path.isfile(folder / SUMMARY)
@@ -163,21 +188,23 @@ def _fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def _found_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
-    """What an earlier run found for these very photographs; None where none did."""
+    """What an earlier run found for these very photographs; None where none did, or too little."""
     if not os.path.isfile(out / SUMMARY) or not os.path.isdir(out / "sparse" / "0"):
         return None
     content = read_json(out / SUMMARY, "name another folder")
     if not isinstance(content, dict) or content.get("photographs") != known:
         return None
     found = content["found"]
-    return FoundPoses(
+    earlier = FoundPoses(
         found["photographs"],
         tuple(found["missing"]),
         tuple(found["models"]),
         found["points"],
         found["error"],
+        found.get("focal"),
         reused=True,
     )
+    return None if earlier.is_too_little else earlier
 
 
 def _find(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
@@ -189,13 +216,36 @@ def _find(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
     result = _mapped(copies, folder)
     if not result["registered"]:
         raise InputError(
-            f"COLMAP found no cameras for the {len(names)} photographs in {quoted(photographs)}; "
-            "add photographs of the same scene that overlap by two thirds and are sharp."
+            f"COLMAP found no cameras for the {len(names)} photographs in "
+            f"{quoted(str(photographs))}; add photographs of the same scene that overlap by "
+            "two thirds and are sharp."
         )
     registered = set(result["registered"])
-    missing = tuple(copy.source for copy in copies if copy.name not in registered)
-    return FoundPoses(
-        len(names), missing, tuple(result["models"]), result["points"], result["error"]
+    found = FoundPoses(
+        len(names),
+        tuple(copy.source for copy in copies if copy.name not in registered),
+        tuple(result["models"]),
+        result["points"],
+        result["error"],
+        result["focal"],
+    )
+    refuse_failure(photographs, found, result["defect"])
+    return found
+
+
+def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> None:
+    """Refuse a reconstruction with too little in it, or with a lens that no camera has.
+
+    Raises:
+        InputError: where it is such a one; `defect` describes the lens.
+    """
+    if not found.is_too_little and defect is None:
+        return
+    lens = "" if defect is None else f", {defect}"
+    raise InputError(
+        f"COLMAP placed {found.registered} of {found.photographs} photographs in "
+        f"{quoted(str(photographs), 40)}, with {found.points:,} points{lens}, which is too little "
+        "at any focal length; add sharp ones that overlap by two thirds, or name their cameras."
     )
 
 
@@ -208,6 +258,8 @@ def _mapped(copies: Sequence[Upright], folder: Path) -> dict[str, Any]:
             "model": str(folder / "sparse" / "0"),
             "photographs": [asdict(copy) for copy in copies],
             "threads": min(MAX_THREADS, threads()),
+            "wanted": math.ceil(WANTED_SHARE * len(copies)),
+            "min_points": MIN_POINTS,
         }
         (Path(work) / "job.json").write_text(json.dumps(job), encoding="utf-8")
         with (Path(work) / "complaints.txt").open("w+", errors="replace") as complaints:

@@ -21,7 +21,7 @@ from gscompleter.io.ply import save_ply
 from gscompleter.kernels.sharing import side_by_side
 from gscompleter.metrics.coverage import Look, coverage_of
 from gscompleter.metrics.image import psnr, ssim
-from gscompleter.render import Renderer
+from gscompleter.render import Renderer, each_view
 from gscompleter.reports.depth_picture import limits_of, write_depth
 from gscompleter.reports.record import Limits, most_changed, record_of, write_record
 from gscompleter.splats.layout import save_like
@@ -48,6 +48,16 @@ class Target:
     """What the camera took, where it took anything. No stage sees it but `oracle`."""
     near: int | None = None
     """Number of the frame that a camera was derived from, where it was found and not named."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A photograph that is neither of the context nor of a target: it only scores the result."""
+
+    view: View
+    """In the frame of the result."""
+    is_check: bool = False
+    """Whether it told, in a small copy, what of a given splat is supported."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +121,20 @@ def at_photographs(completion: Completion, completer: GSCompleter) -> list[Image
     after = contexts_of(completer.at(completion, views))
     seen = zip(completion.begun, after, views, strict=True)
     return [Images(first, last, view.image) for first, last, view in seen]
+
+
+def score_held_out(
+    completion: Completion, photographs: Sequence[HeldOut], renderer: Renderer
+) -> list[dict[str, Any]]:
+    """Score the context and the completed scene at photographs that were not used, for the
+    summary."""
+
+    def score(held_out: HeldOut) -> dict[str, Any]:
+        view = held_out.view
+        scores = compare(completion, view.camera, view.image, renderer).scores()
+        return {"frame": view.frame, **scores, "is_check": held_out.is_check}
+
+    return list(each_view(completion.added)(score, photographs))
 
 
 def summarize(
@@ -198,6 +222,7 @@ def write_report(
     said: Mapping[str, Any],
     brought: Brought | None = None,
     around: Callable[[], Around] = Around,
+    held_out: Sequence[HeldOut] = (),
 ) -> dict[str, Any]:
     """Write the three scenes, `images/`, `report.json` and `summary.json`; returns the summary.
 
@@ -209,6 +234,7 @@ def write_report(
         said: Settings, seed and device, for the summary.
         brought: Where the context comes from, if not from Ψ: `completed.ply` keeps its layout.
         around: Tells what surrounds it; asked once all else is drawn and written.
+        held_out: Photographs that were not used, for scores alone.
 
     Raises:
         InputError: where a file cannot be written.
@@ -219,6 +245,7 @@ def write_report(
         for target, result in zip(targets, completion.targets, strict=True)
     ]
     scores = side_by_side(Images.scores, [*context_images, *target_images])
+    unused = {"held_out": score_held_out(completion, held_out, completer.renderer)}
     write_scenes(folder, completion, brought)
     pictured = folder / "images"
     pictured.mkdir()
@@ -228,7 +255,8 @@ def write_report(
     shown = most_changed(surroundings.looks)
     write_looks(pictured, shown)
     write_record(folder, record_of(completion, limits, shown, surroundings.photographs))
-    summary = summarize(completion, targets, scores, {**said, **covered_by(surroundings)})
+    said = {**said, **covered_by(surroundings), **unused}
+    summary = summarize(completion, targets, scores, said)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     return summary
 

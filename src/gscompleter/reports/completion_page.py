@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from markupsafe import Markup
@@ -248,14 +249,25 @@ def cameras_caption(found: Finished) -> str:
 
 
 def score_tables(summary: Summary) -> list[Table]:
-    """The scores at the targets and at the photographs of the context."""
+    """The scores at the targets, at photographs that were not used and at those of the context."""
     targets = [score_row(f"{n}: {row.name}", row) for n, row in enumerate(summary.targets, start=1)]
     context = [score_row(f"photograph {row.frame}", row) for row in summary.context]
+    unused = [score_row(f"photograph {row.frame}", row) for row in summary.held_out]
+    if unused:
+        unused.append(score_row("mean", mean_of(summary.held_out)))
     tables = [
         Table("At the targets", SCORES, targets),
+        Table("At photographs that were not used", SCORES, unused),
         Table("At the photographs of the context", SCORES, context),
     ]
     return [table for table in tables if table.rows]
+
+
+def mean_of(rows: Sequence[Scores]) -> Scores:
+    """Average each score over the rows that have it."""
+    names = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
+    known = {name: [v for row in rows if (v := getattr(row, name)) is not None] for name in names}
+    return Scores(None, **{name: fmean(v) if v else None for name, v in known.items()})
 
 
 def score_row(name: str, row: Scores) -> list[str]:

@@ -6,6 +6,7 @@ back the same way, so that it may be shown again and again, and every picture is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from gscompleter.render import Renderer
 from gscompleter.reports.completion import compare
 from gscompleter.reports.film_path import path_through
 from gscompleter.reports.record import spread
-from gscompleter.stages.candidates import shrunk
+from gscompleter.stages.candidates import resized, shrunk
 from gscompleter.types import Camera, Completion
 
 NAME = "film.mp4"
@@ -38,9 +39,11 @@ MIN_LEG = 0.75
 MAX_TARGETS = 6
 """Targets that it goes through at most: the first ones."""
 MAX_SIDE = 640
-"""Pixels of the longer side of one half at most."""
+"""Pixels of the longer side of one half at most, where that is no narrower than `MIN_WIDTH`."""
 GAP = 4
 """Pixels between the halves."""
+MIN_WIDTH = 720
+"""Pixels of a row of the film at least, both halves and the gap together."""
 LABEL = 12
 """Pixels of the letters at least."""
 MAX_PHOTOGRAPHS = 200
@@ -76,8 +79,14 @@ def stops(completion: Completion) -> list[Camera]:
     targets = [result.target for result in results[:MAX_TARGETS]]
     photographs = [view.camera for view in completion.views]
     nearest = min(photographs, key=lambda camera: baseline_between(camera, targets[0]))
-    lens = even(shrunk(completion.ranged(targets[0]), MAX_SIDE))
+    lens = even(widened(shrunk(completion.ranged(targets[0]), MAX_SIDE)))
     return [replace(lens, c2w=camera.c2w.to(lens.c2w)) for camera in (nearest, *targets)]
+
+
+def widened(camera: Camera) -> Camera:
+    """Enlarge the image of a camera, if need be, so that two of them make a film."""
+    factor = max((MIN_WIDTH - GAP) / 2 / camera.width, 1.0)
+    return resized(camera, math.ceil(factor * camera.width), math.ceil(factor * camera.height))
 
 
 def even(camera: Camera) -> Camera:

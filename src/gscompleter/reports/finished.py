@@ -54,6 +54,14 @@ class ContextRow(Scores):
 
 
 @dataclass(frozen=True)
+class HeldOutRow(Scores):
+    """A photograph that was not used."""
+
+    is_check: bool = False
+    """Whether it told, in a small copy, what of a given splat is supported."""
+
+
+@dataclass(frozen=True)
 class TargetRow(Scores):
     """What came of a target."""
 
@@ -125,6 +133,7 @@ class Summary:
     targets: tuple[TargetRow, ...]
     gaussians: Mapping[str, int]
     seconds: Mapping[str, float] = field(default_factory=dict)
+    held_out: tuple[HeldOutRow, ...] = ()
 
 
 @dataclass(frozen=True)

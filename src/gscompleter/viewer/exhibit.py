@@ -17,6 +17,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.framing import Resolution
 from gscompleter.data.origin import frame_from_photographs
 from gscompleter.data.scene import load_cameras
+from gscompleter.data.structure_from_motion import POSES
 from gscompleter.errors import InputError, quoted
 from gscompleter.frames.similarity import moved_camera
 from gscompleter.io.files import COMPLETED, CONTEXT, SUMMARY, TARGETS
@@ -124,9 +125,9 @@ def exhibit_of_completion(folder: Path, drop_nonfinite: bool) -> Exhibit:
     place = place_of_completion(folder, summary)
     targets, remarks = target_shots(folder, summary, place), []
     try:
-        photographs = context_shots(summary, place)
+        photographs = context_shots(folder, summary, place)
     except InputError:
-        photographs, remarks = (), [_lost(summary)]
+        photographs, remarks = (), [_lost(source_of(folder, summary))]
     name = folder.resolve().name
     return Exhibit(name, after, before, (*targets, *photographs), tuple(remarks), place)
 
@@ -163,14 +164,14 @@ def target_shots(folder: Path, summary: Summary, place: Place) -> tuple[Shot, ..
     )
 
 
-def context_shots(summary: Summary, place: Place) -> tuple[Shot, ...]:
-    """The photographs that a completion began with.
+def context_shots(folder: Path, summary: Summary, place: Place) -> tuple[Shot, ...]:
+    """Show the photographs that the completion in `folder` began with.
 
     Raises:
         InputError: where they are no more where they were, or cannot be read.
     """
-    settings, rows = _part(summary, "settings"), summary.get("context")
-    photographs = open_photographs(str(settings.get("folder")), settings.get("format"))
+    rows, format = summary.get("context"), _part(summary, "settings").get("format")
+    photographs = open_photographs(source_of(folder, summary), format)
     transform = place.transform @ frame_from_photographs(place.origin - photographs.origin)
     frames = [row["frame"] for row in rows or () if isinstance(row, dict) and "frame" in row]
     return tuple(
@@ -182,6 +183,14 @@ def context_shots(summary: Summary, place: Place) -> tuple[Shot, ...]:
         )
         for number in frames
     )
+
+
+def source_of(folder: Path, summary: Summary) -> Path:
+    """Locate the posed photographs that the completion in `folder` began with: in that folder where
+    their cameras had to be found."""
+    if _part(summary, "scene").get("format") == "photographs":
+        return folder / POSES
+    return Path(str(_part(summary, "settings").get("folder")))
 
 
 def camera_shots(path: Path, resolution: Resolution, place: Place) -> tuple[Shot, ...]:
@@ -251,8 +260,7 @@ def thumbnail_of(path: Path) -> bytes | None:
     return jpeg_of(image, THUMBNAIL_QUALITY)
 
 
-def _lost(summary: Summary) -> str:
-    source = _part(summary, "settings").get("folder")
+def _lost(source: Path) -> str:
     return (
         f"The photographs that the completion began with are not shown: {quoted(source)} does not "
         "hold them any more; name their cameras to jump to them."

@@ -60,6 +60,22 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     if is_image_file(path):
         yield _scene(path.parent, path.parent, read_image_file(path), ())
         return
+    yield _scene(path, *_largest(path))
+
+
+def read_cameras_of(path: Path) -> list[Frame]:
+    """Read the cameras of a scene's largest model in its order, with photographs that are there.
+
+    Raises:
+        InputError: where there is no model or it is damaged.
+    """
+    model, frames, _ = _largest(path)
+    finder = _finder(_roots(path, model))
+    return [finder.placed(frame) for frame in frames]
+
+
+def _largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
+    """Find the model of a scene with most images: its folder, its frames, and notes on others."""
     models = _models(path)
     if not models:
         raise InputError(
@@ -68,8 +84,7 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
         )
     frames = [_frames_of(model) for model in models]
     best = max(range(len(models)), key=lambda number: len(frames[number]))
-    notes = _choice(models, [len(f) for f in frames], best)
-    yield _scene(path, models[best], frames[best], notes)
+    return models[best], frames[best], _choice(models, [len(f) for f in frames], best)
 
 
 def read_image_file(path: Path) -> list[Frame]:
@@ -147,13 +162,17 @@ def _scene(
     scene: Path, model: Path, frames: Sequence[Frame], notes: tuple[str, ...]
 ) -> Photographs:
     roots = _roots(scene, model)
-    # Beside a model with a lens, `images` may hold photographs that have lost theirs.
-    lens = any(root.name.casefold() == DISTORTED for root in roots)
-    finder = ImageFinder(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
+    finder = _finder(roots)
     there, missing = with_photographs([finder.placed(frame) for frame in frames], str(model))
     notes += missing + _turned(there[0])
     photographs = photographs_of(roots[-1].name, str(model), there)
     return replace(photographs, notes=notes, sparse=_points_of(model))
+
+
+def _finder(roots: Sequence[Path]) -> ImageFinder:
+    # Beside a model with a lens, `images` may hold photographs that have lost theirs.
+    lens = any(root.name.casefold() == DISTORTED for root in roots)
+    return ImageFinder(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
 
 
 def _roots(scene: Path, model: Path) -> list[Path]:
