@@ -129,6 +129,6 @@ def test_the_context_stays_as_it_is():
     with_check, without = beginning(0.12), beginning(None)
     assert torch.equal(with_check.context.means, without.context.means)
     assert torch.equal(with_check.context.sh, without.context.sh)
-    assert with_check.allowed_errors == without.allowed_errors
+    assert [b.limit for b in with_check.budgets[0]] == [b.limit for b in without.budgets[0]]
     assert all(view.contradicted is None for view in without.views)
     assert CompleterConfig.paper().contradiction.min_difference is None

@@ -19,7 +19,7 @@ from gscompleter.render import load_renderer
 from gscompleter.stages.context import init_context
 from gscompleter.stages.harm import do_no_harm, squared_error
 from gscompleter.stages.integration import refine_opacities
-from gscompleter.types import SceneContext, View, sh_from_rgb
+from gscompleter.types import ErrorBudget, SceneContext, View, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, photographed, reconstruction_of
 from scenes import view_of as photograph_of
 
@@ -70,7 +70,7 @@ def test_what_is_ignored_forbids_nothing():
     for photograph, kept in ((wrong, False), (replace(wrong, ignored=mask), True)):
         before = photograph.compared(frozen.context.image)
         allowed = 2 * squared_error(before, photograph.image).item() + 1e-3
-        mended = do_no_harm(added, [frozen], [photograph], [allowed])
+        mended = do_no_harm(added, [frozen], [[ErrorBudget(photograph, "mse", allowed)]])
         assert torch.equal(mended.opacities, added.opacities) == kept
 
 

@@ -31,7 +31,7 @@ from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
 from gscompleter.stages.setting_aside import not_needed
 from gscompleter.stages.stereo import corrected, stereo_among
 from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
-from gscompleter.types import Completion, SceneContext, merge, sh_from_rgb
+from gscompleter.types import Completion, ErrorBudget, SceneContext, merge, sh_from_rgb
 from scenes import (
     Room,
     camera_at,
@@ -164,11 +164,11 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     completion = completer(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
     assert len(completion.targets[0].added) > 0
     gained = []
-    for view, judge in zip(completion.photographs, completion.judges, strict=True):
+    for view, (seen, *_) in zip(completion.photographs, completion.budgets, strict=True):
         before, after = (RENDERER.render(g, view.camera) for g in (half, completion.scene))
         holes = before.alpha < 0.5
         assert holes.float().mean() > 0.05
-        assert torch.equal(judge.ignored, holes)
+        assert torch.equal(seen.view.ignored, holes)
         errors = [
             (render.image.clamp(0, 1) - view.image).square().mean(dim=-1)
             for render in (before, after)
@@ -178,8 +178,8 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     assert max(gained) > 0
 
 
-def test_what_is_added_is_drawn_only_where_photographs_count(monkeypatch):
-    """Not in their holes; and at the target, whose wider camera is asked last, in nothing else."""
+def test_what_is_added_is_drawn_only_where_it_counts(monkeypatch):
+    """All over the photographs; and at the target, whose wider camera is asked last, in holes."""
     asked, plan = [], CpuView.plan_appearance
 
     def noted(self, new, where):
@@ -190,9 +190,8 @@ def test_what_is_added_is_drawn_only_where_photographs_count(monkeypatch):
     half = SURFACES[SURFACES.means[:, 0] < 0.3]
     completion = knowing()(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
     *at_photographs, (at_target, holes) = asked
-    shares = sorted(where.float().mean().item() for _, where in at_photographs)
-    assert shares == sorted(judge.counted.float().mean().item() for judge in completion.judges)
-    assert shares[0] < 0.9
+    assert len(at_photographs) == len(completion.photographs)
+    assert all(where.all() for _, where in at_photographs)
     assert holes.float().mean() > 0.1
     assert (at_target.context.alpha < 0.5)[holes].float().mean() > 0.9
 
@@ -233,8 +232,7 @@ def test_what_is_added_is_fitted_to_all_photographs_at_once():
         view,
         holes,
         [RENDERER.freeze(SURFACES, v.camera).plan_appearance(new, v.counted) for v in VIEWS],
-        VIEWS,
-        allowed,
+        [ErrorBudget(v, "mse", error) for v, error in zip(VIEWS, allowed, strict=True)],
     )
     scene = merge([SURFACES, added])
     for photograph, error in zip(VIEWS, allowed, strict=True):

@@ -49,7 +49,7 @@ from gscompleter.stages.context import (
 from gscompleter.stages.contradiction import contradicted
 from gscompleter.stages.exploration import MAX_GAUSSIANS, overlap_of
 from gscompleter.stages.free_space import respect_free_space
-from gscompleter.stages.harm import do_no_harm, error_with_loss, squared_error
+from gscompleter.stages.harm import do_no_harm, error_budgets
 from gscompleter.stages.integration import hole_mask, keep_in_holes, refine_opacities
 from gscompleter.stages.kept_views import KeptViews
 from gscompleter.stages.reconciliation import reconcile
@@ -85,8 +85,6 @@ MAX_TARGETS = 255
 
 UNSEEN = 0.1
 """Share of what the target sees of a Gaussian, below which no photograph shows it."""
-ROUNDING = 1e-4
-"""Decibels that a photograph may lose where it may lose nothing."""
 MIN_COVER = 0.5
 """Pixels of a hole that a Gaussian has to cover to stand in the way."""
 
@@ -479,7 +477,7 @@ class GSCompleter:
     ) -> tuple[Gaussians, tuple[float, ...]]:
         """Stage 4: what joins the scene with the opacities it has there, and the losses."""
         completion, config = sight.completion, self.config
-        judges, allowed = completion.judges, completion.allowed_errors
+        budgets = completion.budgets
         frozen = self.at(completion, completion.photographs)
         if completion.evidence is None:
             nearest = nearest_views(reference.camera, completion.views)[: config.refine.num_views]
@@ -494,13 +492,14 @@ class GSCompleter:
         else:
             holes, degree = self.holes(sight), completion.context.sh_degree
             settings = config.reconcile.at_most(degree)
-            counted = [view.counted for view in judges]
+            counted = [view.counted for view in completion.photographs]
             plans = list(each_view(kept)(lambda v, c: v.plan_appearance(kept, c), frozen, counted))
+            observed = [first for first, *_ in budgets]
             refined, losses = reconcile(
-                kept, sight.frozen, reference, holes, plans, judges, allowed, settings
+                kept, sight.frozen, reference, holes, plans, observed, settings
             )
             drawings = [in_colours(plan, refined.sh) for plan in plans]
-        return do_no_harm(refined, frozen, judges, allowed, config.harm, drawings), losses
+        return do_no_harm(refined, frozen, budgets, config.harm, drawings), losses
 
     def sight(self, completion: Completion, target: Camera, wide: Camera | None = None) -> Sight:
         """The scene as it stands, frozen at the target's wider camera, and the target's anchor.
@@ -651,19 +650,20 @@ class GSCompleter:
 
     def judged(self, completion: Completion) -> Completion:
         """`completion` before any target, with what its photographs ask of whatever is added."""
-        tolerance = 0.0 if completion.evidence is not None else self.config.harm.tolerance or 0.0
+        config = self.config.harm
+        tolerance = 0.0 if completion.evidence is not None else config.tolerance or 0.0
         drawn = contexts_of(self.at(completion, completion.photographs))
-        loss = max(tolerance, ROUNDING)
-        judges = tuple(
-            ignoring(view, hole_mask(render.alpha, self.config.holes))
+        budgets = tuple(
+            error_budgets(
+                view,
+                render.image,
+                hole_mask(render.alpha, self.config.holes),
+                tolerance,
+                config.ssim_tolerance,
+            )
             for view, render in zip(completion.photographs, drawn, strict=True)
         )
-        allowed = tuple(
-            error_with_loss(squared_error(v.compared(r.image), v.image).item(), loss)
-            for r, v in zip(drawn, judges, strict=True)
-        )
-        begun = drawn[: len(completion.views)]
-        return replace(completion, judges=judges, allowed_errors=allowed, begun=begun)
+        return replace(completion, budgets=budgets, begun=drawn[: len(completion.views)])
 
     def at(self, completion: Completion, views: Sequence[View]) -> tuple[FrozenView, ...]:
         """The scene as it stands, frozen at the cameras of photographs."""
@@ -677,13 +677,6 @@ class GSCompleter:
 def ranged(view: View, near: float, far: float) -> View:
     """`view` with a depth range."""
     return replace(view, camera=replace(view.camera, near=near, far=far))
-
-
-def ignoring(view: View, where: Bool[Tensor, "h w"]) -> View:
-    """`view`, which is ignored `where` it is told, too."""
-    if not where.any():
-        return view
-    return replace(view, ignored=where if view.ignored is None else view.ignored | where)
 
 
 def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:

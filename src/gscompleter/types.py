@@ -432,6 +432,18 @@ class Evidence:
 
 
 @dataclass(frozen=True)
+class ErrorBudget:
+    """How far the render of a photograph may be off, by one measure, whatever is added."""
+
+    view: View
+    """The photograph; what it ignores does not count."""
+    metric: Literal["mse", "dssim"]
+    """Mean squared error, or 1 - SSIM."""
+    limit: float
+    """Largest error."""
+
+
+@dataclass(frozen=True)
 class Completion:
     """A scene on its way to completion: what `GSCompleter` begins with and what a step leads to.
 
@@ -446,8 +458,9 @@ class Completion:
     views: tuple[View, ...]
     """The photographs, with the depth range that the completion works in, in the exposure of the
     context where Ψ evened theirs out."""
-    allowed_errors: tuple[float, ...]
-    """Largest mean squared error that each of `judges` may have, whatever is added."""
+    budgets: tuple[tuple[ErrorBudget, ...], ...]
+    """What each of `views`, then of `witnesses`, asks of whatever is added. The first of each leaves
+    out where the scene had a hole at first, so that nothing makes up for what was good."""
     targets: tuple[TargetCompletion, ...]
     """What happened so far, in the order of the targets."""
     seconds: Mapping[str, float]
@@ -460,9 +473,6 @@ class Completion:
     gains: Float[Tensor, "v 3"] | None = None
     """By how much each photograph, as it was taken, is brighter than in `views`, by channel; None
     where exposures were not evened out."""
-    judges: tuple[View, ...] = ()
-    """`views`, then `witnesses`, as they are held against the scene whatever is added: where this
-    has a hole at first they are ignored, so that nothing makes up for what was good."""
     begun: tuple[Render, ...] = ()
     """What each of `views` saw of the context, as it is drawn, before any target."""
     proxy: Proxy | None = None

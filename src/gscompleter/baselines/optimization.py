@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import conv2d
 
 from gscompleter.geometry import rotations_from, z_depths
 from gscompleter.progress import track
 from gscompleter.render import Renderer
+from gscompleter.ssim import ssim_map
 from gscompleter.types import Camera, Gaussians, View, merge
 
 
@@ -189,22 +189,3 @@ def densified(
             children.append(replace(parents, means=moved, scales=parents.scales / 1.6))
         dense = merge([kept, clones, *children])
         return dense[dense.opacities >= config.min_opacity]
-
-
-def ssim_map(
-    image: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]
-) -> Float[Tensor, "1 3 h w"]:
-    """Structural similarity (Wang et al. 2004), window of 11, sigma 1.5; differentiable."""
-    offsets = torch.arange(11, dtype=image.dtype, device=image.device) - 5
-    line = torch.exp(-(offsets**2) / (2 * 1.5**2))
-    line = (line / line.sum()).repeat(3, 1)
-
-    def blurred(values: Float[Tensor, "h w 3"]) -> Tensor:
-        planes = values.permute(2, 0, 1)[None]
-        rows = conv2d(planes, line[:, None, None, :], padding=(0, 5), groups=3)
-        return conv2d(rows, line[:, None, :, None], padding=(5, 0), groups=3)
-
-    a, b = blurred(image), blurred(other)
-    aa, bb, ab = blurred(image**2) - a**2, blurred(other**2) - b**2, blurred(image * other) - a * b
-    c1, c2 = 0.01**2, 0.03**2
-    return (2 * a * b + c1) * (2 * ab + c2) / ((a**2 + b**2 + c1) * (aa + bb + c2))

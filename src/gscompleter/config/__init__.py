@@ -200,9 +200,12 @@ class ReconcileConfig(Settings):
 
 @dataclass(frozen=True)
 class HarmConfig(Settings):
-    tolerance: Annotated[float, Interval(ge=0, le=100)] | None = 0.045
-    """Largest loss of PSNR, in dB, that any context view may suffer; None checks nothing, as in
-    the paper. Photographs of a scene that is doubted lose nothing, whatever it is."""
+    tolerance: Annotated[float, Interval(ge=0, le=100)] | None = 0.018
+    """Largest loss of PSNR, in dB, that any context view may suffer, over the whole image; None
+    checks nothing, as in the paper. Photographs of a scene that is doubted lose nothing, whatever
+    it is."""
+    ssim_tolerance: Share = 0.0009
+    """Largest loss of SSIM that any photograph may suffer."""
     max_loss: Share | None = 0.75
     """Largest share of its opacity that what is added may lose by that. If it is more, or if the
     photographs show something else than the synthesized image, nothing is added; None adds whatever

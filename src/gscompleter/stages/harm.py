@@ -9,34 +9,91 @@ from functools import cached_property
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gscompleter.config import HarmConfig
 from gscompleter.masks import dilate
 from gscompleter.render import FrozenView, OpacityImage, image_of
+from gscompleter.ssim import RADIUS, ssim_map
 from gscompleter.stages.integration import falling_on
 from gscompleter.threads import torch_on_one_thread
-from gscompleter.types import Gaussians, View
+from gscompleter.types import ErrorBudget, Gaussians, View
 
 HALVINGS = 16
 """How often harmful Gaussians lose half of their opacity, before a view that still does not hold
 loses those at its worst pixels."""
 REMOVALS = 12
 """How often it does, before it loses all that it sees of them."""
+ROUNDING = 1e-4
+"""Decibels that a photograph may lose where it may lose nothing."""
 REACH = 2
 """Pixels around the worst ones within which Gaussians are lost."""
+
+
+def error_budgets(
+    photograph: View,
+    image: Float[Tensor, "h w 3"],
+    holes: Bool[Tensor, "h w"],
+    tolerance: float,
+    ssim_tolerance: float,
+) -> tuple[ErrorBudget, ...]:
+    """Set how far the render of a photograph may be off, whatever is added.
+
+    The mean squared error counts over the whole photograph, and once more without the holes of the
+    context: what closes a hole must not make up for what was good. SSIM counts over all of it.
+
+    Args:
+        photograph: What the scene is held against.
+        image: The context as its camera sees it.
+        holes: Where the context has a hole there.
+        tolerance: Largest loss of PSNR, in dB.
+        ssim_tolerance: Largest loss of SSIM.
+
+    Returns:
+        The budgets, that without the holes first.
+    """
+    seen = replace(photograph, ignored=holes | ~photograph.counted)
+    budgets = [ErrorBudget(seen, "mse", 0.0)]
+    if holes.any():
+        budgets.append(ErrorBudget(photograph, "mse", 0.0))
+    if min(photograph.image.shape[:2]) > 2 * RADIUS:
+        budgets.append(ErrorBudget(photograph, "dssim", 0.0))
+    before = [errors(image.clamp(0, 1), budget).sum().item() for budget in budgets]
+    limits = {
+        "mse": lambda error: error_with_loss(error, max(tolerance, ROUNDING)),
+        "dssim": lambda error: error + ssim_tolerance,
+    }
+    return tuple(
+        replace(budget, limit=limits[budget.metric](error))
+        for budget, error in zip(budgets, before, strict=True)
+    )
+
+
+def errors(image: Float[Tensor, "h w 3"], budget: ErrorBudget) -> Float[Tensor, "h w"]:
+    """Compute what each pixel adds to the error that a budget limits; differentiable.
+
+    `mse` is the mean squared error, `dssim` is 1 - SSIM, whose windows lie within the image.
+    """
+    view = budget.view
+    compared = view.compared(image)
+    if budget.metric == "mse":
+        return (compared - view.image).square().mean(dim=-1) / view.counted.numel()
+    inner = slice(RADIUS, -RADIUS)
+    dissimilar = (1 - ssim_map(compared, view.image).mean(dim=(0, 1)))[inner, inner]
+    return pad(dissimilar / dissimilar.numel(), (RADIUS,) * 4)
 
 
 @torch_on_one_thread()
 def do_no_harm(
     added: Gaussians,
     frozen_views: Sequence[FrozenView],
-    views: Sequence[View],
-    allowed_errors: Sequence[float],
+    budgets: Sequence[Sequence[ErrorBudget]],
     config: HarmConfig = HarmConfig(),
     drawings: Sequence[OpacityImage] | None = None,
 ) -> Gaussians:
-    """`added` with opacities lowered until no photograph is matched worse than allowed; nothing of
-    it where that takes so much that the photographs contradict all of it.
+    """Lower the opacities of `added` until every photograph is within its error budgets.
+
+    Returns nothing of it where that takes so much that the photographs contradict all of it.
 
     In a view that got worse, a Gaussian is harmful where less opacity would bring the view nearer
     to its photograph. The most harmful ones are halved, no more of them than it takes. Where that
@@ -46,19 +103,18 @@ def do_no_harm(
 
     Args:
         added: Generated Gaussians.
-        frozen_views: The scene frozen at the camera of each of `views`.
-        views: The photographs.
-        allowed_errors: Largest mean squared error allowed in each view.
+        frozen_views: The scene frozen at the camera of each photograph.
+        budgets: The budgets of each photograph.
         config: How it is checked.
-        drawings: What draws each of the views with other opacities of `added`, where that is known
-            already.
+        drawings: What draws each of the photographs with other opacities of `added`, where that is
+            known already.
     """
     if config.tolerance is None or len(added) == 0:
         return added
     if drawings is None:
         drawings = [image_of(frozen.plan(added)) for frozen in frozen_views]
     before = [frozen.context.image for frozen in frozen_views]
-    checks = [Check(*each) for each in zip(views, before, drawings, allowed_errors, strict=True)]
+    checks = [Check(*each) for each in zip(budgets, before, drawings, strict=True)]
     opacities, asked = added.opacities, checks
     for trial in range(HALVINGS + REMOVALS + 1):
         worse = those_over(asked, opacities)
@@ -79,13 +135,11 @@ def do_no_harm(
 class Check:
     """A photograph that may not be matched worse than allowed."""
 
-    view: View
+    budgets: Sequence[ErrorBudget]
     before: Float[Tensor, "h w 3"]
     """What it sees of the scene without what is added."""
     draw: OpacityImage
     """What it sees with it."""
-    allowed: float
-    """Largest mean squared error."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +148,7 @@ class Drawn:
 
     check: Check
     opacities: Float[Tensor, "n"]
-    """Those that are drawn, which `image` has slopes in."""
+    """Those that are drawn, which `image` has gradients in."""
     image: Float[Tensor, "h w 3"]
 
     @staticmethod
@@ -103,29 +157,35 @@ class Drawn:
         return Drawn(check, *drawn_with(check.draw, opacities))
 
     @cached_property
+    def broken(self) -> ErrorBudget:
+        """The budget that is exceeded most, relative to its limit."""
+        shown = self.image.detach().clamp(0, 1)
+        totals = [errors(shown, budget).sum().item() for budget in self.check.budgets]
+        pairs = zip(totals, self.check.budgets, strict=True)
+        return max(pairs, key=lambda pair: pair[0] / max(pair[1].limit, 1e-12))[1]
+
+    @cached_property
     def excess(self) -> float:
-        """How far the mean squared error of the image lies over what is allowed."""
-        view = self.check.view
-        seen = view.compared(self.image.detach())
-        return squared_error(seen, view.image).item() - self.check.allowed
+        """How far the error of the image lies over the limit of that budget."""
+        shown = self.image.detach().clamp(0, 1)
+        return errors(shown, self.broken).sum().item() - self.broken.limit
 
     def to_lower(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
         """Which of `added` are to give way."""
         if HALVINGS <= trial < HALVINGS + REMOVALS:
             return self.at_worst(added)
-        slope = slope_of(self.image, self.check.view, self.opacities)
+        gradient = gradient_of(self.image, self.broken, self.opacities)
         if trial < HALVINGS:
-            return fewest(slope * self.opacities.detach() / 2, self.excess)
-        return slope != 0
+            return fewest(gradient * self.opacities.detach() / 2, self.excess)
+        return gradient != 0
 
     def at_worst(self, added: Gaussians) -> Bool[Tensor, "n"]:
         """Those of `added` at the fewest pixels of the image that make up for its excess."""
-        view = self.check.view
-        compared = map(view.compared, (self.image.detach(), self.check.before))
-        errors, before = (squared_errors(image, view.image) for image in compared)
-        relief = (errors - before) / errors.numel()
+        images = (self.image.detach(), self.check.before)
+        after, before = (errors(image.clamp(0, 1), self.broken) for image in images)
+        relief = after - before
         pixels = fewest(relief.flatten(), self.excess).view(relief.shape)
-        return falling_on(dilate(pixels, REACH), added, view.camera)
+        return falling_on(dilate(pixels, REACH), added, self.broken.view.camera)
 
 
 def those_over(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[Drawn]:
@@ -162,7 +222,7 @@ def error_slope(
 ) -> tuple[float, Float[Tensor, "n"]]:
     """Error against the photograph, and how it grows with each opacity."""
     variable, image = drawn_with(draw, opacities)
-    slope = slope_of(image, view, variable)
+    slope = gradient_of(image, ErrorBudget(view, "mse", 0.0), variable)
     return squared_error(view.compared(image.detach()), view.image).item(), slope
 
 
@@ -176,25 +236,18 @@ def drawn_with(
         return variable, draw(variable)
 
 
-def slope_of(
-    image: Float[Tensor, "h w 3"], view: View, variable: Float[Tensor, "n"]
+def gradient_of(
+    image: Float[Tensor, "h w 3"], budget: ErrorBudget, variable: Float[Tensor, "n"]
 ) -> Float[Tensor, "n"]:
-    """How the error of `image` against the photograph grows with each of what it was drawn with."""
+    """Differentiate the error that a budget limits with respect to what `image` was drawn with."""
     with torch.enable_grad():
-        error = (view.compared(image) - view.image).square().mean()
+        error = errors(image, budget).sum()
     return torch.autograd.grad(error, variable)[0]
 
 
 def squared_error(image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]) -> Tensor:
     """Mean squared error of the image as it is shown, clipped to [0, 1]."""
     return (image.clamp(0, 1) - photograph).square().mean()
-
-
-def squared_errors(
-    image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]
-) -> Float[Tensor, "h w"]:
-    """The same of each pixel."""
-    return (image.clamp(0, 1) - photograph).square().mean(dim=-1)
 
 
 def error_with_loss(error: float, decibel: float) -> float:

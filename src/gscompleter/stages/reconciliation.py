@@ -21,7 +21,7 @@ from gscompleter.descent import Adam
 from gscompleter.progress import track
 from gscompleter.render import AppearanceRender, FrozenView, LooksError
 from gscompleter.threads import torch_on_one_thread
-from gscompleter.types import SH_C0, Gaussians, View
+from gscompleter.types import SH_C0, ErrorBudget, Gaussians, View
 
 Looks = tuple[Float[Tensor, "n"], Float[Tensor, "n k 3"]]
 """Opacities and spherical harmonics."""
@@ -42,8 +42,7 @@ def reconcile(
     reference: View,
     holes: Bool[Tensor, "h w"],
     plans: Sequence[AppearanceRender],
-    views: Sequence[View],
-    allowed_errors: Sequence[float],
+    budgets: Sequence[ErrorBudget],
     config: ReconcileConfig = ReconcileConfig(),
 ) -> tuple[Gaussians, tuple[float, ...]]:
     """`added` with opacities and view-dependent colours that the photographs agree with.
@@ -53,9 +52,8 @@ def reconcile(
         frozen_target: The scene frozen at the target.
         reference: The synthesized image there.
         holes: Where the scene is to look like it.
-        plans: What draws each of `views`, as far as it counts, with other looks of `added`.
-        views: The photographs.
-        allowed_errors: Largest mean squared error allowed in each of them.
+        plans: What draws each photograph with other looks of `added`.
+        budgets: Limit of the mean squared error of each photograph.
         config: How long, and how freely.
 
     Returns:
@@ -68,7 +66,7 @@ def reconcile(
     planned = frozen_target.plan_appearance(added, holes)
     at_target = planned.compared(reference.image, shares_of(holes))
     before = hole_error(frozen_target.context.image, reference, holes).clamp_min(1e-12)
-    asked = [Asked.by(*each) for each in zip(plans, views, allowed_errors, strict=True)]
+    asked = [Asked.by(*each) for each in zip(plans, budgets, strict=True)]
     with torch.no_grad():
         looks = fit.looks()
         turns = Turns([photograph.excess(looks).item() for photograph in asked])
@@ -106,9 +104,10 @@ class Asked:
     """The largest that is allowed."""
 
     @staticmethod
-    def by(plan: AppearanceRender, view: View, allowed: float) -> Asked:
-        """The photograph `view`, whose camera sees what `plan` draws."""
-        return Asked(plan.compared(view.image, shares_of(view.counted)), max(allowed, 1e-12))
+    def by(plan: AppearanceRender, budget: ErrorBudget) -> Asked:
+        """The photograph of a budget, whose camera sees what `plan` draws."""
+        view = budget.view
+        return Asked(plan.compared(view.image, shares_of(view.counted)), max(budget.limit, 1e-12))
 
     def excess(self, looks: Looks) -> Float[Tensor, ""]:
         """By how much the error is above its goal, relative to what is allowed."""
