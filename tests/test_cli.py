@@ -529,3 +529,20 @@ def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
             assert len(load_ply(out / name)) > 0
     if out.exists():
         json.loads((out / "summary.json").read_text())
+
+
+def test_a_target_that_sees_nothing_ends_in_a_sentence_and_beside_others_in_the_summary(
+    room, tmp_path, monkeypatch, capsys
+):
+    away, out = tmp_path / "away.json", tmp_path / "out"
+    write_cameras(away, [camera_at(0.0, yaw=180, size=64)])
+    frames = ("--context", 0, 1, "--near", 0.5, "--far", 20, "--out", out, "--quiet")
+    assert run(monkeypatch, "complete", room, *frames, "--target", away) == 2
+    said = capsys.readouterr().err
+    assert "sees surfaces of the scene in 0.0% of its image" in said
+    assert not out.exists()
+    assert run(monkeypatch, "complete", room, *frames, "--target", 2, away) == 0
+    first, second = json.loads((out / "summary.json").read_text())["targets"]
+    assert first["refused"] is None
+    assert "at least 2% are needed" in second["refused"]
+    assert second["added"] == 0

@@ -205,7 +205,7 @@ def test_targets_are_synthesized_together_where_the_generator_can():
     """Each has a hole that reaches its edge, whether or not those before it were completed; so it
     is as wide among others as alone."""
     views, (_, target) = photographs(), cameras()
-    others = [camera_at(x, yaw=12, size=SIZE) for x in (0.9, 1.4, 1.9)]
+    others = [camera_at(x, yaw=12, size=SIZE) for x in (0.9, 1.6, 2.3)]
     targets = [target, views[0].camera, *others]
     generator = KnowingTogether()
     together = GSCompleter(KnowingReconstructor(), generator)(views, targets)
@@ -536,3 +536,33 @@ def test_an_antialiased_scene_is_completed_as_one(tmp_path, doubted):
     write_report(tmp_path, done, [Target(target)], knowing(), {})
     for name in ("context.ply", "completed.ply", "generated.ply"):
         assert load_ply(tmp_path / name).is_antialiased, name
+
+
+BEHIND = camera_at(0.0, yaw=180, size=SIZE)
+FAR_AWAY = camera_at(0.0, z=-1000.0, size=SIZE)
+
+
+@pytest.mark.parametrize("config", [CompleterConfig(), CompleterConfig.paper()])
+@pytest.mark.parametrize("target", [BEHIND, FAR_AWAY], ids=["turned away", "far away"])
+def test_a_target_that_sees_nothing_of_the_scene_is_refused(target, config):
+    views, (_, beside) = photographs(), cameras()
+    completer = knowing(config)
+    with pytest.raises(InputError, match=r"sees surfaces of the scene in 0\.\d%"):
+        completer(views, target)
+    done = completer(views, [target, beside])
+    refused, completed = done.targets
+    assert refused.notes == (refused.refused,)
+    assert "at least 2% are needed" in refused.refused
+    assert len(refused.added) == 0
+    assert completed.refused is None
+    assert len(completed.added) > 0
+
+
+def test_photographs_without_texture_are_refused():
+    blank = torch.full((SIZE, SIZE, 3), 0.6)
+    ramp = blank * torch.linspace(0.8, 1.0, SIZE)[:, None]
+    noise = 0.004 * torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
+    for image in (blank, ramp, blank + noise):
+        views = [View(image, camera_at(x, size=SIZE)) for x in (0.0, 0.3)]
+        with pytest.raises(InputError, match="2 of the 2 context photographs show no texture"):
+            GSCompleter()(views, camera_at(0.6, size=SIZE))

@@ -31,6 +31,7 @@ from gscompleter.render import (
 )
 from gscompleter.render.antialiasing import in_mode_of
 from gscompleter.render.proxy import proxy_of
+from gscompleter.sky import surfaces_in
 from gscompleter.stages.anchor import (
     AnchorChoice,
     Synthesized,
@@ -41,6 +42,7 @@ from gscompleter.stages.anchor import (
 from gscompleter.stages.candidates import shrunk
 from gscompleter.stages.compared_depths import compared_depths
 from gscompleter.stages.context import (
+    check_texture,
     exposed_alike,
     init_context,
     sort_by_frame,
@@ -184,7 +186,8 @@ class GSCompleter:
                 set aside, and none of them may get worse. Without them it is taken as it is.
 
         Raises:
-            InputError: too few views, no baseline, too many targets, a scene nobody sees.
+            InputError: too few views, no baseline, too many targets, a scene nobody sees, or no
+                target that sees enough of it.
         """
         targets = [target] if isinstance(target, Camera) else list(target)
         if not targets:
@@ -195,6 +198,7 @@ class GSCompleter:
         counted_as = "target" if at_once == 1 else "group of targets"
         for start in track(range(0, len(targets), at_once), counted_as):
             completion = self.advance_together(completion, targets[start : start + at_once])
+        check_any_completed(completion)
         return completion
 
     def begin(
@@ -246,6 +250,7 @@ class GSCompleter:
         """
         clock = Clock()
         with clock("context"):
+            check_texture(views)
             near, far = working_range(views, None, self.renderer)
             views = [ranged(view, near, far) for view in views]
             gaussians, gains = init_context(self.reconstructor, views)
@@ -280,6 +285,7 @@ class GSCompleter:
             wide = None if reference is None else reference.camera
             sight = self.sight(completion, target, wide)
         result = nothing_added(sight, sight.window.crop(self.holes(sight)))
+        result = self.refused(result)
         reason = nothing_to_do(result, completion.views)
         if reason is not None:
             return followed_by(completion, replace(result, notes=(reason,)), clock.seconds)
@@ -351,6 +357,19 @@ class GSCompleter:
         (image,) = self.synthesize([sight], at_views)
         return View(sight.window.crop(image.image), sight.window.target)
 
+    def refused(self, result: TargetCompletion) -> TargetCompletion:
+        """Refuse a target that sees too little of the scene to continue it."""
+        covered = surfaces_in(result.before, result.target).valid.float().mean().item()
+        least = self.config.holes.min_covered
+        if covered >= least:
+            return result
+        reason = (
+            f"The target sees surfaces of the scene in {covered:.1%} of its image, and at least "
+            f"{least:.0%} are needed; move it closer to the photographs, or turn it towards what "
+            "they show."
+        )
+        return replace(result, refused=reason)
+
     def references(
         self, completion: Completion, targets: Sequence[Camera]
     ) -> tuple[list[Synthesized | None], Mapping[str, float]]:
@@ -361,6 +380,7 @@ class GSCompleter:
             results = [
                 nothing_added(sight, sight.window.crop(self.holes(sight))) for sight in sights
             ]
+            results = [self.refused(result) for result in results]
             asked = [nothing_to_do(result, completion.views) is None for result in results]
             at_views = contexts_of(self.at(completion, completion.views))
         with clock("generate"):
@@ -732,6 +752,8 @@ def nothing_added(sight: Sight, holes: Bool[Tensor, "h w"]) -> TargetCompletion:
 
 def nothing_to_do(result: TargetCompletion, views: Sequence[View]) -> str | None:
     """Why a target needs no completion, in a sentence; None where it does."""
+    if result.refused is not None:
+        return result.refused
     if any(same_camera(result.target, view.camera) for view in views):
         return "The target is a context view: nothing to complete."
     if not result.hole_mask.any():
@@ -750,6 +772,14 @@ def followed_by(
         targets=(*completion.targets, result),
         seconds=total(completion.seconds, seconds),
     )
+
+
+def check_any_completed(completion: Completion) -> None:
+    """Raise InputError if every target was refused, with the reason of the first."""
+    reasons = [result.refused for result in completion.targets]
+    if reasons and all(reason is not None for reason in reasons):
+        more = "" if len(reasons) == 1 else f" So do the other {len(reasons) - 1}."
+        raise InputError(f"{reasons[0]}{more}", "target")
 
 
 def contexts_of(frozen_views: Sequence[FrozenView]) -> tuple[Render, ...]:

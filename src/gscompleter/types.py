@@ -400,6 +400,8 @@ class TargetCompletion:
     None where it was not doubted."""
     pairs: DepthPairs | None = None
     """Of what the affine was fitted to; None where nothing was compared."""
+    refused: str | None = None
+    """Why the target cannot be completed, a sentence; None where it can."""
 
     @property
     def hole_fraction(self) -> float:
@@ -459,8 +461,8 @@ class Completion:
     """The photographs, with the depth range that the completion works in, in the exposure of the
     context where Ψ evened theirs out."""
     budgets: tuple[tuple[ErrorBudget, ...], ...]
-    """What each of `views`, then of `witnesses`, asks of whatever is added. The first of each leaves
-    out where the scene had a hole at first, so that nothing makes up for what was good."""
+    """What each of `views`, then of `witnesses`, asks of whatever is added. The first leaves out
+    where the scene had a hole at first, so that nothing makes up for what was good."""
     targets: tuple[TargetCompletion, ...]
     """What happened so far, in the order of the targets."""
     seconds: Mapping[str, float]

@@ -116,6 +116,9 @@ class HoleConfig(Settings):
     """τ of Eq. 12: a pixel of the target that the scene covers by less is a hole. It is painted by
     Φ, what is lifted there joins the scene, and its depth continues that of its surroundings. Where
     the scene's depth is compared, a pixel stays covered from one half on."""
+    min_covered: Share = 0.02
+    """Smallest share of the target's image that surfaces of the scene must cover for it to be
+    completed. A target that sees less of the scene has nothing to continue, and is refused."""
     dilation: Pixels = 3
     """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
     neighbourhood: Pixels | None = 16

@@ -176,6 +176,7 @@ def summarize(
                 "generated": int(result.added.generated[0]) if len(result.added) else None,
                 "added": len(result.added),
                 "notes": list(result.notes),
+                "refused": result.refused,
             }
             for target, result, scored in zip(
                 targets, completion.targets, scores[count:], strict=True

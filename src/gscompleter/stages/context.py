@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.errors import InputError
 from gscompleter.geometry import z_depths
@@ -16,6 +17,12 @@ from gscompleter.reconstructors import Reconstructor, reconstructed
 from gscompleter.render import Renderer
 from gscompleter.stages.integration import falling_on
 from gscompleter.types import Camera, Gaussians, Reconstruction, View
+
+MIN_CONTRAST = 0.02
+"""Difference of brightness within 5 x 5 smoothed pixels that counts as texture; colours are in
+[0, 1]."""
+MIN_VARIED = 0.01
+"""Smallest share of an image with such a difference."""
 
 
 def init_context(
@@ -27,6 +34,26 @@ def init_context(
     """
     made = reconstructed(reconstructor, views)
     return without_ignored(made, views), made.gains
+
+
+def check_texture(views: Sequence[View]) -> None:
+    """Raise InputError if fewer than two photographs have any texture to match."""
+    flat = [view for view in views if not has_texture(view.image)]
+    if len(views) - len(flat) >= 2:
+        return
+    raise InputError(
+        f"{len(flat)} of the {len(views)} context photographs show no texture, and stereo needs at "
+        "least 2 that do; choose other photographs."
+    )
+
+
+def has_texture(image: Float[Tensor, "h w 3"]) -> bool:
+    """Tell whether enough of an image varies from pixel to pixel by more than noise."""
+    smooth = avg_pool2d(image.mean(dim=-1)[None, None], 3, stride=1)
+    highest = max_pool2d(smooth, 5, stride=1)
+    lowest = -max_pool2d(-smooth, 5, stride=1)
+    varied = highest - lowest > MIN_CONTRAST
+    return varied.float().mean().item() >= MIN_VARIED
 
 
 def sort_by_frame(views: Sequence[View]) -> list[View]:
