@@ -34,8 +34,6 @@ from gscompleter.errors import InputError, quoted
 class Format:
     """A layout of posed photographs on disk."""
 
-    layout: str
-    """What a file or folder of it is, for error messages."""
     holds: Callable[[Path], bool]
     """Whether a file or folder is of it, by names and first bytes."""
     open: Callable[[Path], Iterable[Photographs]]
@@ -45,47 +43,18 @@ class Format:
 
 
 FORMATS = {
-    "chunks": Format(
-        "chunks of pixelSplat (a .torch file, a folder of them, or one with an index.json in it or "
-        "in its folder test)",
-        holds_chunks,
-        open_chunks,
-    ),
-    "dgp": Format("a scene file of DGP or DDAD beside its calibration", holds_dgp, open_dgp, "m"),
-    "nerfstudio": Format(
-        "a folder with nerfstudio's transforms.json", holds_transforms, open_transforms
-    ),
-    "colmap": Format(
-        "a folder with photographs and a COLMAP model (sparse/0, as .bin or .txt)",
-        holds_colmap,
-        open_colmap,
-    ),
-    "cameras-json": Format(
-        "a cameras.json of a 3DGS trainer beside its photographs",
-        holds_camera_list,
-        open_camera_list,
-    ),
-    "llff": Format("a folder with LLFF's poses_bounds.npy", holds_llff, open_llff),
-    "kitti": Format("a sequence of KITTI odometry", holds_kitti, open_kitti, "m"),
-    "kitti-raw": Format(
-        "a drive of raw KITTI (with oxts and image_02)", holds_kitti_raw, open_kitti_raw, "m"
-    ),
-    "pandaset": Format("a sequence of PandaSet", holds_pandaset, open_pandaset, "m"),
-    "mmdet3d": Format(
-        "infos of mmdetection3d for nuScenes or Waymo (.pkl)", holds_infos, open_infos, "m"
-    ),
-    "waymo": Format(
-        "segments of the Waymo Open Dataset 2 (a folder with camera_image/SEGMENT.parquet, or that "
-        "file)",
-        holds_waymo,
-        open_waymo,
-        "m",
-    ),
-    "real-estate-10k": Format(
-        "RealEstate10K camera files (.txt, with the frames of each in the folder of its name)",
-        holds_camera_files,
-        open_camera_files,
-    ),
+    "chunks": Format(holds_chunks, open_chunks),
+    "dgp": Format(holds_dgp, open_dgp, "m"),
+    "nerfstudio": Format(holds_transforms, open_transforms),
+    "colmap": Format(holds_colmap, open_colmap),
+    "cameras-json": Format(holds_camera_list, open_camera_list),
+    "llff": Format(holds_llff, open_llff),
+    "kitti": Format(holds_kitti, open_kitti, "m"),
+    "kitti-raw": Format(holds_kitti_raw, open_kitti_raw, "m"),
+    "pandaset": Format(holds_pandaset, open_pandaset, "m"),
+    "mmdet3d": Format(holds_infos, open_infos, "m"),
+    "waymo": Format(holds_waymo, open_waymo, "m"),
+    "real-estate-10k": Format(holds_camera_files, open_camera_files),
 }
 """By the names that `open_photographs` takes, in the order in which they are tried."""
 
@@ -109,7 +78,7 @@ def open_photographs(
     scenes = list(islice(FORMATS[found].open(path), 2))
     if len(scenes) > 1:
         raise InputError(
-            f"{quoted(str(path))} holds several scenes, such as {quoted(scenes[0].name)} and "
+            f"{quoted(path)} holds several scenes, such as {quoted(scenes[0].name)} and "
             f"{quoted(scenes[1].name)}; name a file or folder with one of them."
         )
     (scene,) = scenes
@@ -130,13 +99,11 @@ def format_of(path: Path, name: str | None = None) -> str:
             f"There is no format '{quoted(name)}'; choose one of {', '.join(FORMATS)}."
         )
     if not os.path.exists(path):
-        raise InputError(f"There is no {quoted(str(path))}; name {accepted()}.")
+        raise InputError(f"There is no {quoted(path)}; name {accepted()}.")
     found = recognised(path) if name is None else name
     if found is None:
         refuse_other_exports(path)
-        raise InputError(
-            f"There are no posed photographs in {quoted(str(path))}; name {accepted()}."
-        )
+        raise InputError(f"There are no posed photographs in {quoted(path)}; name {accepted()}.")
     return found
 
 
@@ -146,6 +113,7 @@ def recognised(path: Path) -> str | None:
 
 
 def accepted() -> str:
-    """What can be opened, in words."""
-    *others, last = (format.layout for format in FORMATS.values())
-    return f"{', '.join(others)}, or {last}"
+    """Name what can be opened, for error messages."""
+    known = ("nerfstudio", "colmap")
+    others = ", ".join(name for name in FORMATS if name not in known)
+    return f"a folder with nerfstudio's transforms.json or COLMAP's sparse/0, or one of {others}"

@@ -132,7 +132,8 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
             draft.publish()
         except InputError as error:
             # The user asked for `path` and need not hear of the temporary name.
-            raise type(error)(str(error).replace(str(draft.folder), str(path))) from error
+            whole = str(error.args[0]).replace(str(draft.folder), str(path))
+            raise type(error)(whole, error.argument) from error
         except OSError as error:
             if error.errno not in _DISK_ERRORS:
                 raise

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gscompleter.errors import InputError, quoted, refuse_pointer
+from gscompleter.reading import open_file
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
 NOT_THE_ENCODERS = ("decoder.", "losses.")
@@ -46,13 +47,8 @@ def check_kind(path: Path, name: str) -> None:
     """Raise an InputError where a file is missing, empty, a pointer, a web page, or cut off."""
     if not os.path.isfile(path):
         raise InputError(f"There is no file {path}; {name} is needed there.")
-    try:
-        with path.open("rb") as file:
-            head = file.read(64)
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be opened ({error.strerror}); make it readable."
-        ) from error
+    with open_file(path) as file:
+        head = file.read(64)
     refuse_pointer(path)
     wrong = ""
     if not head:
