@@ -78,6 +78,8 @@ MAX_TARGETS = 255
 
 UNSEEN = 0.1
 """Share of what the target sees of a Gaussian, below which no photograph shows it."""
+COLOUR_SLACK = 0.01
+"""By how much a colour may lie outside of [0, 1], as resampling leaves it."""
 ROUNDING = 1e-4
 """Decibels that a photograph may lose where it may lose nothing."""
 MIN_COVER = 0.5
@@ -215,6 +217,7 @@ class GSCompleter:
                 f"{len(views)} context view was given, and stereo needs at least 2; name more "
                 "frames, or bring a scene."
             )
+        check_values([*views, *(witnesses or ())], scene)
         clock = Clock()
         with clock("context"):
             cameras = [*targets, *(view.camera for view in (*views, *(witnesses or ())))]
@@ -759,6 +762,24 @@ def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
     if affine.method == "identity":
         notes.append("There was nothing to fit an affine to; depths were left as predicted.")
     return tuple(notes)
+
+
+def check_values(views: Sequence[View], scene: Gaussians | None) -> None:
+    """Refuse images and Gaussians of values that no stage can work with.
+
+    Raises:
+        InputError: where colours are outside of [0, 1], or the scene holds NaN or infinity.
+    """
+    for number, view in enumerate(views):
+        low, high = (float(bound) for bound in view.image.aminmax())
+        if not (low >= -COLOUR_SLACK and high <= 1 + COLOUR_SLACK):  # nor NaN
+            raise InputError(
+                f"The image of view {number} has values from {low:g} to {high:g}; colours in "
+                "[0, 1] are needed."
+            )
+    parts = () if scene is None else (scene.means, scene.quats, scene.scales, scene.opacities)
+    if not all(bool(part.isfinite().all()) for part in parts):
+        raise InputError("The scene holds NaN or infinity; leave such Gaussians out.")
 
 
 class Clock:
