@@ -63,8 +63,6 @@ class Camera(Movable):
         defect = _planes_defect(self.near, self.far) or (
             _pose_defect(self.c2w) or _intrinsics_defect(self.K, self.width, self.height)
         )
-        if defect is None and self.c2w.dtype != self.K.dtype:
-            defect = f"its pose is {self.c2w.dtype}, and its K is {self.K.dtype}"
         if defect is not None:
             raise InputError(f"There is no such camera: {defect}.")
 

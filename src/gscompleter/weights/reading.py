@@ -76,8 +76,7 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
                 f"{path} is not the published file {name} but that of {other.name}; choose that "
                 f"model, or fetch {name}."
             )
-    begins = f"its SHA-256 begins with {digest[:8]} instead of {expected[:8]}"
-    raise _broken(path, f"is not the published file {name}: {begins}", name)
+    raise _broken(path, f"is not the published file (SHA-256 {digest[:8]})", name)
 
 
 def sha256_of(path: Path) -> str:
@@ -190,7 +189,10 @@ def is_plain(tensor: Tensor) -> bool:
 
 def _broken(path: Path, wrong: str, name: str) -> InputError:
     # In the hub's cache the path is a link; without the file behind it, it is fetched anew.
-    return InputError(f"{path} {wrong}; delete {path.resolve()} and fetch {name} again.")
+    file = path.resolve()
+    if file == path.absolute():
+        return InputError(f"{path} {wrong}; delete it and fetch {name} again.")
+    return InputError(f"{name} {wrong}; delete {file} and fetch it anew.")
 
 
 def _some(keys: list[str]) -> str:
