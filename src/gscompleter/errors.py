@@ -35,7 +35,7 @@ class InputError(ValueError):
         self.argument = None if argument is None else quoted(argument)
 
     def __str__(self) -> str:
-        option = 0 if self.argument is None else len(f" (--{self.argument})")
+        option = 0 if self.argument is None else len(f" (--{self.argument}).")
         return shortened(super().__str__(), LONGEST_MESSAGE - len(PROGRAM) - option)
 
 

@@ -38,7 +38,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except RecursionError as error:
         raise InputError(f"{name} is nested too deeply.") from error
     except Exception as error:  # PyYAML fails in many ways, KeyError and IndexError among them
-        reason = quoted(" ".join(str(error).split()), LONGEST_REASON)
+        mark = getattr(error, "problem_mark", None)
+        place = "" if mark is None else f" in line {mark.line + 1}"
+        reason = f"{quoted(getattr(error, 'problem', None) or str(error), LONGEST_REASON)}{place}"
         raise InputError(f"{name} is not YAML: {reason}.") from error
     if content is None:
         return {}
