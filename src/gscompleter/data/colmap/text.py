@@ -19,7 +19,7 @@ from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.errors import InputError, quoted
 from gscompleter.reading import read_lines
 
-MAX_LINE = 1 << 25
+MAX_LINE = 1 << 22
 """Of characters of the features of an image."""
 MAX_BYTES = 1 << 34
 """Of a file."""
