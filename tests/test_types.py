@@ -45,7 +45,7 @@ def test_an_impossible_camera_is_refused_at_once(change, sentence):
 def test_a_rotation_may_be_rounded_and_planes_may_be_unknown():
     camera = camera_at(yaw=12, size=32)
     pose = camera.c2w.clone()
-    pose[:3, :3] += 1e-4
+    pose[:, :3] += 1e-4
     assert replace(camera, c2w=pose, near=None).far == 20
 
 

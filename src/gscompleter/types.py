@@ -127,8 +127,8 @@ def _pose_defect(c2w: Float[Tensor, "4 4"]) -> str | None:
         return "its pose holds NaN or infinity"
     lengths = (a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i)
     angles = (a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i)
-    errors = (*(length - 1 for length in lengths), *angles)
-    if max(map(abs, errors)) > MAX_RIGID_ERROR or last != [0, 0, 0, 1]:
+    errors = (*(length - 1 for length in lengths), *angles, *last[:3], last[3] - 1)
+    if not max(map(abs, errors)) <= MAX_RIGID_ERROR:
         return "its pose is no rotation and translation but scaled, sheared or projective"
     if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
         return "its pose is left-handed; mirror one of its axes"
