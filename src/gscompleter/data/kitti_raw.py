@@ -130,7 +130,7 @@ def _entry(
     found = entries.get(key)
     if found is None or len(found) != count:
         raise InputError(
-            f"{quoted(title)} has no line {key} of {count} numbers; copy it from the same date."
+            f"{title} has no line {key} of {count} numbers; copy it from the same date."
         )
     return found
 
