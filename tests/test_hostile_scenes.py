@@ -166,6 +166,17 @@ def test_a_scene_of_a_chunk_that_is_no_scene_is_refused(tmp_path, parts):
     sentence(save_chunk(tmp_path / "000000.torch", changed(**parts)))
 
 
+def test_a_chunk_that_claims_more_than_there_is_room_for_is_refused(tmp_path):
+    path = save_chunk(tmp_path / "000000.torch", example("room"))
+    torch.save([example("room")], path, _use_new_zipfile_serialization=False)
+    data = path.read_bytes()
+    count = example("room")["images"][0].numel()
+    claimed = data.replace(b"M" + count.to_bytes(2, "little"), b"\x8a\x06" + b"\xff" * 5 + b"\x7f")
+    assert claimed != data
+    path.write_bytes(claimed)
+    assert "asks for more memory" in sentence(path)
+
+
 def test_cameras_that_were_trained_are_read(tmp_path):
     cameras = example("room")["cameras"].requires_grad_()
     read(save_chunk(tmp_path / "000000.torch", changed(cameras=cameras)))

@@ -126,8 +126,6 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
             # About pickle protocols, in the moment before the file is refused.
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except MemoryError:
-        raise
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
     # On damaged bytes the unpickler raises whatever the next instruction leads to.
@@ -147,6 +145,8 @@ def _cannot_load(path: Path, error: Exception) -> str:
             f"{path} holds pickled Python objects, which are refused because loading them can "
             "run any code; save it again with tensors, strings, lists and dicts only."
         )
+    if isinstance(error, MemoryError) or "allocate memory" in str(error):
+        return f"{path} asks for more memory than there is; divide it, or download it again."
     return f"{path} is truncated or no file of torch.save; download it again."
 
 
