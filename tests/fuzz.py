@@ -18,6 +18,7 @@ import re
 import resource
 import shutil
 import signal
+import socket
 import sys
 import tempfile
 import time
@@ -32,8 +33,8 @@ os.environ |= {"OMP_WAIT_POLICY": "PASSIVE", "NUMBA_NUM_THREADS": "1", "OMP_NUM_
 ADDRESS_SPACE = 8 << 30
 MAX_MEMORY = 2 << 20
 """Of a run, in kilobytes."""
-LONGEST_ERROR = 2500
-"""In characters."""
+LONGEST_ERROR = 300
+"""In characters, without the end of the line."""
 SIZE = 32
 
 NUMBERS: list[Any] = [
@@ -42,6 +43,7 @@ NUMBERS: list[Any] = [
 ]
 STRINGS: list[Any] = ["", "²", "a" * 100_000, "../../..", "/dev/null", "nan", "0", "\0", "\ud800"]
 OBJECTS: list[Any] = [[], {}, [[]], [0] * 5000, {"a": {"b": []}}]
+MATRICES: list[Any] = [[[1e300] * 4] * 4, [[None] * 4] * 4, [[1], [1, 2]], [[0] * 4] * 4, [1] * 16]
 ODD = NUMBERS + STRINGS + OBJECTS
 WORDS = ["", "²", "--2", "-1", "0", "1,2", "9" * 5000, "1e300", "nan", "inf", "1e-300", "/dev/null"]
 WORDS += ["99999999", str(2**64), "a" * 5000, "--", "-", "..", "1000000", "\udce4", "0.5", "None"]
@@ -64,6 +66,8 @@ PARTS = [
 ]
 FILES = [b"", b"\0" * 100, b"PK\x03\x04", b"\x93NUMPY", b"ply\n", b"{", b"<html>", b"glTF", b"NGSP"]
 COUNTS = [b"0", b"-1", b"1" + b"0" * 12, b"9" * 4000, b"nan"]
+YAML += ["0x_", "1:", "1" + ":59" * 9000, "=", "{<<: 1}", "{<<: [[1]]}", "!!int ''", "!!float x"]
+YAML += ["&a 1", "*a", "!!binary '='", "!!set {1, 2}", "!!omap [1]", "!!timestamp x", "? {a: 1}"]
 YAML += ["!!python/object:os.system x", "~", "'²'", "0", "1", "-1", "1000000000000", "yes", "''"]
 
 
@@ -91,6 +95,7 @@ def build(folder: Path) -> None:
     import torch
 
     from chunk_files import example, save_chunk
+    from driving_files import write_drive, write_infos, write_swept_dgp
     from gscompleter import save_ply
     from gscompleter.data.scene import write_cameras
     from pose_files import WRITERS, write_camera_list
@@ -111,6 +116,7 @@ def build(folder: Path) -> None:
     save_ply(folder / "small.ply", gaussians[:5])
     (folder / "ascii.ply").write_bytes(as_ascii((folder / "small.ply").read_bytes()))
     save_chunk(folder / "chunks" / "000000.torch", example("room", views=views))
+    (folder / "chunks" / "index.json").write_text('{"room": "000000.torch"}')
     row = {"scene": "scene", "context": [0, 1], "target": 2, "near": 0.5, "far": 20.0}
     cases = {"resolution": [SIZE, SIZE], "cases": [{**row, "neighbours": [1]}]}
     (folder / "cases.json").write_text(json.dumps(cases))
@@ -135,6 +141,9 @@ def build(folder: Path) -> None:
     (folder / "splats").mkdir()
     for name in (*FORMATS_BUT_PLY, "plain.spz", "folder"):
         made(folder / "splats", name, plausible(40, 1))
+    write_infos(folder / "infos")
+    write_drive(folder / "kitti-raw")
+    write_swept_dgp(folder / "dgp-swept")
     in_every_format(WRITERS["colmap-text"][1](folder / "photographs") / "images")
 
 
@@ -185,16 +194,16 @@ def in_json(path: str, command: Sequence[str]) -> Mutation:
     return mutate
 
 
-def replaced(content: Any, chance: random.Random) -> Any:
-    """`content` with one value somewhere in it replaced, removed or doubled."""
+def replaced(content: Any, chance: random.Random, odd: Sequence[Any] = ODD) -> Any:
+    """`content` with one value somewhere in it replaced by an odd one, or removed."""
     if not isinstance(content, (dict, list)) or not content or chance.random() < 0.08:
-        return chance.choice(ODD)
+        return chance.choice(odd)
     keys = list(content) if isinstance(content, dict) else range(len(content))
     key = chance.choice(list(keys))
     if chance.random() < 0.05:
         del content[key]
     else:
-        content[key] = replaced(content[key], chance)
+        content[key] = replaced(content[key], chance, odd)
     return content
 
 
@@ -305,18 +314,117 @@ def in_words(folder: Path, chance: random.Random) -> list[str]:
     return ["complete", "scene", *words, "--out", "out", "--quiet"]
 
 
-def in_weights(folder: Path, chance: random.Random) -> list[str]:
-    """A file of weights that holds something else."""
+def in_infos(folder: Path, chance: random.Random) -> list[str]:
+    """Values of a pickle of infos are replaced by odd ones, or by the whole in a part of it."""
+    import pickle
+
+    file = folder / "infos" / "infos.pkl"
+    if chance.random() < 0.2:
+        damage(file, chance)
+    else:
+        content = pickle.loads(file.read_bytes())
+        kinds = [ODD, MATRICES, [content], [{"car": [1]}, {1: 2}, {(1, 2): 3}, {1, 2}]]
+        for _ in range(chance.choice([1, 1, 2])):
+            content = replaced(content, chance, chance.choice(kinds))
+        file.write_bytes(pickle.dumps(content, protocol=chance.choice([0, 2, 4])))
+    return scene_words("infos/infos.pkl")
+
+
+def in_chunk(folder: Path, chance: random.Random) -> list[str]:
+    """A value of a chunk is replaced by an odd one or an odd tensor, or a name in an index."""
     import torch
 
-    tensors: list[Any] = [
+    file = folder / "chunks" / "000000.torch"
+    if chance.random() < 0.2:
+        name = chance.choice([*STRINGS, "000000.torch\0", "../chunks", 5])
+        (folder / "chunks" / "index.json").write_text(json.dumps({"room": name}))
+    else:
+        content = torch.load(file, weights_only=True)
+        torch.save(replaced(content, chance, [*ODD, *odd_tensors()]), file)
+    return CHUNKS
+
+
+def in_sweep(folder: Path, chance: random.Random) -> list[str]:
+    """The sweep of a laser is damaged, or holds another array."""
+    import numpy as np
+
+    file = folder / "dgp-swept" / "0.npz"
+    if chance.random() < 0.5:
+        damage(file, chance)
+    else:
+        arrays = [np.zeros(3), np.zeros((2, 2)), np.float64(1), np.full((4, 3), np.nan)]
+        arrays += [np.full((4, 3), 1e300), np.array([["a"] * 3]), np.zeros((0, 3)), np.eye(4) > 0]
+        arrays += [np.array([[None] * 3], dtype=object), np.zeros((9, 3), complex)]
+        np.savez(file, **{chance.choice(["data", "other"]): chance.choice(arrays)})
+    return scene_words("dgp-swept")
+
+
+def odd_tensors() -> list[Any]:
+    import torch
+
+    return [
         torch.empty(3, device="meta"),
         torch.eye(3).to_sparse(),
         torch.full((3,), float("nan")),
         torch.ones(1).expand(10**6, 10**6),
+        torch.ones(1, dtype=torch.uint8).expand(10**12),
+        torch.ones(1, 1).expand(3, 18),
+        torch.zeros(3, 18),
+        torch.full((3, 18), 1e30),
+        torch.zeros(3, 18, dtype=torch.float16, requires_grad=True),
         torch.eye(3, dtype=torch.complex64),
-        *ODD,
+        torch.zeros(0),
     ]
+
+
+KINDS_OF_FILE = ("pipe", "folder", "zero", "null", "socket", "link", "large")
+
+
+def not_a_file(path: str, command: Sequence[str]) -> Mutation:
+    """A file gives way to a pipe, a device, a folder, or to one of a terabyte; of those that a
+    pattern names, one."""
+
+    def mutate(folder: Path, chance: random.Random) -> list[str]:
+        file = chance.choice([file for file in sorted(folder.glob(path)) if file.is_file()])
+        kind = chance.choice(KINDS_OF_FILE)
+        if kind == "large":
+            os.truncate(file, 1 << 40)
+            return list(command)
+        file.unlink()
+        if kind == "pipe":
+            os.mkfifo(file)
+        elif kind == "folder":
+            file.mkdir()
+        elif kind == "socket":
+            with socket.socket(socket.AF_UNIX) as bound:
+                bound.bind(str(file))
+        else:
+            file.symlink_to(file.name if kind == "link" else f"/dev/{kind}")
+        return list(command)
+
+    return mutate
+
+
+def long_line(path: str, command: Sequence[str]) -> Mutation:
+    """A line or a number of a text file has millions of characters, or there are many lines."""
+
+    def mutate(folder: Path, chance: random.Random) -> list[str]:
+        file = chance.choice(sorted(folder.glob(path)))
+        lines = file.read_bytes().splitlines(keepends=True)
+        at = chance.randrange(len(lines))
+        times = chance.choice([10**4, 10**6, 10**7])
+        lines[at] = chance.choice([b"9" * times, lines[at] * (times // 100), b"1 " * times])
+        file.write_bytes(b"".join(lines))
+        return list(command)
+
+    return mutate
+
+
+def in_weights(folder: Path, chance: random.Random) -> list[str]:
+    """A file of weights that holds something else."""
+    import torch
+
+    tensors = [*odd_tensors(), *ODD]
     name = chance.choice(["encoder.a", "a" * 10_000, "decoder.a", ""])
     if chance.random() < 0.5:
         torch.save({"state_dict": {name: chance.choice(tensors)}}, folder / "weights.ckpt")
@@ -328,8 +436,13 @@ def in_weights(folder: Path, chance: random.Random) -> list[str]:
 
 def posed(kind: str, pattern: str) -> Mutation:
     """A file of a scene of a format of posed photographs, by the table of `pose_files`."""
+    return in_bytes(f"{kind}/{pattern}", scene_words(kind))
+
+
+def scene_words(kind: str) -> list[str]:
+    """The command that completes a scene of a format of posed photographs."""
     words = ["complete", kind, "--context", "0", "1", "--target", "2", "--out", "out", "--quiet"]
-    return in_bytes(f"{kind}/{pattern}", [*words, "--resolution", str(SIZE), str(SIZE)])
+    return [*words, "--resolution", str(SIZE), str(SIZE)]
 
 
 def splat(name: str, pattern: str = "") -> Mutation:
@@ -340,6 +453,9 @@ def splat(name: str, pattern: str = "") -> Mutation:
 
 RANGE = ["--near", "0.5", "--far", "20"]
 SCORES = ["--methods", "context", "--out", "run", "--quiet"]
+CLIPS = ["index", "clips", "--protocol", "n-1", "--out", "i"]
+CHUNKS = ["evaluate", "chunks", "--protocol", "n-1", "--limit", "1", *SCORES]
+DRIVE = "kitti-raw/2011_09_26_drive_0001_sync"
 ALONE = ["poses", "photographs/images", "--out", "out", "--quiet"]
 KINDS: dict[str, Mutation] = {
     "transforms": in_json("scene/transforms.json", [*COMPLETE, "2", *RANGE]),
@@ -355,10 +471,8 @@ KINDS: dict[str, Mutation] = {
     "chunk": in_bytes(
         "chunks/000000.torch", ["index", "chunks", "--protocol", "n-1", "--out", "i"]
     ),
-    "chunk-run": in_bytes(
-        "chunks/000000.torch", ["evaluate", "chunks", "--protocol", "n-1", "--limit", "1", *SCORES]
-    ),
-    "txt": in_bytes("clips/room.txt", ["index", "clips", "--protocol", "n-1", "--out", "i"]),
+    "chunk-run": in_bytes("chunks/000000.torch", CHUNKS),
+    "txt": in_bytes("clips/room.txt", CLIPS),
     "colmap-binary": posed("colmap-binary", "sparse/0/*.bin"),
     "colmap-text": posed("colmap-text", "sparse/*.txt"),
     "cameras-json": posed("cameras-json", "cameras.json"),
@@ -381,6 +495,25 @@ KINDS: dict[str, Mutation] = {
     "sog": splat("scene.sog"),
     "sog-folder": splat("folder", "/*"),
     "glb": splat("scene.glb"),
+    "infos": in_infos,
+    "chunk-values": in_chunk,
+    "sweep": in_sweep,
+    "kitti-raw": in_bytes("kitti-raw/**/*.txt", scene_words(DRIVE)),
+    "kitti-long": long_line("kitti/*.txt", scene_words("kitti")),
+    "kitti-raw-long": long_line("kitti-raw/**/*.txt", scene_words(DRIVE)),
+    "colmap-long": long_line("colmap-text/sparse/*.txt", scene_words("colmap-text")),
+    "txt-long": long_line("clips/room.txt", CLIPS),
+    "txt-file": not_a_file("clips/room.txt", CLIPS),
+    "scene-file": not_a_file("scene/*", [*COMPLETE, "2", *RANGE]),
+    "kitti-file": not_a_file("kitti/**/*.*", scene_words("kitti")),
+    "colmap-file": not_a_file("colmap-text/sparse/*", scene_words("colmap-text")),
+    "dgp-file": not_a_file("dgp-swept/**/*.*", scene_words("dgp-swept")),
+    "infos-file": not_a_file("infos/*", scene_words("infos/infos.pkl")),
+    "chunk-file": not_a_file("chunks/*", CHUNKS),
+    "config-file": not_a_file("config.yaml", [*COMPLETE, "2", *RANGE, "--config", "config.yaml"]),
+    "sog-file": not_a_file("splats/folder/*", ["convert", "splats/folder", "out.ply", "--quiet"]),
+    "splat-file": not_a_file("splats/scene.s*", ["convert", "splats/scene.splat", "out.ply"]),
+    "ply-file": not_a_file("small.ply", ["convert", "small.ply", "out.ply", "--quiet"]),
     "yaml": in_yaml,
     "words": in_words,
     "weights": in_weights,
@@ -444,7 +577,7 @@ def finding_of(status: int, outlived: bool, memory: int, log: str, left: set[str
         return f"exit {code}: {log.strip()[-150:]}"
     if memory > MAX_MEMORY:
         return f"takes {memory // 1024:,} MB"
-    if code == 2 and (len(log) > LONGEST_ERROR or log.count("\n") != 1):
+    if code == 2 and (len(log) > LONGEST_ERROR + 1 or log.count("\n") != 1):
         return f"an error of {len(log):,} characters: {log[:80]!r}"
     if code == 2 and left:
         return f"exit 2, and {', '.join(sorted(left)[:3])} was written"

@@ -397,6 +397,11 @@ def test_truncated_and_empty_files_are_refused(tmp_path, name):
         ("images.txt", "1 1 0 0 0 0 0 0", "line 1 of .*images.txt .* IMAGE_ID"),
         ("images.txt", "1 1 0 0 0 0 zero 0 7 0.png", "line 1 of .*images.txt"),
         ("images.txt", "", "lists no images"),
+        (
+            "images.txt",
+            "1 1 0 0 0 0 0 0 7 0.png\n\n2 1 0 0 0 1 0 0 7 0.png",
+            "lists the image 0.png 2 times",
+        ),
         ("images.txt", "1 0 0 0 0 0 0 0 7 0.png", "pose holds NaN"),
         ("points3D.txt", "1 2", "line 1 of .*points3D.txt .* POINT3D_ID"),
         ("points3D.txt", "1 2 3 four 5", "line 1 of .*points3D.txt"),

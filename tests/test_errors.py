@@ -5,11 +5,12 @@ from pathlib import Path
 import pytest
 
 from gscompleter import load_ply, load_splat
+from gscompleter.commands.words import sentence_of
 from gscompleter.data.chunks import open_chunks
 from gscompleter.data.colmap.binary import read_images
 from gscompleter.data.point_cloud import read_point_cloud
 from gscompleter.data.upright import write_upright
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, numbers_listed, quoted
 from gscompleter.io.image import read_pixels
 from gscompleter.weights.reading import check_kind
 
@@ -21,7 +22,7 @@ def test_a_short_value_is_quoted_as_it_is():
 
 def test_a_long_one_keeps_its_two_ends():
     shown = quoted("a" * 60_000 + "b" * 60_000)
-    assert len(shown) <= 100
+    assert len(shown) <= 60
     assert shown.startswith("aaa")
     assert shown.endswith("bbb")
     assert "…" in shown
@@ -34,6 +35,48 @@ def test_a_quote_stays_on_its_line_and_shows_no_control_characters():
 def test_integers_that_python_refuses_to_write_are_described():
     assert quoted(10**5000) == "an integer of about 5,000 digits"
     assert quoted([10**5000]) == "a list that cannot be written out"
+
+
+def test_lists_are_quoted_without_walking_all_of_them():
+    endless: list = []
+    endless += [endless] * 100
+    wide: list = [0] * 10
+    for _ in range(40):
+        wide = [wide] * 10
+    for value in (endless, wide, {"a": wide}, [["x" * 10**6] * 10**4] * 10**4):
+        assert len(quoted(value)) <= 60
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "a" * 10**6,
+        "a b " * 10**5,
+        "\n".join(["line"] * 500),
+        f"{'/folder' * 300}/a.png is none; write {'/other' * 300}/b.png again.",
+        f"There are {' '.join(map(str, range(500)))}; name others.",
+    ],
+    ids=["word", "words", "lines", "paths", "numbers"],
+)
+@pytest.mark.parametrize("argument", [None, "context", "x" * 1000])
+def test_whatever_an_error_is_made_of_it_is_one_line(message, argument):
+    error = InputError(message, argument)
+    shown = f"gscompleter: {sentence_of(error)}"
+    assert 150 < len(shown) <= 300
+    assert "\n" not in shown
+
+
+def test_what_matters_of_a_long_error_is_kept():
+    error = InputError(f"{'/folder' * 60}/a.png is not an image; copy it again.")
+    assert str(error).startswith("/folder")
+    assert str(error).endswith("/a.png is not an image; copy it again.")
+
+
+def test_numbers_are_summarized():
+    assert numbers_listed([]) == ""
+    assert numbers_listed([3]) == "3"
+    assert numbers_listed([2, 1, 0, 2]) == "0-2"
+    assert numbers_listed([*range(40), 52, 60, 61, 70, 80]) == "0-39, 52, 60-61 and 2 others"
 
 
 def test_a_path_has_more_room_and_is_written_plainly():

@@ -275,6 +275,31 @@ def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, number):
     assert tree(results) == before
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, number):
+    code = (
+        "import os, shutil, sys\nfrom gscompleter.interrupts import treat_stops_alike\n"
+        "from gscompleter.io import unfinished\nfrom gscompleter.io.files import output_folder\n"
+        "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\ntreat_stops_alike()\n"
+        "rmtree = shutil.rmtree\n"
+        "def stopped(*words, **others):\n"
+        "    os.kill(os.getpid(), int(sys.argv[2]))\n"
+        "    rmtree(*words, **others)\n"
+        "shutil.rmtree = stopped\n"
+        "try:\n"
+        "    with output_folder(sys.argv[1], overwrite=True) as folder:\n"
+        "        for name in os.listdir(sys.argv[1]): (folder / name).write_text('new')\n"
+        "except KeyboardInterrupt as stop:\n    print(stop)\n"
+    )
+    command = [sys.executable, "-c", code, str(results), str(int(number))]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == f"{results} is complete", done.stderr
+    assert set(tree(results).values()) == {"new"}
+    assert os.listdir(results.parent) == [results.name]
+
+
 def test_the_draft_of_a_living_process_is_left_alone(tmp_path):
     with writing(tmp_path / "out"):
         check_output(tmp_path / "out")

@@ -83,7 +83,7 @@ def test_a_header_is_quoted_in_part(tmp_path):
 
 def test_a_pipe_is_no_scene_and_nobody_waits_for_it(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")
-    assert "is a directory or a device" in sentence(load_ply, tmp_path / "pipe.ply")
+    assert "is not a file but a pipe" in sentence(load_ply, tmp_path / "pipe.ply")
     assert "is not a file" in sentence(read_json, tmp_path / "pipe.ply", "")
 
 

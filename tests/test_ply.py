@@ -188,7 +188,7 @@ def test_a_truncated_file_says_how_much_is_there(tmp_path):
 def test_what_is_no_scene_is_refused(tmp_path):
     refused(tmp_path / "nowhere.ply", "No such file")
     (tmp_path / "folder.ply").mkdir()
-    refused(tmp_path / "folder.ply", "directory")
+    refused(tmp_path / "folder.ply", "folder")
     path = tmp_path / "scene.ply"
     path.write_bytes(b"")
     refused(path, "empty")

@@ -74,7 +74,7 @@ def test_the_file_of_another_model_is_named(mvsplat_file, tmp_path):
 
 def test_without_a_file_it_is_said_where_to_get_it(monkeypatch, tmp_path):
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path))
-    with pytest.raises(InputError, match=r"acid.ckpt .*drive.google.com.* put it at .*acid.ckpt"):
+    with pytest.raises(InputError, match=r"acid.ckpt from .*drive.google.com.* into .*mvsplat"):
         load_reconstructor("mvsplat-acid")
 
 

@@ -75,10 +75,11 @@ def covariances(gaussians: Gaussians) -> torch.Tensor:
     return axes @ axes.transpose(1, 2)
 
 
-def refused(path: Path, sentence: str) -> None:
+def refused(path: Path, sentence: str) -> str:
     with pytest.raises(InputError, match=sentence) as caught:
         load_splat(path)
     assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 # ------------------------------------------------------------------------------- round trips
@@ -383,6 +384,54 @@ def test_numbers_that_are_none_are_counted_or_left_out(tmp_path, name):
         path.write_bytes(data)
     refused(path, "1 of 20 Gaussians with NaN")
     assert len(load_splat(path, drop_nonfinite=True)) == 19
+
+
+def of_three(sizes: float, opacity: float) -> Gaussians:
+    """Three Gaussians, of which the second has other sizes and another opacity."""
+    gaussians = plausible(3, 0)
+    scales, opacities = gaussians.scales.clone(), gaussians.opacities.clone()
+    scales[1] *= sizes
+    opacities[1] = opacity
+    return replace(gaussians, scales=scales, opacities=opacities)
+
+
+@pytest.mark.parametrize("name", ["scene.ksplat", "scene.splat", "scene.glb"])
+def test_negative_scales_are_refused(tmp_path, name):
+    path = made(tmp_path, name, of_three(-1, 0.5))
+    refused(path, "has 1 of 3 Gaussians with a negative scale or an opacity outside of")
+
+
+@pytest.mark.parametrize("opacity", [2.0, -0.5, 1e30])
+def test_opacities_that_are_no_fractions_are_refused(tmp_path, opacity):
+    path = made(tmp_path, "scene.glb", of_three(1, opacity))
+    refused(path, "has 1 of 3 Gaussians with a negative scale or an opacity outside of")
+
+
+def test_opacities_that_are_off_by_rounding_are_clamped(tmp_path):
+    for opacity, clamped in ((1.0001, 1.0), (-0.0001, 0.0)):
+        loaded = load_splat(made(tmp_path, "scene.glb", of_three(1, opacity)))
+        assert loaded.opacities[1] == clamped
+
+
+def test_names_and_versions_of_others_are_quoted_in_part(tmp_path):
+    long = "a\n" * 5000
+    path = made(tmp_path, "folder", plausible(20, 1))
+    table = json.loads((path / "meta.json").read_text())
+    for changed in (
+        {**table, "version": long},
+        {**table, "count": long},
+        {**table, "count": [long]},
+        {**table, "means": {**table["means"], "files": [long, long]}},
+        {**table, "means": {**table["means"], "mins": [long] * 3}},
+        {**table, "means": {long: 1}},
+    ):
+        (path / "meta.json").write_text(json.dumps(changed))
+        assert len(refused(path, "version|means nothing|names a file")) <= 287
+    gaussians, binary = glb_table(plausible(20, 0))
+    primitive = gaussians["meshes"][0]["primitives"][0]
+    primitive["extensions"]["KHR_gaussian_splatting"] = {"kernel": long, "colorSpace": long}
+    primitive["extensions"][long] = {}
+    assert len(refused(write_glb(tmp_path / "long.glb", gaussians, binary), "not known")) <= 287
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):

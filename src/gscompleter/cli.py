@@ -38,7 +38,7 @@ from gscompleter.commands.warmup import WarmupOptions
 from gscompleter.commands.words import read_words, sentence_of
 from gscompleter.compilation import begin
 from gscompleter.config.settings import checked
-from gscompleter.errors import InputError
+from gscompleter.errors import PROGRAM, InputError
 from gscompleter.garbage import staying
 from gscompleter.interrupts import treat_stops_alike
 from gscompleter.threads import bound_threads
@@ -119,7 +119,7 @@ def main() -> None:
             command = getattr(import_module(module), function)
         command(options)
     except InputError as error:
-        print(f"gscompleter: {sentence_of(error)}", file=sys.stderr)
+        print(f"{PROGRAM}{sentence_of(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
         goes_on = words[:1] in (["batch"], ["evaluate"])

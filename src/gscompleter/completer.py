@@ -87,6 +87,8 @@ MAX_TARGETS = 255
 
 UNSEEN = 0.1
 """Share of what the target sees of a Gaussian, below which no photograph shows it."""
+COLOUR_SLACK = 0.01
+"""By how much a colour may lie outside of [0, 1], as resampling leaves it."""
 MIN_COVER = 0.5
 """Pixels of a hole that a Gaussian has to cover to stand in the way."""
 
@@ -226,6 +228,7 @@ class GSCompleter:
                 "frames, or bring a scene."
             )
         views = sort_by_frame(views)
+        check_values([*views, *(witnesses or ())], scene)
         if scene is None:
             return self.begin_with(self.reconstruct(views))
         clock = Clock()
@@ -814,6 +817,24 @@ def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
     if affine.method == "identity":
         notes.append("There was nothing to fit an affine to; depths were left as predicted.")
     return tuple(notes)
+
+
+def check_values(views: Sequence[View], scene: Gaussians | None) -> None:
+    """Refuse images and Gaussians of values that no stage can work with.
+
+    Raises:
+        InputError: where colours are outside of [0, 1], or the scene holds NaN or infinity.
+    """
+    for number, view in enumerate(views):
+        low, high = (float(bound) for bound in view.image.aminmax())
+        if not (low >= -COLOUR_SLACK and high <= 1 + COLOUR_SLACK):  # nor NaN
+            raise InputError(
+                f"The image of view {number} has values from {low:g} to {high:g}; colours in "
+                "[0, 1] are needed."
+            )
+    parts = () if scene is None else (scene.means, scene.quats, scene.scales, scene.opacities)
+    if not all(bool(part.isfinite().all()) for part in parts):
+        raise InputError("The scene holds NaN or infinity; leave such Gaussians out.")
 
 
 class Clock:

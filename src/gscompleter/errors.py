@@ -1,10 +1,17 @@
 """What the user is told when the input is wrong."""
 
 import os
+from collections.abc import Iterable
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
+from reprlib import Repr
 
-LONGEST_QUOTE = 100
+PROGRAM = "gscompleter: "
+"""Printed before every error message."""
+LONGEST_MESSAGE = 300
+"""Characters of an error message as the command line prints it."""
+LONGEST_QUOTE = 60
 """Characters of the input that a sentence quotes at most."""
 LONGEST_PATH = 250
 """The same of a path, which one may want to copy."""
@@ -17,14 +24,19 @@ class InputError(ValueError):
     """The input is wrong, and the user can mend it.
 
     Its message is one sentence: what was given, what is needed, what to do. The command
-    line prints it without a traceback and exits with code 2.
+    line prints it without a traceback and exits with code 2. Whatever the message holds, it is
+    shown on one line, whose length with the names of program and option is `LONGEST_MESSAGE`.
     """
 
     def __init__(self, message: str, argument: str | None = None) -> None:
         """The `argument` of the function, or the name of the setting, that the user can mend. The
         command line names its option of that name."""
         super().__init__(message)
-        self.argument = argument
+        self.argument = None if argument is None else quoted(argument)
+
+    def __str__(self) -> str:
+        option = 0 if self.argument is None else len(f" (--{self.argument}).")
+        return shortened(super().__str__(), LONGEST_MESSAGE - len(PROGRAM) - option)
 
 
 class OutputError(InputError):
@@ -52,6 +64,37 @@ def quoted(value: object, length: int | None = None) -> str:
     return f"{line[:half]}…{line[-half:]}"
 
 
+def shortened(message: str, most: int) -> str:
+    """Fit a message into one line of `most` characters.
+
+    The longest words, such as paths, are cut first, then the middle of the message.
+    """
+    line = " ".join(part.strip() for part in message.splitlines())
+    words = quoted(line, 100 * most).split(" ")
+    while (excess := len(" ".join(words)) - most) > 0:
+        longest = max(range(len(words)), key=lambda i: len(words[i]))
+        length = max(len(words[longest]) - excess, LONGEST_QUOTE)
+        if length >= len(words[longest]):
+            break
+        words[longest] = quoted(words[longest], length)
+    return quoted(" ".join(words), most)
+
+
+def numbers_listed(numbers: Iterable[int], most: int = 3) -> str:
+    """Write whole numbers for a sentence, as in "0-39, 52 and 12 others".
+
+    Args:
+        numbers: In any order.
+        most: Runs of consecutive numbers that are written out.
+    """
+    found = sorted(set(numbers))
+    starts = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(found)) if b != a + 1), len(found)]
+    runs = [found[start:stop] for start, stop in pairwise(starts)]
+    shown = ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs[:most] if r)
+    others = sum(map(len, runs[most:]))
+    return f"{shown} and {others} others" if others else shown
+
+
 def refuse_pointer(path: Path) -> None:
     """Refuse what git-lfs leaves in place of a file until it is fetched.
 
@@ -60,6 +103,8 @@ def refuse_pointer(path: Path) -> None:
     Raises:
         InputError: where the file is such a pointer.
     """
+    if not os.path.isfile(path):
+        return
     with suppress(OSError), path.open("rb") as file:
         if file.read(len(POINTER)) == POINTER:
             raise InputError(
@@ -68,11 +113,17 @@ def refuse_pointer(path: Path) -> None:
             )
 
 
+_REPR = Repr()
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 4, 4 * LONGEST_QUOTE, 4 * LONGEST_QUOTE
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = LONGEST_QUOTE // 2
+_REPR.maxlong = 4 * LONGEST_QUOTE
+
+
 def _written(value: object) -> str:
-    """`repr`, which refuses integers of more than 4,300 digits."""
+    """Write a value as Python does, as far as a sentence can hold it."""
     if isinstance(value, int) and value.bit_length() > 4 * LONGEST_QUOTE:
         return f"an integer of about {value.bit_length() * 0.30103:,.0f} digits"
     try:
-        return repr(value)
-    except (ValueError, RecursionError):
+        return _REPR.repr(value)
+    except (ValueError, RecursionError):  # integers of more than 4,300 digits are among them
         return f"a {type(value).__name__} that cannot be written out"

@@ -11,6 +11,7 @@ Values are frozen: a stage returns new ones and writes to none it was given.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -21,9 +22,13 @@ from jaxtyping import Bool, Float, Int, Int64, Shaped, UInt8
 from torch import Tensor
 
 from gscompleter.coverage import COVERED
+from gscompleter.errors import InputError
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
+
+MAX_RIGID_ERROR = 1e-3
+"""Largest entry of RᵀR - I that still counts as rounding of a rotation R."""
 
 M = TypeVar("M", bound="Movable")
 
@@ -52,6 +57,14 @@ class Camera(Movable):
     """Smallest z-depth of the scene, in scene units; None where it is not known."""
     far: float | None = None
     """Largest z-depth of the scene, in scene units; None where it is not known."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError if no camera is like that; values that lie on a GPU stay unread."""
+        defect = _planes_defect(self.near, self.far) or (
+            _pose_defect(self.c2w) or _intrinsics_defect(self.K, self.width, self.height)
+        )
+        if defect is not None:
+            raise InputError(f"There is no such camera: {defect}.")
 
     @property
     def center(self) -> Float[Tensor, "3"]:
@@ -93,6 +106,49 @@ class Camera(Movable):
         return pixels @ torch.linalg.inv(self.K).T @ self.c2w[:3, :3].T
 
 
+def _planes_defect(near: float | None, far: float | None) -> str | None:
+    """Find what makes depth planes impossible; None if nothing does."""
+    for name, plane in (("near", near), ("far", far)):
+        if plane is not None and not 0 < plane < math.inf:
+            return f"its {name} plane is at {plane:g}, and a positive z-depth is needed"
+    if near is not None and far is not None and near >= far:
+        return f"its near plane at {near:g} is not before its far plane at {far:g}"
+    return None
+
+
+def _pose_defect(c2w: Float[Tensor, "4 4"]) -> str | None:
+    """Find what makes a pose impossible; None if nothing does. Plain floats are the fastest way."""
+    if not isinstance(c2w, Tensor) or c2w.shape != (4, 4) or not c2w.is_floating_point():
+        return "its pose is no tensor of 4 × 4 floats"
+    if c2w.device.type != "cpu":
+        return None
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = c2w.tolist()
+    if not math.isfinite(a + b + c + d + e + f + g + h + i + x + y + z):
+        return "its pose holds NaN or infinity"
+    lengths = (a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i)
+    angles = (a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i)
+    errors = (*(length - 1 for length in lengths), *angles, *last[:3], last[3] - 1)
+    if not max(map(abs, errors)) <= MAX_RIGID_ERROR:
+        return "its pose is no rotation and translation but scaled, sheared or projective"
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
+        return "its pose is left-handed; mirror one of its axes"
+    return None
+
+
+def _intrinsics_defect(K: Float[Tensor, "3 3"], width: int, height: int) -> str | None:
+    """Find what makes intrinsics impossible; None if nothing does."""
+    if not isinstance(K, Tensor) or K.shape != (3, 3) or not K.is_floating_point():
+        return "its K is no tensor of 3 × 3 floats"
+    if width < 1 or height < 1:
+        return f"its image has {width} × {height} pixels"
+    if K.device.type != "cpu":
+        return None
+    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
+    if not (fx > 0 and fy > 0 and math.isfinite(fx + fy + cx + cy + skew)):
+        return f"its focal lengths are {fx:g} and {fy:g}, its centre is ({cx:g}, {cy:g})"
+    return None
+
+
 @dataclass(frozen=True)
 class Window:
     """A target camera, and the wider one that it is completed with."""
@@ -127,6 +183,26 @@ class View(Movable):
     contradicted: Bool[Tensor, "h w"] | None = None
     """True where other photographs show something else in its place, so that something moved: what
     is completed takes nothing from there. None where that was not asked."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError if the image, or a map of it, has another size than the camera."""
+        size = self.camera.height, self.camera.width
+        image = self.image
+        if (
+            not isinstance(image, Tensor)
+            or image.shape[2:] != (3,)
+            or not image.is_floating_point()
+        ):
+            raise InputError(
+                "The image of a view is no tensor of floats of shape [h, w, 3]; convert it."
+            )
+        for name in ("image", "depth", "ignored", "contradicted"):
+            pixels = getattr(self, name)
+            if pixels is not None and tuple(pixels.shape[:2]) != size:
+                raise InputError(
+                    f"The {name} of a view has the shape {list(pixels.shape)}, and its camera has "
+                    f"{size[0]} × {size[1]} pixels (height × width); resize one of them."
+                )
 
     @property
     def counted(self) -> Bool[Tensor, "h w"]:

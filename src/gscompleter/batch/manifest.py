@@ -21,6 +21,7 @@ from gscompleter.batch.jobs import Job, check_jobs, slug
 from gscompleter.batch.places import is_address, store_of
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.unfinished import MARK
+from gscompleter.reading import read_bytes
 
 FOLDER, NAME = "folder", "name"
 """What every row has: where the scene lies, and what the job is called."""
@@ -100,9 +101,7 @@ def text_of(manifest: str) -> str:
     try:
         if is_address(manifest):
             return bytes(store_of(manifest).cat_file(manifest)).decode("utf-8-sig")
-        if os.path.getsize(manifest) > LONGEST_FILE:
-            raise InputError(f"The manifest {quoted(manifest)} is too long; divide it.")
-        return Path(manifest).read_text(encoding="utf-8-sig")
+        return read_bytes(Path(manifest), LONGEST_FILE).decode("utf-8-sig")
     except OSError as error:
         reason = error.strerror or str(error)
         raise InputError(f"The manifest {quoted(manifest)} cannot be read: {reason}.") from error

@@ -25,7 +25,7 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sparse_points import with_depth_range
 from gscompleter.data.structure_from_motion import POSES, find_poses, holds_photographs
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, numbers_listed, quoted
 from gscompleter.frames.beside import GivenSplat
 from gscompleter.frames.placing import frame_of_splat
 from gscompleter.frames.similarity import moved_camera, moved_view
@@ -294,8 +294,9 @@ def check_context(options: SceneOptions) -> None:
             "name more, as in --context 0 4, or leave it out."
         )
     if context is not None and len(set(context)) < len(context):
+        twice = [frame for frame in context if context.count(frame) > 1]
         raise InputError(
-            f"--context names a frame twice ({' '.join(map(str, context))}), which gives "
+            f"--context names {numbers_listed(twice)} twice, which gives "
             "identical cameras and no baseline; name different frames."
         )
 

@@ -9,9 +9,12 @@ from typing import Any
 import yaml
 
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import read_bytes
 
 LONGEST_FILE = 65_536
-"""Characters of a file beyond which it holds no settings."""
+"""Bytes of a file beyond which it holds no settings."""
+LONGEST_REASON = 120
+"""Characters of what PyYAML objects to."""
 
 
 class PlainLoader(yaml.SafeLoader):
@@ -29,22 +32,18 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises:
         InputError: where it cannot be read, is no YAML, holds something else, or is too long.
     """
+    name, data = f"The config {quoted(path)}", read_bytes(path, LONGEST_FILE)
     try:
-        with path.open() as file:
-            text = file.read(LONGEST_FILE + 1)
-        content = json.loads(json.dumps(yaml.load(text, PlainLoader), default=str))
-    except OSError as error:
-        raise InputError(f"Cannot read the config {path}: {error.strerror}.") from error
+        content = json.loads(json.dumps(yaml.load(data.decode(), PlainLoader), default=str))
     except RecursionError as error:
-        raise InputError(f"The config {path} is nested too deeply.") from error
-    except (yaml.YAMLError, ValueError, TypeError) as error:
-        raise InputError(
-            f"The config {path} is not YAML: {quoted(' '.join(str(error).split()))}."
-        ) from error
-    if len(text) > LONGEST_FILE:
-        raise InputError(f"The config {path} has more than {LONGEST_FILE:,} characters.")
+        raise InputError(f"{name} is nested too deeply.") from error
+    except Exception as error:  # PyYAML fails in many ways, KeyError and IndexError among them
+        mark = getattr(error, "problem_mark", None)
+        place = "" if mark is None else f" in line {mark.line + 1}"
+        reason = f"{quoted(getattr(error, 'problem', None) or str(error), LONGEST_REASON)}{place}"
+        raise InputError(f"{name} is not YAML: {reason}.") from error
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise InputError(f"The config {path} must map settings to values, as in `holes: ...`.")
+        raise InputError(f"{name} must map settings to values, as in `holes: ...`.")
     return content

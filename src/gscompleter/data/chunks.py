@@ -23,6 +23,7 @@ from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.real_estate import intrinsics_and_pose
 from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.json_file import read_json
+from gscompleter.reading import check_file
 
 TEST = "test"
 """The half of a data set that is evaluated on, in a folder of its own."""
@@ -112,26 +113,19 @@ def _scenes_of(path: Path) -> Iterator[Photographs]:
 
 def _load_chunk(path: Path) -> list[Any]:
     """The scenes of a chunk, not checked one by one."""
-    try:
-        written = path.stat().st_mtime_ns
-    except OSError:
-        written = 0  # what is wrong with it is found out by reading it
-    return _read_chunk(path, written)
+    check_file(path)
+    return _read_chunk(path, path.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=1)
 def _read_chunk(path: Path, _written: int) -> list[Any]:
     """The last one stays in memory, for the frames that are asked for one after the other."""
-    if not os.path.isfile(path):
-        raise InputError(f"There is no chunk {path}; download it, or take it out of the index.")
     refuse_pointer(path)
     try:
         with warnings.catch_warnings():
             # About pickle protocols, in the moment before the file is refused.
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except MemoryError:
-        raise
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
     # On damaged bytes the unpickler raises whatever the next instruction leads to.
@@ -151,6 +145,8 @@ def _cannot_load(path: Path, error: Exception) -> str:
             f"{path} holds pickled Python objects, which are refused because loading them can "
             "run any code; save it again with tensors, strings, lists and dicts only."
         )
+    if isinstance(error, MemoryError) or "allocate memory" in str(error):
+        return f"{path} asks for more memory than there is; divide it, or download it again."
     return f"{path} is truncated or no file of torch.save; download it again."
 
 
@@ -180,7 +176,7 @@ def _photographs(example: Any, path: Path, position: int) -> Photographs:
                 "PNG file are needed, uint8 of one dimension."
             )
     frames = []
-    for number, row in enumerate(cameras.double().numpy()):
+    for number, row in enumerate(cameras.detach().double().numpy()):
         intrinsics, c2w = intrinsics_and_pose(row)
         image = partial(_image_bytes, path, position, number)
         title = f"frame {number} of the {called}"
@@ -190,19 +186,24 @@ def _photographs(example: Any, path: Path, position: int) -> Photographs:
 
 def _image_bytes(path: Path, position: int, number: int) -> bytes:
     """An image file of a chunk, of which nothing else stays in memory."""
-    data: bytes = _load_chunk(path)[position]["images"][number].numpy().tobytes()
+    data: bytes = _load_chunk(path)[position]["images"][number].detach().numpy().tobytes()
     return data
 
 
 def _is_dense(value: Any, ndim: int) -> TypeGuard[Tensor]:
     """Whether it is a tensor of `ndim` dimensions that holds a number for each of its entries."""
-    if not isinstance(value, Tensor) or value.ndim != ndim:
+    if not isinstance(value, Tensor) or value.is_nested or value.ndim != ndim:
         return False
-    return value.layout == torch.strided and not value.is_meta
+    if value.layout != torch.strided or value.is_meta or value.is_quantized:
+        return False
+    return value.untyped_storage().nbytes() >= value.numel() * value.element_size()
 
 
 def _described(value: Any) -> str:
     if isinstance(value, Tensor):
+        if value.is_nested:
+            return "a nested tensor"
         kind = "" if _is_dense(value, value.ndim) else "sparse or empty "
-        return f"{kind}{str(value.dtype).removeprefix('torch.')} of shape {list(value.shape)}"
+        shape = quoted(list(value.shape))
+        return f"{kind}{str(value.dtype).removeprefix('torch.')} of shape {shape}"
     return f"of type {type(value).__name__}"

@@ -25,11 +25,14 @@ from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import rotation_of
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.json_file import read_json
+from gscompleter.reading import open_file, read_head
 
 CALIBRATIONS = "calibration"
 ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26
 """Bytes at the beginning of a file that tell whether it is a scene."""
+MAX_SWEEP = 1 << 28
+"""Bytes of the points of a sweep."""
 
 
 def holds_dgp(path: Path) -> bool:
@@ -104,12 +107,29 @@ def _sweeps(content: Any) -> dict[str, Any]:
 def _points(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
     """The points of a sweep in the world frame: the first three columns of its array `data`."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            points = arrays["data"][:, :3].astype(np.float64)
-    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
+        with open_file(path) as file, zipfile.ZipFile(file) as archive:
+            points = _array(archive, "data.npy")
+        finite = points[np.isfinite(points).all(axis=1)]
+    except InputError:
+        raise
+    except Exception as error:  # a damaged archive or array fails in any way
         raise InputError(f"{quoted(path)} is no point cloud of DGP; {ADVICE}.") from error
-    finite = points[np.isfinite(points).all(axis=1)]
     return finite @ world_from_laser[:3, :3].T + world_from_laser[:3, 3]
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> Float[np.ndarray, "n 3"]:
+    """Read the first three columns of an array that is no larger than it may be.
+
+    Raises:
+        ValueError: if it is, or is no table of numbers.
+    """
+    if archive.getinfo(name).file_size > MAX_SWEEP:
+        raise ValueError
+    with archive.open(name) as file:
+        table = np.lib.format.read_array(file, allow_pickle=False)
+    if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "fiu":
+        raise ValueError
+    return table[:, :3].astype(np.float64)
 
 
 def _pose(pose: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
@@ -171,8 +191,7 @@ def _scene_file(path: Path) -> Path | None:
 def _is_scene(path: Path) -> bool:
     if path.suffix != ".json" or not os.path.isfile(path):
         return False
-    with path.open("rb") as file:
-        return b'"datum"' in file.read(MAX_SNIFFED)
+    return b'"datum"' in read_head(path, MAX_SNIFFED)
 
 
 def _list(content: Any, key: str) -> list[Any]:

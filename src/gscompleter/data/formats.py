@@ -85,7 +85,7 @@ def open_photographs(
     scenes = list(islice(FORMATS[found].open(path), 2))
     if len(scenes) > 1:
         raise InputError(
-            f"{quoted(str(path))} holds several scenes, such as {quoted(scenes[0].name)} and "
+            f"{quoted(path)} holds several scenes, such as {quoted(scenes[0].name)} and "
             f"{quoted(scenes[1].name)}; name a file or folder with one of them."
         )
     (scene,) = scenes
@@ -106,12 +106,12 @@ def format_of(path: Path, name: str | None = None) -> str:
             f"There is no format '{quoted(name)}'; choose one of {', '.join(FORMATS)}."
         )
     if not os.path.exists(path):
-        raise InputError(f"There is no {quoted(str(path))}; {accepted()}.")
+        raise InputError(f"There is no {quoted(path)}; {accepted()}.")
     found = recognised(path) if name is None else name
     if found is None:
         refuse_other_exports(path)
         refuse_scenes_below(path)
-        raise InputError(f"There are no posed photographs in {quoted(str(path))}; {accepted()}.")
+        raise InputError(f"There are no posed photographs in {quoted(path)}; {accepted()}.")
     return found
 
 

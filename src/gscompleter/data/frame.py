@@ -88,7 +88,7 @@ class Frame:
         """The photograph as it is stored."""
         stored = self.stored()
         if stored is None:
-            place = "restore it" if self.image is None else f"put it at {quoted(str(self.image))}"
+            place = "restore it" if self.image is None else f"put it at {quoted(self.image)}"
             raise InputError(
                 f"The image of {self.title} is missing; {place}, or choose another frame."
             )

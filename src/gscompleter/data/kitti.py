@@ -24,14 +24,13 @@ from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import pose_defect
 from gscompleter.data.velodyne import read_sweep
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import MAX_LINE, read_head, read_lines
 
 POSES, CALIBRATION = "poses.txt", "calib.txt"
 CAMERAS = {"image_2": 2, "image_0": 0, "image_3": 3, "image_1": 1, "image_l": 0, "image_r": 1}
 """Folders of photographs, in the order in which they are looked for, and whose they are."""
 LARGEST = 1e12
 """Of the numbers of a matrix."""
-MAX_LINE = 4096
-"""Of characters of a line of twelve numbers."""
 
 
 def holds_kitti(path: Path) -> bool:
@@ -103,7 +102,7 @@ def rectified(
     K, aside = projection[:3, :3], projection[:3, 3]
     if not _is_upright(K):
         raise InputError(
-            f"The projection of camera {camera} in {quoted(title)} is none of a rectified "
+            f"The projection of camera {camera} in {title} is none of a rectified "
             "camera; name the calib.txt of KITTI odometry."
         )
     transform = np.eye(4)
@@ -119,20 +118,13 @@ def _is_upright(K: Float[np.ndarray, "3 3"]) -> bool:
 
 def _laser(calibration: Path) -> Float[np.ndarray, "4 4"] | None:
     """The transform from the frame of the laser to that of camera 0, where the file has it."""
-    with calibration.open(encoding="utf-8-sig", errors="replace") as file:
-        lines = [line for line in file if line.startswith("Tr")]
+    lines = [line for line in read_lines(calibration) if line.startswith("Tr")]
     return _matrix(lines[0].partition(":")[2]) if lines else None
 
 
 def _matrices(path: Path) -> list[Float[np.ndarray, "4 4"]]:
     """The 3×4 matrices of a file, a line each, with labels such as `P0:` or without."""
-    try:
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            lines = [line for line in file if line.strip() and not line.startswith("Tr")]
-    except OSError as error:
-        raise InputError(
-            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
-        ) from error
+    lines = [line for line in read_lines(path) if line.strip() and not line.startswith("Tr")]
     matrices = [_matrix(line) for line in lines]
     found = [matrix for matrix in matrices if matrix is not None]
     if not found or len(found) < len(matrices):
@@ -141,7 +133,7 @@ def _matrices(path: Path) -> list[Float[np.ndarray, "4 4"]]:
 
 
 def _matrix(line: str) -> Float[np.ndarray, "4 4"] | None:
-    words = re.sub(r"^\s*P\d:", "", line[:MAX_LINE]).split()
+    words = re.sub(r"^\s*P\d:", "", line).split()
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError:
@@ -186,9 +178,6 @@ def _camera_folder(folder: Path) -> tuple[Path, int]:
 
 
 def _begins_with_a_pose(path: Path) -> bool:
-    try:
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            first = _matrix(file.readline(MAX_LINE))
-    except OSError:
-        return False
+    line, _, _ = read_head(path, MAX_LINE).partition(b"\n")
+    first = _matrix(line.decode("utf-8-sig", errors="replace"))
     return first is not None and pose_defect(first) is None

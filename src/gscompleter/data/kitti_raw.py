@@ -17,11 +17,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.frame import Frame
-from gscompleter.data.kitti import LARGEST, MAX_LINE, rectified
+from gscompleter.data.kitti import LARGEST, rectified
 from gscompleter.data.photographs import Photographs, along_a_road
 from gscompleter.data.range_image import poses_of
 from gscompleter.data.velodyne import read_sweep
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import read_lines
 
 EARTH_RADIUS = 6_378_137.0
 """In metres."""
@@ -129,7 +130,7 @@ def _entry(
     found = entries.get(key)
     if found is None or len(found) != count:
         raise InputError(
-            f"{quoted(title)} has no line {key} of {count} numbers; copy it from the same date."
+            f"{title} has no line {key} of {count} numbers; copy it from the same date."
         )
     return found
 
@@ -142,13 +143,7 @@ def _calibration(path: Path) -> dict[str, Float[np.ndarray, "_"]]:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            return [line[:MAX_LINE] for line in file if line.strip()]
-    except OSError as error:
-        raise InputError(
-            f"{quoted(path)} cannot be read: {error.strerror}; copy it from the same drive."
-        ) from error
+    return [line for line in read_lines(path) if line.strip()]
 
 
 def _numbers(text: str) -> Float[np.ndarray, "n"] | None:

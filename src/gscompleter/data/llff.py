@@ -24,6 +24,7 @@ from gscompleter.data.limits import DEPTH_RANGE, MAX_SIDE
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.sparse_points import with_room
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import check_file
 
 NAME = "poses_bounds.npy"
 IMAGES = (".jpg", ".jpeg", ".png")
@@ -93,6 +94,7 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
 
 def _stored_array(path: Path) -> Shaped[np.ndarray, "..."]:
     """The array as the file has it. One that claims more than the file holds is refused."""
+    check_file(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -112,7 +114,7 @@ def _photographs_beside(file: Path, count: int) -> list[Path]:
     found = [_images_in(folder) for folder in folders]
     fitting = next((images for images in found if len(images) == count), None)
     if fitting is None:
-        numbers = ", ".join(f"{len(i)} in {f}" for f, i in zip(folders, found, strict=True))
+        numbers = ", ".join(f"{len(i)} in {f.name}" for f, i in zip(folders, found, strict=True))
         raise InputError(
             f"{quoted(file)} has {count} rows, which belong to as many photographs in order of "
             f"their names, and there are {numbers}; put exactly these into a folder "

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -24,11 +25,14 @@ from gscompleter.data.moving_objects import Box, upright
 from gscompleter.data.photographs import Photographs, along_a_road
 from gscompleter.data.restricted_pickle import load_plain
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import open_file
 
 ADVICE = "write the infos again with mmdetection3d 1.1"
 FRONT = "CAM_FRONT"
 MAX_GAP = 1.5
 """Seconds from one sample to the next of a scene; those of nuScenes are half a second apart."""
+MAX_NUMBER = 1e12
+"""Of the entries of matrices, boxes and speeds."""
 MAX_TIME = 1e12
 """Of a time in seconds."""
 MICROSECONDS = 1e12
@@ -43,10 +47,11 @@ def holds_infos(path: Path) -> bool:
     """Whether `path` is a pickle of infos."""
     if path.suffix != ".pkl" or not os.path.isfile(path):
         return False
-    with path.open("rb") as file:
+    with suppress(InputError), open_file(path) as file:
         head = file.read(MAX_SNIFFED)
         file.seek(max(os.path.getsize(path) - MAX_SNIFFED, 0))
         return b"data_list" in head + file.read() or b"metainfo" in head
+    return False
 
 
 def open_infos(path: Path) -> Iterator[Photographs]:
@@ -84,15 +89,15 @@ class _Sample:
         self.time = time * 1e-6 if time >= MICROSECONDS else time
         first = images.get(FRONT) or next(iter(images.values()))
         file_name = os.path.basename(text_of(first, "img_path", title) or "")
-        self.drive = content.get("context_name") or file_name.split("__")[0]
+        self.drive = text_of(content, "context_name", title) or file_name.split("__")[0]
 
     def order(self) -> tuple[str, float]:
-        return str(self.drive), self.time
+        return self.drive, self.time
 
     @property
     def vehicle(self) -> Float[np.ndarray, "4 4"]:
         """Its pose in the world."""
-        return array_of(self.content, "ego2global", (4, 4), self.title)
+        return _numbers(self.content, "ego2global", (4, 4), self.title)
 
     @property
     def vehicle_from_laser(self) -> Float[np.ndarray, "4 4"]:
@@ -100,7 +105,7 @@ class _Sample:
         lidar = self.content.get("lidar_points")
         if not isinstance(lidar, dict) or "lidar2ego" not in lidar:
             return np.eye(4)
-        return array_of(lidar, "lidar2ego", (4, 4), self.title)
+        return _numbers(lidar, "lidar2ego", (4, 4), self.title)
 
 
 def _told(sample: Any, path: Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str]:
@@ -109,14 +114,19 @@ def _told(sample: Any, path: Path) -> tuple[dict[str, Any], dict[str, dict[str, 
     images = sample.get("images") if isinstance(sample, dict) else None
     if not isinstance(images, dict):
         raise InputError(f"An entry of {quoted(path)} has no `images`; {ADVICE}.")
-    there = {name: image for name, image in images.items() if _is_posed(image)}
+    there = {
+        quoted(name): image
+        for name, image in images.items()
+        if isinstance(name, str) and _is_posed(image)
+    }
     if not there:
         raise InputError(f"The images of {title} have no file or no pose; {ADVICE}.")
     return sample, there, title
 
 
 def _is_posed(image: Any) -> bool:
-    return isinstance(image, dict) and {"img_path", "cam2img", "lidar2cam"} <= image.keys()
+    needed = ("img_path", "cam2img", "lidar2cam")
+    return isinstance(image, dict) and all(image.get(key) is not None for key in needed)
 
 
 def _scenes(samples: list[_Sample]) -> Iterator[list[_Sample]]:
@@ -143,13 +153,15 @@ def _frame(sample: _Sample, camera: str) -> Frame:
     title = f"the photograph of {camera} at {sample.time:.3f} in {quoted(sample.file)}"
     file = text_of(image, "img_path", title)
     assert file is not None
-    laser_from_camera = _inverse(array_of(image, "lidar2cam", (4, 4), title))
+    laser_from_camera = _inverse(_numbers(image, "lidar2cam", (4, 4), title))
+    with np.errstate(over="ignore", invalid="ignore"):  # which leaves a defect of the pose
+        # By way of the laser: between its time and the camera's the vehicle has moved, and
+        # lidar2cam knows of it.
+        c2w = sample.vehicle @ sample.vehicle_from_laser @ laser_from_camera
     return Frame(
         f"{camera}/{os.path.basename(file)}",
         title,
-        # By way of the laser: between its time and the camera's the vehicle has moved, and
-        # lidar2cam knows of it.
-        sample.vehicle @ sample.vehicle_from_laser @ laser_from_camera,
+        c2w,
         _intrinsics(image, title),
         _place(sample.file.parent, file, camera),
         sensor=camera,
@@ -166,8 +178,9 @@ def _inverse(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def _intrinsics(image: Mapping[str, Any], title: str) -> Intrinsics:
-    shape = (3, 4) if len(np.shape(image["cam2img"])) == 2 and _columns(image) == 4 else (3, 3)
-    K = array_of(image, "cam2img", shape, title)
+    rows = image["cam2img"]
+    wide = isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows)
+    K = array_of(image, "cam2img", (3, 4) if wide else (3, 3), title)
     if not np.isfinite(K).all() or np.abs(K).max() > MAX_IN_PIXELS:
         raise InputError(f"The `cam2img` of {title} is impossible; {ADVICE}.")
     sides = [
@@ -177,8 +190,14 @@ def _intrinsics(image: Mapping[str, Any], title: str) -> Intrinsics:
     return Intrinsics(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
 
 
-def _columns(image: Mapping[str, Any]) -> int:
-    return np.shape(image["cam2img"])[1]
+def _numbers(
+    entry: Mapping[str, Any], key: str, shape: tuple[int, ...], title: str
+) -> Float[np.ndarray, "*n"]:
+    """Read the nested list at `key`, of numbers that can be multiplied; NaN may be among them."""
+    array = array_of(entry, key, shape, title)
+    if (np.abs(array) > MAX_NUMBER).any():
+        raise InputError(f"The `{key}` of {title} holds numbers beyond {MAX_NUMBER:g}; {ADVICE}.")
+    return array
 
 
 def _place(folder: Path, file: str, camera: str) -> Path:
@@ -193,7 +212,8 @@ def _place(folder: Path, file: str, camera: str) -> Path:
 def _kinds(metainfo: Any) -> dict[int, str]:
     """The names of things by their labels."""
     kinds = metainfo.get("categories") if isinstance(metainfo, dict) else None
-    return {label: name for name, label in kinds.items()} if isinstance(kinds, dict) else {}
+    pairs = kinds.items() if isinstance(kinds, dict) else ()
+    return {n: kind for kind, n in pairs if isinstance(n, int) and isinstance(kind, str)}
 
 
 def _tells_speeds(sample: _Sample) -> bool:
@@ -209,14 +229,18 @@ def _boxes(sample: _Sample) -> tuple[Box, ...]:
     title = f"a box in {quoted(sample.file)}"
     world = sample.vehicle @ sample.vehicle_from_laser
     things = [thing for thing in sample.content["instances"] if isinstance(thing, dict)]
-    moving = [t for t in things if sample.kinds.get(t.get("bbox_label_3d", -1)) not in FIXED]
-    return tuple(_box(thing, world, title) for thing in moving)
+    return tuple(_box(t, world, title) for t in things if _kind(sample, t) not in FIXED)
+
+
+def _kind(sample: _Sample, thing: Mapping[str, Any]) -> str | None:
+    label = thing.get("bbox_label_3d")
+    return sample.kinds.get(label) if isinstance(label, int) else None
 
 
 def _box(thing: Mapping[str, Any], world: Float[np.ndarray, "4 4"], title: str) -> Box:
-    center, sides, heading = np.split(array_of(thing, "bbox_3d", (7,), title), [3, 6])
+    center, sides, heading = np.split(_numbers(thing, "bbox_3d", (7,), title), [3, 6])
     velocity = (
-        array_of(thing, "velocity", (2,), title) if "velocity" in thing else np.full(2, np.nan)
+        _numbers(thing, "velocity", (2,), title) if "velocity" in thing else np.full(2, np.nan)
     )
     speed = float(np.linalg.norm(velocity))
     length, width, height = sides.tolist()

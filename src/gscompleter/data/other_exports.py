@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from pathlib import Path
 
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import read_head
 
 HEAD = 4096
 """Bytes of a file that tell which program wrote it."""
@@ -59,9 +59,7 @@ def _program_of(file: Path) -> str | None:
 
 
 def _head(file: Path) -> bytes:
-    with suppress(OSError), file.open("rb") as opened:
-        return opened.read(HEAD).removeprefix(b"\xef\xbb\xbf")
-    return b""
+    return read_head(file, HEAD).removeprefix(b"\xef\xbb\xbf")
 
 
 def _is_polycam(path: Path) -> bool:

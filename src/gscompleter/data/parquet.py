@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import check_file
 
 ADVICE = "download it again"
 
@@ -30,6 +31,7 @@ def read_columns(
             f"{quoted(path)} is a parquet file, and pyarrow is not installed; run "
             "`pip install 'gscompleter[waymo]'`."
         ) from error
+    check_file(path)
     try:
         table = dataset.dataset(path, format="parquet")
         _check_columns(path, [*columns, *(where or {})], table.schema.names)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.ply import Element, read_header, read_vertices
+from gscompleter.reading import open_file
 
 AXES = ("x", "y", "z")
 
@@ -20,7 +21,7 @@ def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:
         InputError: where it cannot be read, or is no PLY file with points.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             file_format, elements = read_header(file, path)
             vertex = next((e for e in elements if e.name == "vertex"), None)
             if vertex is None or not _is_table(vertex):

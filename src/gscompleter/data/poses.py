@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.limits import MAX_COORDINATE
+from gscompleter.types import MAX_RIGID_ERROR
 
-MAX_RIGID_ERROR = 1e-3
-"""Largest entry of RᵀR - I that still counts as rounding of a rotation R."""
 FLOAT_NOISE = 1e-6
 """Rotations this close to exact are taken as they are."""
 

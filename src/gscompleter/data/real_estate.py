@@ -14,6 +14,7 @@ from gscompleter.data.intrinsics import FRACTIONS, Intrinsics
 from gscompleter.data.photographs import Photographs, photographs_of
 from gscompleter.data.poses import c2w_of
 from gscompleter.errors import InputError
+from gscompleter.reading import read_head, read_lines
 
 
 def holds_camera_files(path: Path) -> bool:
@@ -45,7 +46,10 @@ def read_camera_file(path: Path) -> Photographs:
     Raises:
         InputError: where it is missing or no such file.
     """
-    lines = [line for line in _read_text(path).splitlines()[1:] if line.strip()]
+    try:
+        lines = [line for line in read_lines(path, errors="strict") if line.strip()][1:]
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file; name a camera file.") from error
     if not lines:
         raise InputError(
             f"{path} lists no frames; below the line with the address, one line a frame is needed."
@@ -89,17 +93,4 @@ def _camera_files(folder: Path) -> list[Path]:
 
 
 def _is_camera_file(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(4) == b"http"
-    except OSError:
-        return False
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; correct the path.") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file; name a camera file.") from error
+    return read_head(path, 4) == b"http"

@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gscompleter.errors import InputError, quoted, refuse_pointer
+from gscompleter.reading import check_plain, read_bytes
 
 MAX_BYTES = 1 << 30
 """Of a file."""
+MAX_REPEATS = 4
+"""Values for each byte of a file; there are more where it repeats itself."""
 NUMBERS = frozenset(["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"])
 """Kinds of numbers that are built."""
 
@@ -30,17 +33,12 @@ def load_plain(path: Path) -> Any:
     """
     refuse_pointer(path)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(
-                f"{quoted(path)} has more than {MAX_BYTES >> 20} MB; split it into smaller files."
-            )
-        return _Plain(io.BytesIO(path.read_bytes())).load()
+        data = read_bytes(path, MAX_BYTES)
+        value = _Plain(io.BytesIO(data)).load()
+        check_plain(value, path, MAX_REPEATS * len(data))
+        return value
     except InputError:
         raise
-    except OSError as error:
-        raise InputError(
-            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
-        ) from error
     except Exception as error:  # a damaged pickle fails in any way that its opcodes can
         raise InputError(
             f"{quoted(path)} is no pickle of plain values ({type(error).__name__}: "
@@ -51,7 +49,10 @@ def load_plain(path: Path) -> Any:
 # The unpickler in C reserves as much memory as a file of a few bytes asks for; that in Python grows
 # with what is there.
 class _Plain(pickle._Unpickler):
-    """An unpickler that knows three names."""
+    """An unpickler that knows three names, and dictionaries with plain keys alone.
+
+    To hash tuples within tuples overflows the stack of the process; sets need that too.
+    """
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
         found = KNOWN.get((module.replace("numpy._core", "numpy.core"), name))
@@ -92,3 +93,30 @@ KNOWN: dict[tuple[str, str], Callable[..., Any]] = {
     ("_codecs", "encode"): _bytes_of,
 }
 """What is built where a pickle has one of these names."""
+
+
+def _guarded(code: bytes, is_plain: Callable[[list[Any]], bool]) -> Callable[[Any], None]:
+    """Load an instruction only where what lies on the unpickler's stack is plain."""
+    load: Callable[[Any], None] = pickle._Unpickler.dispatch[code[0]]
+
+    def guarded(unpickler: Any) -> None:
+        if not is_plain(unpickler.stack):
+            raise pickle.UnpicklingError("it holds a key or an object that is not plain")
+        load(unpickler)
+
+    return guarded
+
+
+def _are_keys(keys: Sequence[Any]) -> bool:
+    return all(key is None or isinstance(key, (str, int, float)) for key in keys)
+
+
+_Plain.dispatch = {
+    **pickle._Unpickler.dispatch,
+    pickle.SETITEM[0]: _guarded(pickle.SETITEM, lambda stack: _are_keys(stack[-2:-1])),
+    pickle.SETITEMS[0]: _guarded(pickle.SETITEMS, lambda stack: _are_keys(stack[::2])),
+    pickle.DICT[0]: _guarded(pickle.DICT, lambda stack: _are_keys(stack[::2])),
+    pickle.BUILD[0]: _guarded(pickle.BUILD, lambda stack: isinstance(stack[-2], _Kind)),
+}
+for _code in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET):
+    del _Plain.dispatch[_code[0]]

@@ -15,6 +15,7 @@ from PIL import Image, ImageOps
 
 from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.image import FORMATS
+from gscompleter.reading import check_file
 
 MAX_SIDE = 1600
 """Longer side of a copy in pixels. SIFT finds no better places for features in larger ones."""
@@ -52,6 +53,7 @@ def write_upright(root: Path, source: str, folder: Path) -> Upright:
     Raises:
         InputError: where it is damaged or no image, or another copy has its name.
     """
+    check_file(root / source)
     refuse_pointer(root / source)
     try:
         with Image.open(root / source, formats=FORMATS) as image:

@@ -8,9 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import read_bytes
 
 BYTES = 16
 """Of a point."""
+MAX_BYTES = 1 << 28
+"""Of a sweep."""
 
 
 def read_sweep(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
@@ -19,12 +22,7 @@ def read_sweep(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[
     Raises:
         InputError: where the file cannot be read, or is none of whole points.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
-        ) from error
+    data = read_bytes(path, MAX_BYTES)
     if len(data) % BYTES:
         raise InputError(f"{quoted(path)} is truncated: it ends within a point; copy it again.")
     points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)

@@ -149,10 +149,10 @@ def _cameras(segment: Segment) -> dict[int, tuple[Intrinsics, Float[np.ndarray, 
 def _intrinsics(row: dict[str, Any], title: str) -> Intrinsics:
     values = {key: value for key, value in row.items() if key != "pose"}
     if any(value is None or not np.isfinite(value) for value in values.values()):
-        raise InputError(f"A camera in {quoted(title)} lacks intrinsics; {ADVICE}.")
+        raise InputError(f"A camera in {title} lacks intrinsics; {ADVICE}.")
     size = (row["width"], row["height"])
     if not all(1 <= side <= MAX_SIDE for side in size):
-        raise InputError(f"A camera in {quoted(title)} has images of {size} pixels; {ADVICE}.")
+        raise InputError(f"A camera in {title} has images of {size} pixels; {ADVICE}.")
     return Intrinsics(
         size,
         (row["f_u"], row["f_v"]),
@@ -227,7 +227,7 @@ def _vehicle(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
         _matrix(row["pose"], title) for row in segment.rows("vehicle_pose", columns, time=time)
     ]
     if len(found) != 1:
-        raise InputError(f"{quoted(title)} has {len(found)} poses at {time}; {ADVICE}.")
+        raise InputError(f"{title} has {len(found)} poses at {time}; {ADVICE}.")
     return found[0]
 
 
@@ -290,5 +290,5 @@ def _box(row: dict[str, Any], vehicle: Float[np.ndarray, "4 4"]) -> Box:
 def _matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:
     """A transform from its 16 numbers, row by row."""
     if values is None or len(values) != 16 or not np.isfinite(values).all():
-        raise InputError(f"A transform in {quoted(title)} is damaged; {ADVICE}.")
+        raise InputError(f"A transform in {title} is damaged; {ADVICE}.")
     return np.asarray(values, dtype=np.float64).reshape(4, 4)

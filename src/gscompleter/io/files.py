@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gscompleter.errors import InputError, OutputError, quoted
+from gscompleter.interrupts import stops_deferred
 from gscompleter.io.unfinished import (
     MARK,
     abandoned,
@@ -68,7 +69,8 @@ def replacing(path: Path | str, first_stays: bool = False) -> Iterator[BinaryIO]
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         remove_abandoned(target.parent)
-        temporary, opened = create_file(target.parent)
+        with stops_deferred():
+            temporary, opened = create_file(target.parent)
         with opened as file:
             yield file
             file.flush()
@@ -108,7 +110,8 @@ def check_output(path: Path | str, overwrite: bool = False) -> None:
         InputError: where `path` is a file, is a folder with something in it while `overwrite`
             is off, or cannot be created or written to.
     """
-    _Draft(Path(path), overwrite).close()
+    with stops_deferred():
+        _Draft(Path(path), overwrite).close()
 
 
 @contextlib.contextmanager
@@ -120,23 +123,33 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     working directory, other files in it), it stays the folder it is: the new entries replace
     those of the same name by renames, the summary last, and everything else in it is left alone;
     should the process be killed meanwhile, the next run finishes the renames. After any exception,
-    an interrupt included, `path` is as it was before, and so are its parents.
+    an interrupt included, `path` is as it was before, and so are its parents. An interrupt that
+    comes while the results are given their names waits until that is done.
 
     Raises:
         InputError: as `check_output`, and where the disk is full.
     """
-    draft = _Draft(Path(path), overwrite)
-    with contextlib.closing(draft):
+    draft: _Draft | None = None
+    try:
+        with stops_deferred():
+            draft = _Draft(Path(path), overwrite)
         try:
             yield draft.folder
-            draft.publish()
+            with stops_deferred(f"{quoted(Path(path))} is complete"):
+                draft.publish()
+                draft.close()
         except InputError as error:
             # The user asked for `path` and need not hear of the temporary name.
-            raise type(error)(str(error).replace(str(draft.folder), str(path))) from error
+            whole = str(error.args[0]).replace(str(draft.folder), str(path))
+            raise type(error)(whole, error.argument) from error
         except OSError as error:
             if error.errno not in _DISK_ERRORS:
                 raise
             raise OutputError(_cannot_write(path, error)) from error
+    finally:
+        with stops_deferred():
+            if draft is not None:
+                draft.close()
 
 
 class _Draft:
@@ -149,6 +162,7 @@ class _Draft:
         except OSError as error:
             raise OutputError(_cannot_write(path, error)) from error
         self.parents: list[Path] = []
+        self.closed = False
         if self.exists:
             _finish_abandoned(self.target)
         _check_free(path, self.target, overwrite)
@@ -207,6 +221,9 @@ class _Draft:
 
     def close(self) -> None:
         """Remove what was not published, and the parents made for it where they are empty."""
+        if self.closed:
+            return
+        self.closed = True
         # What could not be put back is all there is of it; the next run finishes the renames.
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             if not os.listdir(self.folder / _REPLACED):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import check_plain, read_bytes, read_head
+
+MAX_BYTES = 1 << 29
+"""Of a file."""
 
 MAX_DIGITS = 20
 """Of an integer: those of 64 bits have no more. Longer ones fit into no array and no float."""
@@ -21,19 +24,15 @@ def read_json(path: Path, advice: str) -> Any:
     Raises:
         InputError: where it cannot be read, is no JSON, or holds an integer beyond 64 bits.
     """
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise InputError(f"{quoted(path)} is not a file; correct the path.")
+    data = read_bytes(path, MAX_BYTES)
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"), parse_int=_integer)
-    except OSError as error:
-        raise InputError(
-            f"{quoted(path)} cannot be read: {error.strerror}; correct the path, or make it "
-            "readable."
-        ) from error
+        value = json.loads(data.decode("utf-8-sig"), parse_int=_integer)
     except RecursionError as error:
         raise InputError(f"{quoted(path)} is nested too deeply; {advice}.") from error
     except ValueError as error:
         raise InputError(f"{quoted(path)} is not JSON ({quoted(str(error))}); {advice}.") from error
+    check_plain(value, path, len(data))
+    return value
 
 
 def _integer(digits: str) -> int:
@@ -44,8 +43,4 @@ def _integer(digits: str) -> int:
 
 def begins_a_list(path: Path) -> bool:
     """Whether a JSON file holds a list, by its first character."""
-    try:
-        with path.open("rb") as file:
-            return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
-    except OSError:
-        return False
+    return read_head(path, 64).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")

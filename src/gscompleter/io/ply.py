@@ -25,6 +25,7 @@ from torch import Tensor
 from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.files import replacing
 from gscompleter.kernels.sharing import side_by_side
+from gscompleter.reading import open_file
 from gscompleter.types import Gaussians
 
 _SCALARS = {
@@ -273,9 +274,7 @@ def drawable_rows(path: Path) -> Bool[Tensor, "n"]:
 def _read(path: Path) -> Gaussians:
     """All Gaussians of a file, whether or not they can be drawn."""
     try:
-        if os.path.exists(path) and not os.path.isfile(path):
-            raise InputError(f"{quoted(path)} is a directory or a device; a 3DGS .ply is needed.")
-        with path.open("rb") as file:
+        with open_file(path) as file:
             file_format, elements = read_header(file, path)
             is_antialiased = read_mode(file)
             vertex = _gaussian_element(elements, path)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import read_bytes
 from gscompleter.types import SH_C0, Gaussians, observed
 
 SLACK = 1 << 20
@@ -22,10 +23,7 @@ def content(path: Path) -> bytes:
     Raises:
         InputError: where it cannot be read.
     """
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
+    return read_bytes(path)
 
 
 def check_growth(path: Path, unpacked: int, packed: int, most: int) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.io.ply import load_ply, save_ply, whole
+from gscompleter.reading import open_file
 from gscompleter.splats.compressed_ply import (
     is_compressed,
     read_compressed_ply,
@@ -24,6 +25,8 @@ from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import is_spz, read_spz, write_spz
 from gscompleter.types import Gaussians
 
+ROUNDING = 1e-3
+"""By how much an opacity may lie outside of [0, 1]."""
 HEAD = 8192
 """Bytes that tell what a file is: the header of a compressed .ply fits."""
 
@@ -85,8 +88,26 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         gaussians = format_.read(path)
     if len(gaussians) == 0:
         raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
+    gaussians = within_ranges(gaussians, path)
     labelled = replace(gaussians, generated=load_labels(path, len(gaussians)))
     return whole(labelled, path, drop_nonfinite)
+
+
+def within_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
+    """Refuse negative scales and impossible opacities; opacities off by rounding are clamped.
+
+    Raises:
+        InputError: if `gaussians` of the file `path` have some.
+    """
+    opacities = gaussians.opacities
+    bad = (gaussians.scales < 0).any(1) | ((opacities - 0.5).abs() > 0.5 + ROUNDING)
+    bad &= opacities.isfinite()  # others are counted as what is not finite
+    if bad.any():
+        raise InputError(
+            f"{quoted(path)} has {int(bad.sum()):,} of {len(bad):,} Gaussians with a negative "
+            "scale or an opacity outside of [0, 1]; export it again."
+        )
+    return replace(gaussians, opacities=opacities.clamp(0, 1))
 
 
 def save_splat(path: Path | str, gaussians: Gaussians) -> None:
@@ -136,13 +157,8 @@ def format_of(path: Path) -> str:
         if (path / META).is_file():
             return "sog"
         raise InputError(f"{quoted(path)} is a folder without {META}; name a file of Gaussians.")
-    if path.exists() and not path.is_file():
-        raise InputError(f"{quoted(path)} is a device; a file of Gaussians is needed.")
-    try:
-        with path.open("rb") as file:
-            head = file.read(HEAD)
-    except OSError as error:
-        raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
+    with open_file(path) as file:
+        head = file.read(HEAD)
     refuse_pointer(path)
     if not head:
         raise InputError(f"{quoted(path)} is empty; a file of Gaussians is needed.")

@@ -68,7 +68,7 @@ def read_glb(path: Path) -> Gaussians:
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise damaged(path, f"its description means nothing ({str(error)[:80]!r})") from error
+        raise damaged(path, f"its description means nothing ({quoted(str(error))})") from error
     if not parts:
         raise InputError(f"{quoted(path)} holds no Gaussians: nothing in it uses {EXTENSION}.")
     return half_turned(merge(parts), ABOUT_Z)
@@ -155,8 +155,8 @@ def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
     colours = extension.get("colorSpace", COLOURS)
     if packed != EXTENSION or extension.get("kernel", "ellipse") != "ellipse" or colours != COLOURS:
         raise InputError(
-            f"{document.path} holds Gaussians in a way that is not known ({packed}, "
-            f"{extension.get('kernel', 'ellipse')}, {colours}); export it as .ply."
+            f"{document.path} holds Gaussians in a way that is not known ({quoted(packed)}, "
+            f"{quoted(extension.get('kernel', 'ellipse'))}, {quoted(colours)}); export it as .ply."
         )
 
     count = document.table["accessors"][attributes["POSITION"]]["count"]

@@ -74,11 +74,11 @@ class Parts:
         width, height = _webp_size(self.path, data)
         check_growth(self.path, 4 * width * height, len(data), MOST_GROWTH)
         if width * height < needed:
-            raise damaged(self.path, f"{name} has fewer pixels than there are Gaussians")
+            raise damaged(self.path, f"{quoted(name)} has fewer pixels than there are Gaussians")
         try:
             return np.array(Image.open(io.BytesIO(data), formats=["WEBP"]).convert("RGBA"))
         except (OSError, ValueError, SyntaxError, MemoryError) as error:
-            raise damaged(self.path, f"{name} is no image") from error
+            raise damaged(self.path, f"{quoted(name)} is no image") from error
 
 
 def is_sog(head: bytes) -> bool:
@@ -112,9 +112,9 @@ def _entry(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
     try:
         entry = bundle.getinfo(name)
     except KeyError as error:
-        raise damaged(path, f"it has no {name}") from error
+        raise damaged(path, f"it has no {quoted(name)}") from error
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise damaged(path, f"its {name} is packed in a way that bundles are not")
+        raise damaged(path, f"its {quoted(name)} is packed in a way that bundles are not")
     check_growth(path, entry.file_size, entry.compress_size, MOST_DEFLATED)
     with bundle.open(entry) as file:
         return file.read(entry.file_size)
@@ -122,7 +122,7 @@ def _entry(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
 
 def _plain(path: Path, name: object) -> str:
     """The name of a file right beside `meta.json`; nothing else is opened."""
-    if not isinstance(name, str) or not name or Path(name).name != name or "\0" in name:
+    if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable():
         raise damaged(path, f"it names a file '{quoted(name)}', which is none of its own")
     return name
 
@@ -146,13 +146,13 @@ def _read(parts: Parts, meta: str = META) -> Gaussians:
             raise InputError(f"{parts.path} is no .sog: its {meta} describes something else.")
         version = table.get("version", 1)
         if version not in (1, 2):
-            raise InputError(f"{parts.path} is .sog version {version}; 1 and 2 are known.")
+            raise InputError(f"{parts.path} is .sog version {quoted(version)}; 1 and 2 are known.")
         marked = table.get("model") == "antialiased" or table.get("antialias") is True
         return replace(_decoded(parts, table, version), is_antialiased=marked)
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise damaged(parts.path, f"its {meta} means nothing ({str(error)[:80]!r})") from error
+        raise damaged(parts.path, f"its {meta} means nothing ({quoted(str(error))})") from error
 
 
 def _decoded(parts: Parts, table: dict[str, Any], version: int) -> Gaussians:
@@ -218,12 +218,14 @@ def _rest(
     palette = parts.pixels(centroids, 1)
     k = palette.shape[1] // PALETTE_WIDTH
     if k not in COEFFICIENTS[1:] or palette.shape[1] % PALETTE_WIDTH:
-        raise damaged(parts.path, f"{centroids} is no palette of harmonics of degree 1 to 3")
+        raise damaged(
+            parts.path, f"{quoted(centroids)} is no palette of harmonics of degree 1 to 3"
+        )
     rows = palette[:, :, :3].reshape(-1, k, 3)
     label = parts.pixels(labels, count).reshape(-1, 4)[:count].astype(np.int64)
     number = label[:, 0] + 256 * label[:, 1]
     if count and number.max() >= len(rows):
-        raise damaged(parts.path, f"{labels} names harmonics that are not in the palette")
+        raise damaged(parts.path, f"{quoted(labels)} names harmonics that are not in the palette")
     if version == 2:
         return _codebook(table)[rows][number]
     low, high = float(table["mins"]), float(table["maxs"])

@@ -26,7 +26,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from gscompleter.cache import cache_folder
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
 
 LOCK = Path(__file__).with_name("package-lock.json")
@@ -178,12 +178,11 @@ def fetched(package: Package) -> bytes:
     except (OSError, ValueError) as error:
         raise InputError(
             f"{needed(package)}, and {urlsplit(url).netloc or 'its place'} cannot be reached; "
-            f"where there is a connection, fetch {quoted(url)} and put it at "
-            f"{quoted(place_of(package))}."
+            f"fetch {url} and put it at {place_of(package)}."
         ) from error
     if not package.is_intact(archive):
         raise InputError(
-            f"What lies at {quoted(url)} is not {package.name} {package.version} as it was pinned: "
+            f"What lies at {url} is not {package.name} {package.version} as it was pinned: "
             "its SHA-512 differs, and it was not used; try another connection."
         )
     return archive

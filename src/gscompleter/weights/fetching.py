@@ -6,6 +6,9 @@ Nothing here imports torch.
 from __future__ import annotations
 
 import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,6 +16,8 @@ from gscompleter.cache import cache_folder
 from gscompleter.errors import InputError
 from gscompleter.weights.published import PublishedWeights
 
+MAX_RETRIES = 2
+"""Of a request to the hub."""
 INSTALL = "pip install 'gscompleter[models]'"
 
 
@@ -43,7 +48,7 @@ def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = 
         return found
     if weights.repository is None:
         raise WeightsNotAvailable(
-            f"The weights {weights.name} are not on this machine, and no program can fetch them: "
+            f"The weights {weights.name} are not here and no program can fetch them: "
             f"{_by_hand(weights)}."
         )
     return _download(weights, offline)
@@ -83,7 +88,33 @@ def _given(weights: PublishedWeights, local: Path) -> Path:
 
 
 def _by_hand(weights: PublishedWeights) -> str:
-    return f"fetch {weights.file} from {weights.url} and put it at {place_of(weights)}"
+    address = weights.url if weights.repository else f"{weights.file} from {weights.url}"
+    return f"fetch {address} into {place_of(weights).parent}"
+
+
+@contextmanager
+def few_retries() -> Iterator[None]:
+    """Let the hub's library try `MAX_RETRIES` times again, and say nothing of it.
+
+    It has no setting for the number, so the defaults of its functions are others meanwhile.
+    """
+    from huggingface_hub import utils
+
+    functions = (getattr(utils, name, None) for name in ("http_backoff", "http_stream_backoff"))
+    defaults = [getattr(function, "__kwdefaults__", None) or {} for function in functions]
+    changed = [(held, held["max_retries"]) for held in defaults if "max_retries" in held]
+    verbosity = utils.logging.get_verbosity()
+    utils.logging.set_verbosity_error()
+    for held, _ in changed:
+        held["max_retries"] = MAX_RETRIES
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="huggingface_hub")
+            yield
+    finally:
+        utils.logging.set_verbosity(verbosity)
+        for held, retries in changed:
+            held["max_retries"] = retries
 
 
 def _download(weights: PublishedWeights, offline: bool) -> Path:
@@ -93,26 +124,27 @@ def _download(weights: PublishedWeights, offline: bool) -> Path:
         from huggingface_hub.errors import LocalEntryNotFoundError
     except ImportError as error:
         raise WeightsNotAvailable(
-            f"To download the weights {weights.name}, huggingface_hub is needed: {INSTALL}; or "
-            f"{_by_hand(weights)}."
+            f"huggingface_hub is missing: {INSTALL}; or {_by_hand(weights)}."
         ) from error
     offline = offline or constants.HF_HUB_OFFLINE
     try:
-        path = hf_hub_download(
-            weights.repository, weights.file, revision=weights.revision, local_files_only=offline
-        )
+        with few_retries():
+            path = hf_hub_download(
+                weights.repository,
+                weights.file,
+                revision=weights.revision,
+                local_files_only=offline,
+            )
     except LocalEntryNotFoundError as error:
         reason = "downloads are off" if offline else "the hub cannot be reached"
         raise WeightsNotAvailable(
-            f"The weights {weights.name} are not on this machine and {reason}; where there is a "
-            f"connection, {_by_hand(weights)}."
+            f"The weights {weights.name} are not here and {reason}; {_by_hand(weights)}."
         ) from error
     except Exception as error:
         # Which library's errors come through depends on the version of huggingface_hub; whatever
         # it was, the way out is the same.
-        reason = " ".join(str(error).split())
         raise WeightsNotAvailable(
-            f"The weights {weights.name} could not be downloaded ({type(error).__name__}: "
-            f"{reason}); try again, or {_by_hand(weights)}."
+            f"The weights {weights.name} were not downloaded ({type(error).__name__}); "
+            f"{_by_hand(weights)}."
         ) from error
     return Path(path)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gscompleter.errors import InputError, quoted, refuse_pointer
+from gscompleter.reading import open_file
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
 NOT_THE_ENCODERS = ("decoder.", "losses.")
@@ -46,13 +47,8 @@ def check_kind(path: Path, name: str) -> None:
     """Raise an InputError where a file is missing, empty, a pointer, a web page, or cut off."""
     if not os.path.isfile(path):
         raise InputError(f"There is no file {path}; {name} is needed there.")
-    try:
-        with path.open("rb") as file:
-            head = file.read(64)
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be opened ({error.strerror}); make it readable."
-        ) from error
+    with open_file(path) as file:
+        head = file.read(64)
     refuse_pointer(path)
     wrong = ""
     if not head:
@@ -80,8 +76,7 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
                 f"{path} is not the published file {name} but that of {other.name}; choose that "
                 f"model, or fetch {name}."
             )
-    begins = f"its SHA-256 begins with {digest[:8]} instead of {expected[:8]}"
-    raise _broken(path, f"is not the published file {name}: {begins}", name)
+    raise _broken(path, f"is not the published file (SHA-256 {digest[:8]})", name)
 
 
 def sha256_of(path: Path) -> str:
@@ -194,7 +189,10 @@ def is_plain(tensor: Tensor) -> bool:
 
 def _broken(path: Path, wrong: str, name: str) -> InputError:
     # In the hub's cache the path is a link; without the file behind it, it is fetched anew.
-    return InputError(f"{path} {wrong}; delete {path.resolve()} and fetch {name} again.")
+    file = path.resolve()
+    if file == path.absolute():
+        return InputError(f"{path} {wrong}; delete it and fetch {name} again.")
+    return InputError(f"{name} {wrong}; delete {file} and fetch it anew.")
 
 
 def _some(keys: list[str]) -> str:

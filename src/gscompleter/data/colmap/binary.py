@@ -21,6 +21,7 @@ from gscompleter.data.colmap.lenses import intrinsics_of, model_called
 from gscompleter.data.colmap.records import PosedImage, portable
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.errors import InputError, quoted, refuse_pointer
+from gscompleter.reading import open_file
 
 MAX_NAME = 1024
 """Of bytes in the name of an image."""
@@ -88,7 +89,7 @@ def _image(records: _Records) -> PosedImage:
 def _opened(path: Path) -> Iterator[_Records]:
     refuse_pointer(path)
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             if os.fstat(file.fileno()).st_size == 0:
                 raise InputError(f"{quoted(path)} is empty; export the model again.")
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:

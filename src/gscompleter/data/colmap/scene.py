@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -145,6 +146,12 @@ def _frames(cameras_file: Path, images_file: Path) -> list[Frame]:
     images = _READERS[images_file.suffix.lower()].read_images(images_file)
     if not images:
         raise InputError(f"{quoted(images_file)} lists no images; export the model again.")
+    (name, times), *_ = Counter(image.name for image in images).most_common(1)
+    if times > 1:
+        raise InputError(
+            f"{quoted(images_file)} lists the image {quoted(name)} {times:,} times; export the "
+            "model again."
+        )
     return [_frame(image, cameras, images_file) for image in images]
 
 

@@ -17,6 +17,12 @@ from gscompleter.data.colmap.lenses import intrinsics_of, model_called
 from gscompleter.data.colmap.records import PosedImage, portable
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import read_lines
+
+MAX_LINE = 1 << 22
+"""Of characters of the features of an image."""
+MAX_BYTES = 1 << 34
+"""Of a file."""
 
 
 def read_cameras(path: Path) -> dict[int, Intrinsics]:
@@ -89,16 +95,11 @@ def _lists_features(line: str) -> bool:
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
     """The lines that say something, each with where it stands."""
-    try:
-        # Names may be of any encoding, and are handed on to the file system as they are.
-        with path.open(encoding="utf-8-sig", errors="surrogateescape") as file:
-            for number, line in enumerate(file, start=1):
-                if line.strip() and not line.lstrip().startswith("#"):
-                    yield line, f"line {number} of {quoted(path)}"
-    except OSError as error:
-        raise InputError(
-            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
-        ) from error
+    # Names may be of any encoding, and are handed on to the file system as they are.
+    lines = read_lines(path, MAX_LINE, MAX_BYTES, errors="surrogateescape")
+    for number, line in enumerate(lines, start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield line, f"line {number} of {quoted(path)}"
 
 
 def _damaged(place: str, line: str, form: str) -> InputError:

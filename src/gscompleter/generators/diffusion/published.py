@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quoted
+from gscompleter.weights.fetching import few_retries
 
 PACKAGES = ("diffusers", "transformers", "accelerate")
 """What the generators import; the rest comes with these."""
@@ -157,7 +158,7 @@ def reading(source: Source, setting: str = "path") -> Iterator[None]:
         InputError: where the files cannot be had, or are not what they should be.
     """
     try:
-        with silent(source.is_local):
+        with silent(source.is_local), few_retries():
             yield
     except InputError:
         raise
@@ -192,7 +193,6 @@ def silent(local: bool) -> Iterator[None]:
 
 def cannot_load(source: Source, error: Exception, setting: str) -> InputError:
     """The sentence for a folder or repository that did not load."""
-    reason = " ".join(str(error).split())[:400]
     page = f"https://huggingface.co/{source.place}"
     if source.is_local:
         way_out = "see that it is complete, as `save_pretrained` writes it"
@@ -203,7 +203,8 @@ def cannot_load(source: Source, error: Exception, setting: str) -> InputError:
             f"see that you accepted its terms at {page} and are logged in, or give a folder "
             f"as its {setting}"
         )
+    reason = f"{type(error).__name__}: {quoted(str(error), 120).rstrip('.')}"
     return InputError(
-        f"Could not load {source.place} ({type(error).__name__}: {reason.rstrip('.')}); {way_out}.",
+        f"Could not load {source.place} ({reason}); {way_out}.",
         f"generator_{setting}",
     )
