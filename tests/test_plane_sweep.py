@@ -197,3 +197,17 @@ def test_depth_of_a_real_room(shared):
     found = PlaneSweep()(views).depths[0].depth
     known = views[0].depth > 0
     assert share_within(found[known], views[0].depth[known], 0.05) > 0.7
+
+
+def test_a_lift_agrees_with_a_reconstruction_of_the_same_pair():
+    """Both measure at the full size, where half of it would be enough to match at all."""
+    views = [view_of(Room(), camera_at(x, size=200)) for x in (-0.1, 0.1)]
+    everywhere = torch.ones(200, 200, dtype=torch.bool)
+    lifted, reconstructed = (
+        depths[0]
+        for depths in (PlaneSweep().lift(views, everywhere).depths, PlaneSweep()(views).depths)
+    )
+    both = (lifted.confidence > 0) & (reconstructed.confidence > 0)
+    assert both.float().mean() > 0.5
+    error = (lifted.depth / reconstructed.depth - 1).abs()[both]
+    assert (error < 0.005).float().mean() > 0.95

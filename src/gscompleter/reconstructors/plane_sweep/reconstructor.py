@@ -50,20 +50,20 @@ class PlaneSweep(Splatter):
         """The Gaussians of the pixels `wanted` of the first view, a synthesized image.
 
         What fills a hole is seen by no photograph, so that its opacities are left alone; and its
-        depth is that of the surfaces around it, which are matched and fitted at half the size. Its
-        colours are fitted to the synthesized image itself, for drawing takes the half of its
-        sharpness. Other views' depths are those that were measured. The sky tells no depth here;
-        the scene has it.
+        depth is that of the surfaces around it, measured at the full size, so that it agrees with
+        the context as well as a reconstruction of the pair would. Its colours are fitted to the
+        synthesized image itself, for drawing takes the half of its sharpness. Other views' depths
+        are those that were measured. The sky tells no depth here; the scene has it.
 
         Raises:
             InputError: as a call.
         """
         views = ranged(views)
-        rig = rig_of(views, halves=True)
-        first, second = matched(rig, views, halves=True)
+        rig = rig_of(views)
+        first, second = matched(rig, views)
         open_there = sky_above(rig.images[1], second)
         layers = [
-            surfaces_of(rig.images[0], without(first, sky_shown(rig, open_there)), finest=1),
+            surfaces_of(rig.images[0], without(first, sky_shown(rig, open_there))),
             as_measured(rig.images[1], without(second, open_there)),
         ]
         return self.wanted_of(views, depth_maps(layers, rig.unit, views), wanted)
@@ -76,7 +76,7 @@ class PlaneSweep(Splatter):
 
     def layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
         """What stereo says of each view."""
-        found = matched(rig, views, halves=len(views) > 2)
+        found = matched(rig, views)
         seen = skies(rig, found)
         surfaces = side_by_side(surfaces_of, rig.images, map(without, found, seen))
         return list(map(before_sky, surfaces, found, seen))
@@ -92,16 +92,16 @@ def ranged(views: Sequence[View]) -> list[View]:
     return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
 
 
-def matched(rig: Rig, views: Sequence[View], halves: bool) -> list[Measured]:
-    """What stereo measures in each of `views`; with `halves` large ones only at half their size."""
-    large = min(min(image.size) for image in rig.images) >= HALVED_FROM
-    return measured(rig.halved() if large and halves else rig, *depth_range_of(views))
+def matched(rig: Rig, views: Sequence[View]) -> list[Measured]:
+    """Measure depth in each of `views` by stereo; more than two large ones at half their size."""
+    is_halved = len(views) > 2 and min(min(image.size) for image in rig.images) >= HALVED_FROM
+    return measured(rig.halved() if is_halved else rig, *depth_range_of(views))
 
 
-def surfaces_of(image: StereoImage, found: Measured, finest: int = 0) -> Layer:
-    """The surfaces of a view through what was measured there, to that level of their pyramid."""
+def surfaces_of(image: StereoImage, found: Measured) -> Layer:
+    """The surfaces of a view through what was measured there."""
     full = found.at_size(image.size)
-    heights = fit_surfaces(full.index, full.weight, image.image, finest)
+    heights = fit_surfaces(full.index, full.weight, image.image)
     return Layer(image, inverse_at(full.planes, heights), full.confidence)
 
 

@@ -15,9 +15,6 @@ from gscompleter.reconstructors.plane_sweep.epipolar import rotated_to_matches
 from gscompleter.reconstructors.plane_sweep.fusion import Transforms
 from gscompleter.types import View
 
-FEATURES_HALVED_FROM = 384
-"""Pixels of the shortest side from which half the size has features enough to tell a pose."""
-
 
 @dataclass(frozen=True)
 class Rig:
@@ -35,16 +32,14 @@ class Rig:
         return replace(self, images=[halved(i) for i in self.images], transforms=transforms)
 
 
-def rig_of(views: Sequence[View], halves: bool = False) -> Rig:
-    """Where `views` stand, through poses that agree with the matched features; with `halves` those
-    of large images at half their size.
+def rig_of(views: Sequence[View]) -> Rig:
+    """Relate `views` to each other, through poses that agree with the matched features.
 
     Raises:
         InputError: fewer than two views, no baseline between them.
     """
     images, unit = stereo_images(views)
-    large = min(min(image.size) for image in images) >= FEATURES_HALVED_FROM
-    neighbours = neighbours_at_half(images) if halves and large else neighbours_among(images)
+    neighbours = neighbours_among(images)
     transforms = {}
     for i, j in combinations(range(len(images)), 2):
         source = images[j]
@@ -53,12 +48,6 @@ def rig_of(views: Sequence[View], halves: bool = False) -> Rig:
         transforms[i, j] = source_from_reference(images[i], source)
         transforms[j, i] = source_from_reference(source, images[i])
     return Rig(images, unit, neighbours, transforms)
-
-
-def neighbours_at_half(images: Sequence[StereoImage]) -> Neighbours:
-    """`neighbours_among` by the features of images of half the size, at twice their pixels."""
-    found = neighbours_among(list(map(halved, images)))
-    return replace(found, matches={pair: (2 * a, 2 * b) for pair, (a, b) in found.matches.items()})
 
 
 def halved(image: StereoImage) -> StereoImage:

@@ -41,11 +41,10 @@ ITERATIONS = 100
 """Steps on the finest level, and twice as many on each coarser one, where they cost little."""
 
 
-def fit_surfaces(measured: Map, confidence: Map, image: Image, finest: int = 0) -> Map:
+def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
     """Heights [h, w] that follow `measured` as far as `confidence` [h, w] in [0, 1] goes.
 
-    Where nothing at all is measured, the result is `measured`. `finest` is the level of the pyramid
-    that it ends with: 0 is the image itself, 1 half its size.
+    Where nothing at all is measured, the result is `measured`.
     """
     if not (confidence > 0).any():
         return measured
@@ -54,7 +53,7 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image, finest: int = 0) 
         levels.append(halved(*levels[-1]))
     heights = beginning(*levels[-1][:2])
     slopes = np.zeros((2, *heights.shape), np.float32)
-    for number, (data, weight, colours) in reversed(list(enumerate(levels))[finest:]):
+    for number, (data, weight, colours) in reversed(list(enumerate(levels))):
         if heights.shape != data.shape:
             heights = doubled(heights, data.shape)
             slopes = np.stack([doubled(slope, data.shape) / 2 for slope in slopes])
@@ -64,7 +63,7 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image, finest: int = 0) 
         bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
         steps = ITERATIONS * 2**number
         variation.fit(heights, slopes, data, weight, across, down, bend, tolerance, steps)
-    return heights if heights.shape == measured.shape else doubled(heights, measured.shape)
+    return heights
 
 
 def beginning(data: AnyMap, weight: AnyMap) -> AnyMap:
