@@ -400,6 +400,9 @@ class TargetCompletion:
     None where it was not doubted."""
     pairs: DepthPairs | None = None
     """Of what the affine was fitted to; None where nothing was compared."""
+    registered: Gaussians | None = None
+    """All that was lifted, as it was registered, before the hole mask filters it; None where it was
+    not kept (`GSCompleter.keep_registered`) or nothing was lifted."""
 
     @property
     def hole_fraction(self) -> float:

@@ -2,8 +2,9 @@
 
 The paper reports the three as "the alignment error between the generated target primitives and
 the context primitives" and gives neither formulas nor thresholds. Ours are below, each with its
-reason. They can rank methods and ablations scored alike; they are not comparable with the
-numbers printed in the paper.
+reason, for two choices of the primitives: those that were added, and all that were lifted. They can
+rank methods and ablations scored alike; they are not comparable with the numbers printed in the
+paper.
 """
 
 from __future__ import annotations
@@ -39,10 +40,16 @@ def abs_rel(
     Over the pixels of `where` with known (positive) truth; None where there is none. No scale
     is fitted beforehand: a wrong scale is one of the errors that registration has to remove.
     """
-    if truth is None or not (known := where & (truth > 0)).any():
+    if truth is None or not num_known(truth, where):
         return None
+    known = where & (truth > 0)
     d, t = depth[known].double(), truth[known].double()
     return ((d - t).abs() / t).mean().item()
+
+
+def num_known(truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]) -> int | None:
+    """Count the pixels of `where` with known (positive) truth; None where there is no truth."""
+    return None if truth is None else int((where & (truth > 0)).sum())
 
 
 @dataclass(frozen=True)
@@ -107,6 +114,8 @@ class Alignment:
 
     overlap: float
     """Share of the target's pixels that both cover."""
+    pixels: int
+    """How many pixels that is."""
     scale: float | None
     """Median z-depth of the context at the target, in scene units."""
     abs_rel: float | None
@@ -125,10 +134,11 @@ class Alignment:
 def alignment(
     added: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
 ) -> Alignment:
-    """AbsRel, Chamfer distance and F-score between what one target added and the context.
+    """Measure AbsRel, Chamfer distance and F-score of generated primitives against the context.
 
-    Completion adds primitives in the dilated hole only, so the two meet at its rim. The overlap
-    is made of the target's pixels that each covers when it is rendered alone.
+    Completion adds primitives in the dilated hole only, so that these meet the context at its rim;
+    all that was lifted, before the hole mask filters it, covers what the context shows too. The
+    overlap is made of the target's pixels that each covers when it is rendered alone.
 
     - AbsRel compares the two rendered z-depths there; the context's is the reference.
     - A point of the first cloud is the mean of an added Gaussian that projects into the overlap.
@@ -144,7 +154,7 @@ def alignment(
     which this floor is the same.
 
     Args:
-        added: What completion added for one target.
+        added: What completion added for one target, or all that was registered for it.
         context: The scene as it was before, usually `Completion.context`.
         target: The camera it was completed for.
         renderer: Draws both.
@@ -154,9 +164,9 @@ def alignment(
     generated = renderer.render(added, target).depth_map()
     reference = renderer.render(context, target).depth_map()
     overlap = generated.valid & reference.valid
-    share = overlap.double().mean().item()
-    if not overlap.any():
-        return Alignment(share, None, None, None, None)
+    share, pixels = overlap.double().mean().item(), int(overlap.sum())
+    if pixels == 0:
+        return Alignment(share, pixels, None, None, None, None)
 
     scale = reference.depth[reference.valid].double().median().item()
     threshold = MATCHED * scale
@@ -165,9 +175,10 @@ def alignment(
     surface = surface[on_surface(surface, reference.depth, target, threshold)]
     error = abs_rel(generated.depth, reference.depth, overlap)
     if len(judged) == 0 or len(surface) == 0:
-        return Alignment(share, scale, error, None, None)
+        return Alignment(share, pixels, scale, error, None, None)
     distances = CloudDistances(nearest(judged, context.means), nearest(surface, added.means))
-    return Alignment(share, scale, error, distances.chamfer, distances.f_score(threshold))
+    f_score = distances.f_score(threshold)
+    return Alignment(share, pixels, scale, error, distances.chamfer, f_score)
 
 
 def on_surface(
