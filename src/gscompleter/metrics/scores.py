@@ -11,7 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.metrics.flip import flip_map
-from gscompleter.metrics.geometry import Alignment, abs_rel, alignment, num_known
+from gscompleter.metrics.geometry import (
+    Alignment,
+    abs_rel,
+    alignment,
+    num_known,
+    primitive_alignment,
+)
 from gscompleter.metrics.haarpsi import haarpsi
 from gscompleter.metrics.image import MAX_PSNR, gradient_energy_ratio, masked_psnr, ssim
 from gscompleter.metrics.lpips import lpips_if_available
@@ -104,10 +110,10 @@ class Scores:
     align_f_score: float | None = None
     """F-score between the two."""
     registered_pixels: int | None = None
-    """How many pixels of the target both the context covers and all that was lifted, as it was
+    """How many pixels of the target the context covers and what was lifted falls on, as it was
     registered and before any of it was filtered: those of the three below."""
     registered_abs_rel: float | None = None
-    """AbsRel of all that was lifted against the context."""
+    """AbsRel of all that was lifted against the context (`geometry.primitive_alignment`)."""
     registered_chamfer: float | None = None
     """Chamfer distance between the two, as a share of the median depth at the target."""
     registered_f_score: float | None = None
@@ -170,12 +176,16 @@ def score(
         hole_looks=looks(target.compared(now.image), target.image, holes & counted),
         observed_looks=looks(target.compared(now.image), target.image, ~holes & counted),
     )
-    for name, made in (("align", added), ("registered", registered)):
-        if made is not None and len(made) > 0:
-            aligned = alignment(made, before, target.camera, renderer)
-            scores = replace(scores, **alignment_scores(name, aligned))
     if added is not None and len(added) > 0:
-        scores = replace(scores, depth_rim=rim_error(added, was, target.camera, renderer))
+        aligned = alignment(added, before, target.camera, renderer)
+        scores = replace(
+            scores,
+            depth_rim=rim_error(added, was, target.camera, renderer),
+            **alignment_scores("align", aligned),
+        )
+    if registered is not None and len(registered) > 0:
+        aligned = primitive_alignment(registered, before, target.camera, renderer)
+        scores = replace(scores, **alignment_scores("registered", aligned))
     return scores, Drawings(was, now, holes)
 
 
