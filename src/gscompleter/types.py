@@ -393,6 +393,9 @@ class TargetCompletion:
     added: Gaussians
     losses: Mapping[str, Sequence[float]] = field(default_factory=dict)
     """Loss per iteration of the two optimisations, `register` and `refine`."""
+    registered: Gaussians | None = None
+    """All that was lifted, as it was registered, before the hole mask filters it; None where it was
+    not kept (`GSCompleter.keep_registered`) or nothing was lifted."""
     notes: tuple[str, ...] = ()
     """Fallbacks that were taken, a sentence each."""
     support: Float[Tensor, "h w"] | None = None
@@ -400,9 +403,6 @@ class TargetCompletion:
     None where it was not doubted."""
     pairs: DepthPairs | None = None
     """Of what the affine was fitted to; None where nothing was compared."""
-    registered: Gaussians | None = None
-    """All that was lifted, as it was registered, before the hole mask filters it; None where it was
-    not kept (`GSCompleter.keep_registered`) or nothing was lifted."""
 
     @property
     def hole_fraction(self) -> float:
