@@ -20,13 +20,15 @@ from gscompleter.metrics.geometry import (
     abs_rel,
     alignment,
     cloud_distances,
+    num_known,
+    primitive_alignment,
 )
 from gscompleter.metrics.haarpsi import haarpsi
 from gscompleter.metrics.image import MAX_PSNR, gradient_energy_ratio, masked_psnr, psnr, ssim
-from gscompleter.metrics.scores import looks
+from gscompleter.metrics.scores import Truth, looks, score
 from gscompleter.render import load_renderer
 from gscompleter.stages.integration import hole_mask, keep_in_holes
-from gscompleter.types import Camera, DepthAffine, Gaussians, TargetCompletion
+from gscompleter.types import Camera, DepthAffine, Gaussians, TargetCompletion, merge
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 
 
@@ -231,6 +233,8 @@ def test_abs_rel_is_the_mean_relative_error_where_truth_is_known():
     d, t = depth.double().numpy(), truth.double().numpy()
     mask = where.numpy() & (t > 0)
     assert abs_rel(depth, truth, where) == pytest.approx(np.mean(abs(d - t)[mask] / t[mask]))
+    assert num_known(truth, where) == mask.sum()
+    assert num_known(None, where) is None
 
 
 def test_a_depth_ten_percent_too_great_has_an_abs_rel_of_a_tenth():
@@ -398,9 +402,59 @@ def test_alignment_in_another_unit_of_length_is_the_same_but_for_the_unit():
 def test_where_nothing_overlaps_there_is_no_alignment():
     context = room_context()
     nothing = score_of(context, context[:0])
-    assert nothing == Alignment(0.0, None, None, None, None)
+    assert nothing == Alignment(0.0, 0, None, None, None, None)
     unseen = replace(context, opacities=torch.full_like(context.opacities, 0.001))
     assert score_of(context, unseen) == nothing
+    assert primitive_alignment(unseen, context, TARGET, RENDERER) == nothing
+    behind = replace(context, means=context.means - 50 * TARGET.forward)
+    assert primitive_alignment(behind, context, TARGET, RENDERER) == nothing
+
+
+def test_all_that_was_lifted_is_compared_with_what_the_target_sees_of_the_context():
+    context, view = room_context(), view_of(Room(), TARGET)
+    covered = RENDERER.render(context, TARGET).depth_map()
+    for factor in (1.0, 1.1, 0.8):
+        lifted = gaussians_of(view, factor * view.depth)
+        found = primitive_alignment(lifted, context, TARGET, RENDERER)
+        assert found.pixels == covered.valid.sum()
+        z, d = (factor * view.depth)[covered.valid], covered.depth[covered.valid]
+        assert found.abs_rel == pytest.approx(((z - d).abs() / d).mean().item(), rel=1e-4)
+        assert (found.f_score > 0.95) == (factor == 1.0)
+
+
+def test_primitives_with_gaps_between_them_are_measured_like_all():
+    """Rendered, what is thinned out covers less and is measured over less."""
+    context, view = room_context(), view_of(Room(), TARGET)
+    lifted = gaussians_of(view, 1.1 * view.depth)
+    few = lifted[::7]
+    whole, thin = (primitive_alignment(g, context, TARGET, RENDERER) for g in (lifted, few))
+    assert thin.pixels == pytest.approx(whole.pixels / 7, rel=0.1)
+    assert thin.abs_rel == pytest.approx(whole.abs_rel, rel=0.1)
+    assert score_of(context, few).pixels < 0.5 * score_of(context, lifted).pixels
+
+
+def test_scores_count_the_pixels_that_they_are_measured_over():
+    context, view = room_context(), view_of(Room(), TARGET)
+    depth = view.depth.clone()
+    depth[:10] = 0
+    added, lifted = filling(context), gaussians_of(view)
+    truth = Truth((), replace(view, depth=depth))
+    scores, seen = score(
+        context[:0], context, context, Truth((), view), RENDERER
+    )  # all is a hole, which the context fills
+    assert (scores.depth_observed, scores.depth_observed_pixels) == (None, 0)
+    assert scores.depth_hole_pixels == seen.after.depth_map().valid.sum() > 500
+    after = merge([context, added])
+    scores, seen = score(context, after, added, truth, RENDERER, lifted)
+    known = seen.after.depth_map().valid & (depth > 0)
+    assert scores.depth_hole_pixels == (known & seen.holes).sum() > 0
+    assert scores.depth_observed_pixels == (known & ~seen.holes).sum() > 0
+    assert scores.align_pixels == score_of(context, added).pixels
+    aligned = primitive_alignment(lifted, context, TARGET, RENDERER)
+    assert scores.registered_pixels == aligned.pixels > scores.align_pixels
+    assert scores.registered_chamfer == aligned.relative_chamfer
+    scores, _ = score(context, after, added, Truth((), replace(view, depth=None)), RENDERER)
+    assert scores.depth_hole_pixels is scores.registered_pixels is None
 
 
 # FID

@@ -392,6 +392,7 @@ TABLES = {
         "reggs": {"finished": 1, "psnr": {"value": None, "cases": 0}},
     },
     "gain_by_distance": {"1": {"full": 2.0, "reggs": None}, "2": {"full": 1.0, "reggs": 0.5}},
+    "notes": [f"reggs is not the paper's {HOSTILE}"],
     "fid": {"values": {}, "reason": "not asked for"},
     "failures": [{"case": "b", "method": "reggs", "reason": HOSTILE}],
 }
@@ -420,6 +421,7 @@ def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypat
     assert "full 1.00 2.00 1.00 reggs – 4.00 –" in said
     assert len(page.all("img")) == len(page.all("script")) == 1
     assert "<script>alert(1)</script>" in said
+    assert "reggs is not the paper's" in said
 
 
 @pytest.mark.parametrize("name", ["tables.json", "timings.json"])

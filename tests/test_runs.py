@@ -1,5 +1,6 @@
 """Runs of methods over tasks: what is written, what a stopped run leaves, what is refused."""
 
+import copy
 import json
 import mmap
 import os
@@ -23,7 +24,7 @@ from gscompleter.data.cases import Case
 from gscompleter.io.image import read_image
 from gscompleter.metrics.image import psnr
 from gscompleter.reports.plots import plots
-from gscompleter.reports.summary import gain_of, gains_by_gap, summarize
+from gscompleter.reports.summary import GEOMETRY, gain_of, gains_by_gap, summarize
 from gscompleter.reports.tables import tables
 from gscompleter.runs import methods as runs_methods
 from gscompleter.runs import runner
@@ -31,7 +32,13 @@ from gscompleter.runs.memory import peak_memory
 from gscompleter.runs.methods import BASELINES, METHODS, check_methods, methods_named
 from gscompleter.runs.protocols import read_evaluation_index
 from gscompleter.runs.runner import RowCounts, RunConfig, evaluate
-from gscompleter.runs.store import read_json
+from gscompleter.runs.store import (
+    load_context,
+    load_prediction,
+    read_json,
+    step_path,
+    task_folder,
+)
 from gscompleter.runs.tasks import Task, task_of
 from scenes import Room, camera_at, photographed
 
@@ -100,8 +107,6 @@ def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
     for name, score in scores.items():
         assert score - gains[name] == pytest.approx(scores["context"])
     assert content["methods"]["context"]["context_change"]["value"] == 0
-    assert content["methods"]["full"]["align_f_score"]["value"] > 0.5
-    assert content["methods"]["densify-100"]["align_f_score"]["value"] is None
     without = content["methods"]["full"]["lpips_vgg"]["value"] is None
     assert ("LPIPS: weights not available" in (finished / "tables.md").read_text()) == without
     full, before = (content["methods"][name] for name in ("full", "context"))
@@ -113,13 +118,57 @@ def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
     assert set(read_json(finished / "timings.json")) == set(METHOD_NAMES)
 
 
+def scores_of(out: Path, method: str) -> list[dict]:
+    """The scores of a method in each task of one step."""
+    rows = [read_json(path) for path in sorted((out / "tasks").glob(f"*/{method}.json"))]
+    return [row["steps"][0]["scores"] for row in rows]
+
+
+def test_what_was_added_and_all_that_was_lifted_are_compared_with_the_context(finished, tasks):
+    for task, scores in zip(tasks, scores_of(finished, "full"), strict=True):
+        folder = task_folder(finished, task.name)
+        context = load_context(folder / "context.npz", "cpu").gaussians
+        prediction = load_prediction(step_path(folder, "full", 1), context)
+        assert len(prediction.registered) > len(prediction.added) > 0
+        assert scores["align_f_score"] > 0.5
+        assert scores["registered_f_score"] > 0.9
+        assert scores["registered_abs_rel"] < 0.1
+        assert scores["registered_pixels"] > 2 * scores["align_pixels"] > 0
+    for method in ("context", "densify-100"):
+        for scores in scores_of(finished, method):
+            found = {scores[key] for key in scores if key.startswith(("align_", "registered_"))}
+            assert found == {None}
+
+
+def test_geometry_of_few_pixels_is_left_out(finished):
+    rows = [read_json(path) for path in sorted((finished / "tasks").glob("*/full.json"))]
+    rows = [copy.deepcopy(rows[i % 2]) for i in range(4)]
+    for number, row in enumerate(rows):
+        row["task"]["name"] = str(number)
+        row["steps"][0]["scores"].update(
+            depth_hole=(0.1, 0.2, 0.6, 9.0)[number], depth_hole_pixels=(500, 900, 700, 499)[number]
+        )
+    summary = summarize(rows)
+    hole, median, pixels = (
+        summary.cell("full", column) for column in GEOMETRY if column.key.startswith("depth_hole")
+    )
+    assert (hole.value, hole.count) == (pytest.approx(0.3), 3)
+    assert (median.value, median.count) == (0.2, 3)
+    assert (pixels.value, pixels.count) == (600, 4)
+    assert "at least 500 pixels" in " ".join(summary.notes)
+    assert not any("earlier version" in note for note in summary.notes)
+
+
 def test_rows_of_a_version_that_had_fewer_scores_still_make_tables(finished, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(finished, out)
     for path in (out / "tasks").glob("*/*.json"):
         row = read_json(path)
         for step in row["steps"]:
-            del step["scores"]["hole_looks"], step["scores"]["observed_looks"]
+            scores = step["scores"]
+            del scores["hole_looks"], scores["observed_looks"]
+            for key in [key for key in scores if key.endswith("pixels") or "registered" in key]:
+                del scores[key]
         path.write_text(json.dumps(row))
     tables(out)
     before, now = (
@@ -130,6 +179,8 @@ def test_rows_of_a_version_that_had_fewer_scores_still_make_tables(finished, tmp
     text = (out / "tables.md").read_text()
     assert "HaarPSI" not in text
     assert "scoring again adds the columns" in text
+    assert "AbsRel" not in text
+    assert "which counted no pixels, so their geometry is left out" in text
 
 
 def test_rows_that_are_lost_are_made_again_from_what_is_saved(finished, tasks, tmp_path):
@@ -346,6 +397,11 @@ def test_baselines_run(tasks, tmp_path, monkeypatch):
     (distill,), (reggs,) = (rows[method]["steps"] for method in ("distill", "reggs"))
     assert (distill["added"], distill["anchor"], distill["scores"]["depth_rim"]) == (0, None, None)
     assert (reggs["added"], reggs["anchor"]) == (SIZE * SIZE, 0)
+    assert reggs["scores"]["registered_pixels"] > 500
+    tables(out)
+    (note,) = (n for n in read_json(out / "tables.json")["notes"] if n.startswith("reggs"))
+    for name in ("tables.md", "tables.tex"):
+        assert note in (out / name).read_text()
 
 
 def test_wrong_runs_are_refused(finished, tasks, tmp_path):
@@ -445,6 +501,31 @@ def test_scenes_need_a_protocol_and_an_index_is_kept(scenes, tmp_path, monkeypat
     assert run(monkeypatch, "index", scenes, "--protocol", "n-1", "--out", file) == 2
     assert file.read_text() == "precious"
     assert run(monkeypatch, "tables", tmp_path) == 2
+
+
+def test_one_case_per_scene_is_the_first(scenes, tmp_path, monkeypatch, capsys):
+    def names(out: Path, *words: object) -> set[str]:
+        options = ("--methods", "context", "--device", "cpu", "--quiet", "--out", out)
+        assert run(monkeypatch, "evaluate", *words, *options) == 0
+        return {read_json(path)["task"]["name"] for path in out.glob("tasks/*/context.json")}
+
+    clips = (scenes / "box", scenes / "wide", "--resolution", 24, 24, "--protocol", "n-1")
+    assert len(names(tmp_path / "all", *clips)) == 4
+    once = names(tmp_path / "once", *clips, "--one-per-scene")
+    assert once == {"box 0+1>2", "wide 0+1>2"}
+    assert read_json(tmp_path / "once" / "run.json")["source"]["one_per_scene"] is True
+
+    content = read_json(scenes / "cases.json")
+    turned = {**content["cases"][0], "context": [1, 0]}
+    content["cases"] = [*content["cases"], turned]
+    file = scenes / "three.json"
+    file.write_text(json.dumps(content))
+    assert len(names(tmp_path / "three", file)) == 3
+    assert names(tmp_path / "first", file, "--one-per-scene") == {"box 0+1>2", "wide 0+1>2"}
+
+    options = ("--methods", "context", "--device", "cpu", "--out", tmp_path / "three")
+    assert run(monkeypatch, "evaluate", file, *options, "--one-per-scene") == 2
+    assert "one_per_scene" in capsys.readouterr().err
 
 
 def test_full_is_what_the_completer_does_by_itself(tasks):

@@ -152,6 +152,8 @@ class GSCompleter:
     """Settings of the stages."""
     seed: int = 0
     """Of the random samples that RANSAC draws."""
+    keep_registered: bool = False
+    """Keep in each result all that was registered, about a Gaussian per pixel, for evaluation."""
 
     def __post_init__(self) -> None:
         """Raises InputError where a setting is out of its range."""
@@ -320,7 +322,8 @@ class GSCompleter:
         at_anchor = frozen_views[sight.anchor.index].context
         fit, settings = registration.affine, self.config.registration.affine
         pairs = compared_depths(lifted, sight.frozen.context, at_anchor, fit, settings)
-        result = replace(result, affine=fit, pairs=pairs)
+        everything = registration.gaussians if self.keep_registered else None
+        result = replace(result, affine=fit, pairs=pairs, registered=everything)
         if registration.affine.refuted:
             notes = notes_of(sight.anchor.fallback, registration.affine)
             return replace(result, notes=(*reference.notes, *notes, NOTHING_ADDED))

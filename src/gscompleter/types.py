@@ -469,6 +469,9 @@ class TargetCompletion:
     added: Gaussians
     losses: Mapping[str, Sequence[float]] = field(default_factory=dict)
     """Loss per iteration of the two optimisations, `register` and `refine`."""
+    registered: Gaussians | None = None
+    """All that was lifted, as it was registered, before the hole mask filters it; None where it was
+    not kept (`GSCompleter.keep_registered`) or nothing was lifted."""
     notes: tuple[str, ...] = ()
     """Fallbacks that were taken, a sentence each."""
     support: Float[Tensor, "h w"] | None = None

@@ -87,6 +87,7 @@ def source_of(options: EvaluateOptions) -> dict[str, Any]:
         "protocols": list(options.protocol),
         "resolution": list(size) if isinstance(size, tuple) else size,
         **({"ignore_masked": True} if options.ignore_masked else {}),
+        **({"one_per_scene": True} if options.one_per_scene else {}),
     }
 
 
@@ -158,7 +159,10 @@ def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped], notes: list[s
     said of those that were opened to `notes`."""
     if not options.protocol:
         files = [cases_file(path) for path in options.paths]
-        cases = [case for file in files for case in read_cases(file)][: options.limit]
+        cases = [case for file in files for case in read_cases(file)]
+        if options.one_per_scene:
+            cases = first_of_each_scene(cases)
+        cases = cases[: options.limit]
         notes += notes_of(cases)
         if options.resolution is not None:
             size = working_size(options.resolution)
@@ -167,6 +171,14 @@ def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped], notes: list[s
             cases = [replace(case, ignore_masked=True) for case in cases]
         return [task_of(case) for case in cases]
     return list(islice(tasks_in_clips(options, skipped, notes), options.limit))
+
+
+def first_of_each_scene(cases: Sequence[Case]) -> list[Case]:
+    """Select the first case of each scene."""
+    first: dict[Path, Case] = {}
+    for case in cases:
+        first.setdefault(case.scene, case)
+    return list(first.values())
 
 
 def notes_of(cases: Sequence[Case]) -> Iterator[str]:
@@ -195,7 +207,8 @@ def tasks_in_clips(
                 if isinstance(protocol, ViewByView) and (reason := protocol.reason_to_skip(clip)):
                     skipped.append(Skipped(clip.name, reason))
                 size = working_size(resolution_of(options))
-                yield from tasks_of(protocol, clip, size, options.ignore_masked)
+                tasks = tasks_of(protocol, clip, size, options.ignore_masked)
+                yield from tasks[:1] if options.one_per_scene else tasks
 
 
 def cases_file(path: Path) -> Path:

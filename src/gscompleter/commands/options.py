@@ -251,12 +251,13 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     out: Path
     """Folder for the results, a new one or that of an earlier run to go on with."""
     protocol: tuple[str, ...] = ()
-    """Which frames are given and which are the target: n-10 (frames n and n + 10 for n + 20),
-    stress (0 and 30 for 99), or the path of an evaluation index; one or several. A cases.json
-    needs none. sequence-4 (or sequence-4-steps-6) completes each clip view after view: frames 0
-    and 4 are given, then 8, 12, … are completed one after the other into one scene, and once it is
-    completed the photograph of a frame is given too. It takes context, full, paper, ablations and
-    reggs; the paper's study of long sequences is that with --generator oracle."""
+    """Which frames are given and which are the target: n-10 (frames n and n + 10 for n + 20, then
+    n + 20 and n + 10 for n, for n = 0, 21, 42, …, which is how we read the n-k of the paper; see
+    --one-per-scene), stress (0 and 30 for 99), or the path of an evaluation index; one or several.
+    A cases.json needs none. sequence-4 (or sequence-4-steps-6) completes each clip view after view:
+    frames 0 and 4 are given, then 8, 12, … are completed one after the other into one scene, and
+    once it is completed the photograph of a frame is given too. It takes context, full, paper,
+    ablations and reggs; the paper's study of long sequences is that with --generator oracle."""
     methods: tuple[str, ...] = ("context", "full", "paper")
     """What to compare: context, full, paper, an ablation such as no-sa, densify-100, densify-800,
     distill, reggs; or a group of them: ablations, baselines, all."""
@@ -274,6 +275,9 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     ignore_masked: bool = False
     """Ignore what masks cover in the photographs, and boxes around what moves: nothing is made of
     it, and it does not count in the scores."""
+    one_per_scene: bool = False
+    """Take one case of each scene: the first of each protocol (of n-10 frames 0 and 10 for 20) or
+    of a cases.json. The paper counts as many cases as scenes."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to do, in all shards together."""
 

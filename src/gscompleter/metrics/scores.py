@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.metrics.flip import flip_map
-from gscompleter.metrics.geometry import abs_rel, alignment
+from gscompleter.metrics.geometry import (
+    Alignment,
+    abs_rel,
+    alignment,
+    num_known,
+    primitive_alignment,
+)
 from gscompleter.metrics.haarpsi import haarpsi
 from gscompleter.metrics.image import MAX_PSNR, gradient_energy_ratio, masked_psnr, ssim
 from gscompleter.metrics.lpips import lpips_if_available
@@ -87,14 +94,29 @@ class Scores:
     """AbsRel at the target against the true depth, where the context covers it."""
     depth_hole: float | None
     """The same where the context has a hole and the completion fills it."""
+    depth_observed_pixels: int | None = None
+    """How many pixels `depth_observed` is the mean of."""
+    depth_hole_pixels: int | None = None
+    """How many pixels `depth_hole` is the mean of."""
     depth_rim: float | None = None
     """Median relative difference of depth between what was added, drawn alone, and the context,
     where both cover the target: the step at the border of the holes."""
+    align_pixels: int | None = None
+    """How many pixels of the target both cover: those of `depth_rim` and of the three below."""
     align_abs_rel: float | None = None
     """AbsRel of what was added against the context (`geometry.alignment`)."""
     align_chamfer: float | None = None
     """Chamfer distance between the two, as a share of the median depth at the target."""
     align_f_score: float | None = None
+    """F-score between the two."""
+    registered_pixels: int | None = None
+    """How many pixels of the target the context covers and what was lifted falls on, as it was
+    registered and before any of it was filtered: those of the three below."""
+    registered_abs_rel: float | None = None
+    """AbsRel of all that was lifted against the context (`geometry.primitive_alignment`)."""
+    registered_chamfer: float | None = None
+    """Chamfer distance between the two, as a share of the median depth at the target."""
+    registered_f_score: float | None = None
     """F-score between the two."""
     hole_looks: Looks | None = None
     """At the target, in the hole, after completion."""
@@ -119,6 +141,7 @@ def score(
     added: Gaussians | None,
     truth: Truth,
     renderer: Renderer,
+    registered: Gaussians | None = None,
 ) -> tuple[Scores, Drawings]:
     """All scores of a completion, and what the target camera sees of it.
 
@@ -128,6 +151,7 @@ def score(
         added: What stands in `after` beside `before`; None where that itself was changed.
         truth: The photographs.
         renderer: Draws all of them.
+        registered: All that was lifted, as it was registered; None where nothing was.
     """
     target = truth.target
     was = renderer.render(before, target.camera)
@@ -147,6 +171,8 @@ def score(
         context_ssim=_changes(context, counted_ssim),
         depth_observed=abs_rel(now.depth, target.depth, ~holes & covered),
         depth_hole=abs_rel(now.depth, target.depth, holes & covered),
+        depth_observed_pixels=num_known(target.depth, ~holes & covered),
+        depth_hole_pixels=num_known(target.depth, holes & covered),
         hole_looks=looks(target.compared(now.image), target.image, holes & counted),
         observed_looks=looks(target.compared(now.image), target.image, ~holes & counted),
     )
@@ -155,11 +181,22 @@ def score(
         scores = replace(
             scores,
             depth_rim=rim_error(added, was, target.camera, renderer),
-            align_abs_rel=aligned.abs_rel,
-            align_chamfer=aligned.relative_chamfer,
-            align_f_score=aligned.f_score,
+            **alignment_scores("align", aligned),
         )
+    if registered is not None and len(registered) > 0:
+        aligned = primitive_alignment(registered, before, target.camera, renderer)
+        scores = replace(scores, **alignment_scores("registered", aligned))
     return scores, Drawings(was, now, holes)
+
+
+def alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
+    """Name the fields of `Scores` that an alignment fills, each after `name`."""
+    return {
+        f"{name}_pixels": aligned.pixels,
+        f"{name}_abs_rel": aligned.abs_rel,
+        f"{name}_chamfer": aligned.relative_chamfer,
+        f"{name}_f_score": aligned.f_score,
+    }
 
 
 def quality(image: Float[Tensor, "h w 3"], photograph: View) -> Quality:

@@ -13,15 +13,13 @@ from gscompleter.reports.figures import time_bars
 from gscompleter.reports.finished import as_written, check_results
 from gscompleter.reports.page import Picture, Table, gallery_of, rendered
 from gscompleter.reports.plain_words import shown
-from gscompleter.reports.summary import GEOMETRY, IMAGES, LOOKS, SEQUENCE, Column, stage_place
+from gscompleter.reports.summary import GROUPS, Column, stage_place
 
 TABLES = "tables.json"
 """The file that says a folder holds an evaluation."""
 TIMINGS = "timings.json"
 ADVICE = "let `tables` write it again"
 """What to do about a damaged file."""
-GROUPS = {"Images": IMAGES, "Looks": LOOKS, "Geometry": GEOMETRY, "Sequences": SEQUENCE}
-"""By their titles, the columns of the tables of scores."""
 PLOTS = {
     "gain_by_hole": "Gain at the target against the size of the hole",
     "gain_by_distance": "Gain at the target against the distance from what was given",
@@ -65,6 +63,8 @@ class Tables:
     gain_by_distance: Mapping[str, Mapping[str, float | None]]
     fid: Fid
     failures: tuple[Failure, ...]
+    notes: tuple[str, ...] = ()
+    """What the scores have to be read with."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,7 @@ def evaluation_page(folder: Path) -> str:
                 ("failed", str(len(tables.failures))),
             ],
             "scores": list(score_tables(tables)),
+            "notes": tables.notes,
             "distances": distance_table(tables),
             "fid": fid_sentence(tables.fid),
             "plots": list(plots_of(folder)),

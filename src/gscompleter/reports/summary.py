@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -129,16 +129,54 @@ LOOKS = (
 energy of 1 is as sharp as the photograph. Of these ratios the median over the tasks: where a
 photograph is nearly flat they are anything."""
 
+MIN_PIXELS = 500
+"""Fewest pixels that a number of a column of geometry has to be measured over to count in it."""
+
+
+def _measured(key: str, pixels: str) -> Callable[[Step], float | None]:
+    """The score `key` where it was measured over enough pixels, of which `pixels` is the count."""
+    number, count = _at(key), _at(pixels)
+    return lambda step: number(step) if (count(step) or 0) >= MIN_PIXELS else None
+
+
+def _mean_and_median(key: str, title: str, digits: int, pixels: str) -> tuple[Column, Column]:
+    """Both over the tasks, of what was measured over enough pixels."""
+    mean = Column(key, title, digits, _measured(key, pixels))
+    median = replace(
+        mean, key=f"{key}_median", title=f"{title} (median)", over_tasks=statistics.median
+    )
+    return mean, median
+
+
+def _pixels(key: str, title: str) -> Column:
+    """The median number of pixels over all tasks, also of those with too few to count."""
+    return Column(key, title, 0, _at(key), over_tasks=statistics.median)
+
+
 GEOMETRY = (
-    Column("depth_observed", "AbsRel observed", 3, _at("depth_observed")),
-    Column("depth_hole", "AbsRel in holes", 3, _at("depth_hole")),
-    Column("depth_rim", "step at rim", 4, _at("depth_rim")),
-    Column("align_abs_rel", "AbsRel to context", 4, _at("align_abs_rel")),
-    Column("align_chamfer", "Chamfer to context", 4, _at("align_chamfer")),
-    Column("align_f_score", "F-score to context", 3, _at("align_f_score")),
+    *_mean_and_median("depth_observed", "AbsRel observed", 3, "depth_observed_pixels"),
+    _pixels("depth_observed_pixels", "pixels observed"),
+    *_mean_and_median("depth_hole", "AbsRel in holes", 3, "depth_hole_pixels"),
+    _pixels("depth_hole_pixels", "pixels in holes"),
 )
-"""Against true depth where it is known, and of what was added against the scene before. All lengths
-are shares of the depth."""
+"""Against true depth where it is known."""
+
+ADDED = (
+    *_mean_and_median("depth_rim", "step at rim", 4, "align_pixels"),
+    *_mean_and_median("align_abs_rel", "AbsRel to context", 4, "align_pixels"),
+    *_mean_and_median("align_chamfer", "Chamfer to context", 4, "align_pixels"),
+    *_mean_and_median("align_f_score", "F-score to context", 3, "align_pixels"),
+    _pixels("align_pixels", "pixels of overlap"),
+)
+"""Of what was added against the scene before. All lengths are shares of the depth."""
+
+LIFTED = (
+    *_mean_and_median("registered_abs_rel", "AbsRel of all lifted", 4, "registered_pixels"),
+    *_mean_and_median("registered_chamfer", "Chamfer of all lifted", 4, "registered_pixels"),
+    *_mean_and_median("registered_f_score", "F-score of all lifted", 3, "registered_pixels"),
+    _pixels("registered_pixels", "pixels of all lifted"),
+)
+"""The same of all that was lifted, as it was registered and before any of it was filtered."""
 
 SEQUENCE = (
     Column("psnr_before", "PSNR before", 2, psnr_before),
@@ -148,6 +186,36 @@ SEQUENCE = (
 )
 """What tells steps apart that build on each other: PSNR in dB at the target of each step, just
 before it and in the scene that the last one leaves; the scale of what was added."""
+
+GROUPS = {
+    "Images": IMAGES,
+    "Looks": LOOKS,
+    "Geometry": GEOMETRY,
+    "Geometry of what was added": ADDED,
+    "Geometry of all that was lifted": LIFTED,
+    "Sequences": SEQUENCE,
+}
+"""By the title of their table, all columns."""
+
+NOTES = {
+    "reggs": (
+        "reggs starts from our metric lift and from the true poses. RegGS as the paper has it gets "
+        "neither, so the row of reggs is not the paper's."
+    ),
+}
+"""By method, what its row has to be read with."""
+
+FEW_PIXELS = (
+    f"A number of geometry counts where it was measured over at least {MIN_PIXELS} pixels; the "
+    "columns of pixels are medians over all cases."
+)
+"""What the tables of geometry have to be read with."""
+
+NO_PIXELS = (
+    "Some rows are of an earlier version, which counted no pixels, so their geometry is left out; "
+    "scoring again adds it."
+)
+"""What tables with such rows have to be read with."""
 
 
 @dataclass(frozen=True)
@@ -181,13 +249,27 @@ class Summary:
     @property
     def groups(self) -> dict[str, tuple[Column, ...]]:
         """By the title of their table, the columns that may have a value."""
-        groups = {"Images": IMAGES, "Looks": LOOKS, "Geometry": GEOMETRY}
-        return {**groups, "Sequences": SEQUENCE} if self.sequences else groups
+        return {
+            title: columns
+            for title, columns in GROUPS.items()
+            if columns is not SEQUENCE or self.sequences
+        }
 
     @property
     def columns(self) -> tuple[Column, ...]:
         """Those of all groups."""
         return tuple(column for group in self.groups.values() for column in group)
+
+    @property
+    def notes(self) -> list[str]:
+        """What the tables have to be read with, a sentence or two each."""
+        scores = [s["scores"] for rows in self.rows.values() for row in rows for s in row["steps"]]
+        geometry = {
+            FEW_PIXELS: bool(self.present((*GEOMETRY, *ADDED, *LIFTED))),
+            NO_PIXELS: any("align_pixels" not in found for found in scores),
+        }
+        of_methods = [NOTES[method] for method in self.methods if method in NOTES]
+        return [*(note for note, holds in geometry.items() if holds), *of_methods]
 
     @property
     def num_steps(self) -> int:

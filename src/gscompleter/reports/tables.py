@@ -126,6 +126,7 @@ def score_markdown(summary: Summary, fids: Fid) -> str:
         if chosen:
             head = ["method", *(column.title for column in chosen)]
             parts.append(f"### {title}\n\n" + markdown(head, score_cells(summary, chosen)))
+    parts += [f"{note}\n" for note in summary.notes]
     if not any(column.key.startswith("lpips") for column in summary.present(IMAGES)):
         parts.append(LPIPS_MISSING)
     if not any(column.key.endswith("flip") for column in summary.present(LOOKS)):
@@ -202,6 +203,7 @@ def step_cells(step: Step) -> list[str]:
 def score_latex(summary: Summary) -> str:
     """The tables of scores for LaTeX with booktabs."""
     blocks = [f"% Over the {len(summary.common)} of {len(summary.tasks)} cases that all finished."]
+    blocks += [f"% {note}" for note in summary.notes]
     for group in summary.groups.values():
         columns = summary.present(group)
         if columns:
@@ -241,6 +243,7 @@ def score_content(summary: Summary, fids: Fid) -> dict[str, Any]:
             str(gap): {method: cell.value for method, cell in cells.items()}
             for gap, cells in summary.gains.items()
         },
+        "notes": summary.notes,
         "fid": {"values": fids.values, "reason": fids.reason},
         "failures": [
             dict(zip(("case", "method", "reason"), failure, strict=True))

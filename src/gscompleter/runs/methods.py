@@ -61,6 +61,9 @@ class Prediction:
     """Fallbacks that were taken, a sentence each."""
     peak_bytes: int | None = None
     """The most memory that was held meanwhile; None where the system does not tell."""
+    registered: Gaussians | None = None
+    """All that was lifted, as it was registered, before any of it was filtered; None for a method
+    that lifts nothing."""
 
 
 Method = Callable[[Completion, Camera, Models], Prediction]
@@ -76,12 +79,12 @@ def completed_with(config: str) -> Method:
     """Our method with the settings called `config`."""
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
-        completer = models.completer(config)
+        completer = replace(models.completer(config), keep_registered=True)
         context = InitialContext(state.scene, state.views)
         done = completer.advance(completer.begin_with(context), target)
         (made,) = done.targets
         told = (made.anchor, made.anchor_fallback, made.notes)
-        return Prediction(done.scene, made.added, done.seconds, *told)
+        return Prediction(done.scene, made.added, done.seconds, *told, registered=made.registered)
 
     return method
 
@@ -115,7 +118,7 @@ def registered_by_similarity(state: Completion, target: Camera, models: Models) 
             lifted, state.scene, reference, models.renderer, models.seed, config
         ).gaussians
     scene = merge([state.scene, added])
-    return Prediction(scene, added, clock.seconds, anchor.index, anchor.fallback)
+    return Prediction(scene, added, clock.seconds, anchor.index, anchor.fallback, registered=added)
 
 
 def numbered(prediction: Prediction, number: int, before: Gaussians) -> Prediction:

@@ -176,7 +176,9 @@ def step_of(
     """What a step came to, and what its camera sees."""
     truth = Truth(state.views, target, task.neighbours)
     before, after = state.scene, prediction.scene
-    scores, seen = score(before, after, prediction.added, truth, task.models.renderer)
+    scores, seen = score(
+        before, after, prediction.added, truth, task.models.renderer, prediction.registered
+    )
     anchor = None if prediction.anchor is None else state.views[prediction.anchor]
     scale = None
     if len(task.targets) > 1 and anchor is not None and prediction.added is not None:

@@ -45,6 +45,9 @@ TASKS = "tasks"
 VERSION = 3
 """Of the files in a folder of results."""
 
+REGISTERED = "registered_"
+"""Before the names of the arrays of what was registered, in the file of a prediction."""
+
 _FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 
 Arrays = dict[str, np.ndarray]
@@ -182,7 +185,9 @@ def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
-    """Write what differs from the scene before: what was added, or else the whole scene."""
+    """Write what differs from the scene before, what was added or else the whole scene, and what
+    was registered."""
+    registered = prediction.registered
     whole = prediction.added is None
     write_arrays(
         path,
@@ -195,6 +200,7 @@ def save_prediction(path: Path, prediction: Prediction) -> None:
             "anchor_fallback": np.array(prediction.anchor_fallback),
             "notes": np.array(prediction.notes, dtype=np.str_),
             "peak_bytes": _optional(prediction.peak_bytes),
+            **({} if registered is None else _arrays_of(registered, REGISTERED)),
         },
     )
 
@@ -214,6 +220,11 @@ def load_prediction(path: Path, before: Gaussians) -> Prediction | None:
         anchor_fallback=bool(arrays["anchor_fallback"]),
         notes=tuple(arrays["notes"].tolist()),
         peak_bytes=_known(arrays["peak_bytes"]),
+        registered=(
+            _gaussians_of(arrays, before.means.device, REGISTERED)
+            if f"{REGISTERED}means" in arrays
+            else None
+        ),
     )
 
 
@@ -226,13 +237,16 @@ def _known(number: np.ndarray) -> int | None:
     return None if number < 0 else int(number)
 
 
-def _arrays_of(gaussians: Gaussians) -> Arrays:
-    return {name: getattr(gaussians, name).detach().cpu().numpy() for name in _FIELDS}
+def _arrays_of(gaussians: Gaussians, prefix: str = "") -> Arrays:
+    return {f"{prefix}{name}": getattr(gaussians, name).detach().cpu().numpy() for name in _FIELDS}
 
 
-def _gaussians_of(arrays: Mapping[str, np.ndarray], device: torch.device | str) -> Gaussians:
+def _gaussians_of(
+    arrays: Mapping[str, np.ndarray], device: torch.device | str, prefix: str = ""
+) -> Gaussians:
     """Copies, which lie in memory as torch's own tensors do: how a sum is rounded depends on it."""
-    tensors: list[Any] = [torch.from_numpy(arrays[name]).clone().to(device) for name in _FIELDS]
+    found = (arrays[f"{prefix}{name}"] for name in _FIELDS)
+    tensors: list[Any] = [torch.from_numpy(array).clone().to(device) for array in found]
     return Gaussians(*tensors)
 
 
