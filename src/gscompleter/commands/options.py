@@ -274,6 +274,9 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     ignore_masked: bool = False
     """Ignore what masks cover in the photographs, and boxes around what moves: nothing is made of
     it, and it does not count in the scores."""
+    ego_mask: bool = True
+    """Ignore what stays the same while the camera moves, such as the bonnet of the vehicle that
+    carries it, likewise and for all methods."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to do, in all shards together."""
 

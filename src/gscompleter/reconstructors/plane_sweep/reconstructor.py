@@ -93,9 +93,14 @@ def ranged(views: Sequence[View]) -> list[View]:
 
 
 def matched(rig: Rig, views: Sequence[View], halves: bool) -> list[Measured]:
-    """What stereo measures in each of `views`; with `halves` large ones only at half their size."""
+    """What stereo measures in each of `views`, but for what is ignored; with `halves` large ones
+    only at half their size."""
     large = min(min(image.size) for image in rig.images) >= HALVED_FROM
-    return measured(rig.halved() if large and halves else rig, *depth_range_of(views))
+    found = measured(rig.halved() if large and halves else rig, *depth_range_of(views))
+    return [
+        one if image.ignored is None else without(one, image.ignored)
+        for one, image in zip(found, rig.images, strict=True)
+    ]
 
 
 def surfaces_of(image: StereoImage, found: Measured, finest: int = 0) -> Layer:
