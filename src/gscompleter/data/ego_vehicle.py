@@ -48,7 +48,7 @@ BEND_COST = 0.1
 """What each of these rows costs, against an edge that stays in every photograph."""
 MIN_WIDTH = 0.25
 """Smallest share of the columns in which the outline stays although the ground would move it."""
-MIN_SUPPORT = 0.7
+MIN_SUPPORT = 0.6
 """Smallest share of the length of an outline that stays."""
 MIN_AREA, MAX_AREA = 0.01, 0.5
 """Smallest and largest share of an image that a vehicle fills."""
@@ -192,6 +192,11 @@ class Edges:
     across: Float[np.ndarray, "h w"]
     """Cosine between the normal of what stays and the motion of the ground."""
 
+    @property
+    def is_across(self) -> Bool[np.ndarray, "h w"]:
+        """Where the ground would have moved an edge away."""
+        return self.across >= ACROSS
+
 
 def find_static_region(
     images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 2"], first: int
@@ -209,7 +214,7 @@ def find_static_region(
     edges, (height, width) = find_edges(images, flow), images.shape[1:]
     found, limit = np.full(width, height), np.full(width, height)
     while is_vehicle(edges, outline := trace_outline(edges, first, limit, STRICT)):
-        top = max(first, outline.min() - CLEAR)
+        top = max(first, int(outline.min()) - CLEAR)
         found = np.minimum(found, trace_outline(edges, top, limit, LENIENT))
         limit = np.where(found < height, found - CLEAR, height)
     if (found == height).all():
@@ -291,14 +296,18 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
         return False
     columns = np.nonzero(outline < height)[0]
     rows = outline[columns]
-    staying = edges.staying[rows, columns] >= PERSISTENT
-    telling = staying & (edges.across[rows, columns] >= ACROSS)
+    kept = edges.staying >= PERSISTENT
+    staying, telling = (near_rows(mask)[rows, columns] for mask in (kept, kept & edges.is_across))
     if staying.mean() < MIN_SUPPORT or telling.sum() < MIN_WIDTH * width:
         return False
     elsewhere = ~below(outline - CLEAR, height)
-    kept = edges.staying >= PERSISTENT
     occurring = np.where(elsewhere, edges.occurring, 0)
     return bool(occurring[kept].sum() <= MAX_STAYING * occurring.sum())
+
+
+def near_rows(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Grow a mask by a row upward and downward."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((3, 1), np.uint8)) > 0
 
 
 def below(outline: Int[np.ndarray, "w"], height: int) -> Bool[np.ndarray, "h w"]:

@@ -100,7 +100,8 @@ class Frame:
         return read_pixels(stored)
 
     def small_pixels(self, side: int) -> Float[np.ndarray, "h w"]:
-        """The brightness of the photograph from 0 to 255, its longer side of `side` pixels."""
+        """The brightness of the photograph from 0 to 255, its longer side of at most `side`
+        pixels."""
         stored = self.stored()
         if stored is None:
             return self.pixels()  # which says what is missing

@@ -115,7 +115,7 @@ def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np.ndarray, "h w"]:
-    """The brightness, from 0 to 255, of an image shrunk so that its longer side has `side` pixels.
+    """The brightness, from 0 to 255, of an image whose longer side is shrunk to `side` pixels.
 
     Of a JPEG file no more is decoded than that takes.
 
@@ -128,7 +128,7 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
         InputError: where it is missing, truncated or not an image.
     """
     with _decoded(stored, name) if isinstance(stored, bytes) else _opened(stored) as image:
-        scale = side / max(image.size)
+        scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
         told = f"The image {quoted(name or str(stored))} is damaged"
