@@ -7,6 +7,7 @@ direction in which everything fixed to the ground moves through the image, and i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -23,8 +24,8 @@ from gscompleter.errors import InputError
 
 FEWEST, MOST = 6, 12
 """Photographs of a camera that are looked at; of fewer nothing is told."""
-SIDE = 256
-"""Longer side of the small copies that are looked at, in pixels."""
+SIDE, MIN_SIDE = 256, 16
+"""Longer side of the small copies that are looked at, and the least of the shorter, in pixels."""
 MAX_TURN = 25.0
 """Degrees by which the direction of travel and the downward axis of a camera on a vehicle may be
 off their means."""
@@ -80,14 +81,14 @@ class EgoVehicle:
         if motion is None:
             return None
         small = read_small(chosen)
-        if len(small) < FEWEST:
+        if len(small) < FEWEST or min(small[0][1].shape) < MIN_SIDE:
             return None
-        width, height = small[0][0].size()
-        if small[0][0].defect(width, height) is not None:
+        size = small[0][0].size()
+        if small[0][0].defect(*size) is not None:
             return None
         images = np.stack([image for _, image in small])
-        pinhole = small[0][0].intrinsics.at(width, height)
-        return find_static_region(images, *ground_flow(motion, pinhole, images.shape[1:]))
+        flow, first = ground_flow(motion, small[0][0].intrinsics.at(*size), images.shape[1:])
+        return find_static_region(images, flow, first)
 
 
 def read_small(frames: Sequence[Frame]) -> list[tuple[Frame, Float[np.ndarray, "h w"]]]:
@@ -215,7 +216,8 @@ def find_static_region(
     found, limit = np.full(width, height), np.full(width, height)
     while is_vehicle(edges, outline := trace_outline(edges, first, limit, STRICT)):
         top = max(first, int(outline.min()) - CLEAR)
-        found = np.minimum(found, trace_outline(edges, top, limit, LENIENT))
+        fainter = trace_outline(edges, top, limit, LENIENT)
+        found = np.minimum(found, np.minimum(outline, fainter))
         limit = np.where(found < height, found - CLEAR, height)
     if (found == height).all():
         return None
@@ -225,7 +227,7 @@ def find_static_region(
 
 def without_dents(outline: Int[np.ndarray, "w"]) -> Int[np.ndarray, "w"]:
     """Raise an outline where it falls for a few columns and rises again."""
-    window = np.ones((1, round(DENT * len(outline))), np.uint8)
+    window = np.ones((1, math.ceil(DENT * len(outline))), np.uint8)
     rows = np.pad(outline, len(outline) // 2, mode="edge").astype(np.float32)[None]
     filled = cv2.morphologyEx(rows, cv2.MORPH_OPEN, window)[0]
     return filled[len(outline) // 2 :][: len(outline)].astype(np.int64)

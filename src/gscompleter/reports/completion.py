@@ -20,7 +20,7 @@ from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
 from gscompleter.kernels.sharing import side_by_side
 from gscompleter.metrics.coverage import Look, coverage_of
-from gscompleter.metrics.scores import counted_psnr, counted_ssim
+from gscompleter.metrics.image import masked_psnr, ssim
 from gscompleter.render import Renderer, each_view
 from gscompleter.reports.depth_picture import limits_of, write_depth
 from gscompleter.reports.record import Limits, most_changed, record_of, write_record
@@ -104,11 +104,12 @@ class Images:
 
     def scores(self) -> Scores:
         """PSNR (dB) and SSIM against what counts of the photograph; None where there is none."""
-        images = {"before": self.before.image, "after": self.after.image}
+        images, truth = {"before": self.before.image, "after": self.after.image}, self.truth
+        if truth is None:
+            return {f"{name}_{when}": None for name in ("psnr", "ssim") for when in images}
         return {
-            f"{name}_{when}": None if self.truth is None else metric(image, self.truth)
-            for name, metric in (("psnr", counted_psnr), ("ssim", counted_ssim))
-            for when, image in images.items()
+            **{f"psnr_{w}": masked_psnr(i, truth.image, truth.counted) for w, i in images.items()},
+            **{f"ssim_{w}": ssim(truth.compared(i), truth.image) for w, i in images.items()},
         }
 
 
