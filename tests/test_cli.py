@@ -86,7 +86,10 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
     assert summary["held_out"] == []  # all three are used
     scores = {"psnr_before", "psnr_after", "ssim_before", "ssim_after"}
     assert [row["frame"] for row in summary["context"]] == [0, 1]
-    assert all(set(row) == {"frame", "gain", "contradicted", *scores} for row in summary["context"])
+    assert all(
+        set(row) == {"frame", "gain", "contradicted", "ignored", *scores}
+        for row in summary["context"]
+    )
     assert all(row["gain"] is None for row in summary["context"])  # two stay as they were taken
     (target,) = summary["targets"]
     assert set(target) >= {"frame", "anchor", "anchor_fallback", "hole_fraction", "affine", *scores}

@@ -343,8 +343,8 @@ def test_a_report_draws_no_photograph_again():
     found = at_photographs(done, completer)
     assert renderer.frozen == []
     for images, view in zip(found, done.views, strict=True):
-        drawn = compare(done, view.camera, view.image, CpuRenderer())
-        assert torch.equal(images.truth, drawn.truth)
+        drawn = compare(done, view.camera, view, CpuRenderer())
+        assert images.truth is drawn.truth
         for seen, again in ((images.before, drawn.before), (images.after, drawn.after)):
             assert torch.equal(seen.image, again.image)
             assert torch.equal(seen.alpha, again.alpha)

@@ -62,7 +62,7 @@ from gscompleter.reports.film import NAME as FILM
 from gscompleter.reports.film import write_film
 from gscompleter.reports.page import NAME as PAGE
 from gscompleter.reports.page import write_page
-from gscompleter.reports.plain_words import NO_TARGET, exposures, moved
+from gscompleter.reports.plain_words import NO_TARGET, exposures, left_out, moved
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.order import order_nearby
 from gscompleter.types import Camera, Completion, View
@@ -178,6 +178,8 @@ def prepared(
     settings_class(options.synthesis.name)
     device = choose_device(options.device)
     opened = open_scene(options, console)
+    if not options.config.ego_mask:
+        opened = opened.with_ego_vehicle()
     with preparing("reading photographs"):
         task = read_task(options, opened, device)
     parts = device, options.reconstructor, options.synthesis.name
@@ -281,7 +283,8 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         console.print(note)
     gains = [row["gain"] for row in summary["context"]]
     contradicted = {row["frame"]: row["contradicted"] for row in summary["context"]}
-    for sentence in filter(None, (exposures(gains), moved(contradicted))):
+    carried = left_out(row["ignored"] for row in summary["context"])
+    for sentence in filter(None, (exposures(gains), moved(contradicted), carried)):
         console.print(sentence, soft_wrap=True)
     origin = summary["frame"]["origin"]
     if any(origin):

@@ -88,6 +88,7 @@ def source_of(options: EvaluateOptions) -> dict[str, Any]:
         "resolution": list(size) if isinstance(size, tuple) else size,
         **({"ignore_masked": True} if options.ignore_masked else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
+        **({} if options.ego_mask else {"ego_mask": False}),
     }
 
 
@@ -169,6 +170,7 @@ def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped], notes: list[s
             cases = [replace(case, resolution=size) for case in cases]
         if options.ignore_masked:
             cases = [replace(case, ignore_masked=True) for case in cases]
+        cases = [replace(case, ego_mask=options.ego_mask) for case in cases]
         return [task_of(case) for case in cases]
     return list(islice(tasks_in_clips(options, skipped, notes), options.limit))
 
@@ -203,6 +205,7 @@ def tasks_in_clips(
                     f"Nothing says what is to be ignored in {clip.name}: it has neither masks nor "
                     "boxes of what moves; leave --ignore-masked out."
                 )
+            clip = clip if options.ego_mask else clip.with_ego_vehicle()
             for protocol in protocols:
                 if isinstance(protocol, ViewByView) and (reason := protocol.reason_to_skip(clip)):
                     skipped.append(Skipped(clip.name, reason))

@@ -76,6 +76,10 @@ class Opened:
     number: int
     """How many photographs there are, those included whose camera was not found."""
 
+    def with_ego_vehicle(self) -> Opened:
+        """The same, where the vehicle that carries the camera is taken for a part of the scene."""
+        return replace(self, photographs=self.photographs.with_ego_vehicle())
+
 
 @dataclass(frozen=True)
 class ContextBudget:
@@ -450,7 +454,7 @@ def with_photograph(target: Target, given: Photographs, resolution: Resolution) 
     if target.frame is None or not given.has_photograph(target.frame):
         return target
     (view,) = given.views([target.frame], resolution)
-    return replace(target, photograph=view.image)
+    return replace(target, photograph=view.image, ignored=view.ignored)
 
 
 def check_sizes(cameras: Sequence[Camera]) -> None:

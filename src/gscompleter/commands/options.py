@@ -278,6 +278,9 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     one_per_scene: bool = False
     """Take one case of each scene: the first of each protocol (of n-10 frames 0 and 10 for 20) or
     of a cases.json. The paper counts as many cases as scenes."""
+    ego_mask: bool = True
+    """Ignore what stays the same while the camera moves, such as the bonnet of the vehicle that
+    carries it, likewise and for all methods."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to do, in all shards together."""
 

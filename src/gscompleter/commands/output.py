@@ -84,7 +84,7 @@ def read_held_out(
     for frame in closest([camera.to(device) for camera in wanted], others, MAX_HELD_OUT):
         with suppress(InputError):
             (view,) = opened.photographs.views([frame], working_size(options.resolution))
-            view = View(view.image.to(device), others[frame], frame)
+            view = View(view.image, others[frame], frame, ignored=view.ignored).to(device)
             held_out.append(HeldOut(view, frame in checks))
     return held_out
 

@@ -250,6 +250,9 @@ class CompleterConfig(Settings):
     """Share of its size by which the target image is extended on every side while it is completed,
     where a hole reaches its border, so that a camera that moves on from the target does not meet
     the next hole there. The paper completes what the target itself sees."""
+    ego_mask: bool = True
+    """Ignore what of the photographs stays the same while the camera moves, such as the bonnet of
+    the vehicle that carries it. The paper takes photographs as they are."""
     synthesis: SynthesisConfig = SynthesisConfig()
     """How the target image is synthesized."""
     anchor: AnchorConfig = AnchorConfig()
@@ -282,6 +285,7 @@ class CompleterConfig(Settings):
         """
         return CompleterConfig(
             margin=0.0,
+            ego_mask=False,
             synthesis=SynthesisConfig(correct_color=False, source_depth="monocular"),
             anchor=AnchorConfig(min_baseline=0.0, min_overlap=0.0),
             registration=RegistrationConfig(

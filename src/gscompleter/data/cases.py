@@ -40,6 +40,8 @@ class Case:
     far: float | None = None
     ignore_masked: bool = False
     """Whether what is masked in the photographs is ignored."""
+    ego_mask: bool = True
+    """Whether the vehicle that carries the camera is ignored."""
 
     @property
     def name(self) -> str:
@@ -48,6 +50,7 @@ class Case:
     def load(self, frames: tuple[int, ...]) -> list[View]:
         """Photographs of `frames`."""
         scene = open_photographs(self.scene, near=self.near, far=self.far)
+        scene = scene if self.ego_mask else scene.with_ego_vehicle()
         views = scene.views(frames, self.resolution)
         return without_masked(views, scene, self.resolution) if self.ignore_masked else views
 

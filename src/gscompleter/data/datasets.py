@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from gscompleter.data.cases import holds_cases, open_cases
+from gscompleter.data.ego_vehicle import looking_for_vehicle
 from gscompleter.data.formats import FORMATS, format_of, recognised
 from gscompleter.data.photographs import Photographs, PosedPhotographs
 
@@ -38,7 +39,8 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
     inside = [] if recognised(path) or not os.path.isdir(path) else sorted(path.iterdir())
     folders = [child for child in inside if child.is_dir() and recognised(child)]
     scenes = [(FORMATS[format_of(place)], place) for place in folders or [path]]
-    return (looking_ahead(clip) for format, place in scenes for clip in format.open(place))
+    clips = (looking_ahead(clip) for format, place in scenes for clip in format.open(place))
+    return (replace(clip, frames=looking_for_vehicle(clip.frames)) for clip in clips)
 
 
 def looking_ahead(clip: Photographs) -> Photographs:

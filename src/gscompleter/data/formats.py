@@ -16,6 +16,7 @@ from gscompleter.data.camera_list import holds_camera_list, open_camera_list
 from gscompleter.data.chunks import holds_chunks, open_chunks
 from gscompleter.data.colmap.scene import holds_colmap, open_colmap
 from gscompleter.data.dgp import holds_dgp, open_dgp
+from gscompleter.data.ego_vehicle import looking_for_vehicle
 from gscompleter.data.image_folders import FOLDERS
 from gscompleter.data.kitti import holds_kitti, open_kitti
 from gscompleter.data.kitti_raw import holds_kitti_raw, open_kitti_raw
@@ -92,7 +93,8 @@ def open_photographs(
     near, far = scene.near if near is None else near, scene.far if far is None else far
     check_planes(near, far)
     sparse = None if scene.sparse is None else cache(scene.sparse)
-    return replace(scene, near=near, far=far, format=found, sparse=sparse)
+    frames = looking_for_vehicle(scene.frames)
+    return replace(scene, frames=frames, near=near, far=far, format=found, sparse=sparse)
 
 
 def format_of(path: Path, name: str | None = None) -> str:

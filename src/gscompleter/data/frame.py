@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from gscompleter.data.intrinsics import FRACTIONS, Intrinsics, pinhole_defect
 from gscompleter.data.lens import Pinhole, undistorted
@@ -16,7 +16,7 @@ from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.moving_objects import Box
 from gscompleter.data.poses import pose_defect
 from gscompleter.errors import InputError, quoted
-from gscompleter.io.image import decode_pixels, image_size, read_pixels
+from gscompleter.io.image import decode_pixels, image_size, read_brightness, read_pixels
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Of image files, for names without one."""
@@ -51,6 +51,9 @@ class Frame:
     """Reads what lasers measured at about that time, in the frame of the poses."""
     boxes: Callable[[], tuple[Box, ...]] | None = None
     """Reads boxes around what stands or moves there at about that time, in that frame."""
+    vehicle: Callable[[], Bool[np.ndarray, "h w"] | None] | None = None
+    """Finds what of the photograph, as it is stored but of any size, shows the vehicle that carries
+    the camera; None where nobody is to look."""
 
     def stored(self) -> Path | bytes | None:
         """The image file or its bytes; None where there is none."""
@@ -95,6 +98,14 @@ class Frame:
         if isinstance(stored, bytes):
             return decode_pixels(stored, capital(self.title))
         return read_pixels(stored)
+
+    def small_pixels(self, side: int) -> Float[np.ndarray, "h w"]:
+        """The brightness of the photograph from 0 to 255, its longer side of at most `side`
+        pixels."""
+        stored = self.stored()
+        if stored is None:
+            return self.pixels()  # which says what is missing
+        return read_brightness(stored, side, capital(self.title))
 
     def defect(self, width: int, height: int) -> str | None:
         """What makes the camera of a photograph of that size impossible; None if nothing does."""

@@ -71,7 +71,8 @@ class PosedPhotographs(Protocol):
         """The camera of a frame, as `views` has it."""
 
     def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
-        """The photographs of `frames`, with depth where there is some. Only these are read.
+        """The photographs of `frames`, with depth where there is some. What shows the vehicle that
+        carries the camera is to be ignored, where frames know it (`ego_vehicle.py`).
 
         Lens distortion is removed: the undistorted image has the size of the photograph and no
         empty pixel, and the intrinsics follow (`lens.undistorted` says how).
@@ -158,6 +159,10 @@ class Photographs:
             return None
         return torch.from_numpy(self.sparse() - self.origin).float()
 
+    def with_ego_vehicle(self) -> Photographs:
+        """The same, where the vehicle that carries the camera counts like all else."""
+        return replace(self, frames=tuple(replace(f, vehicle=None) for f in self.frames))
+
     @property
     def has_masks(self) -> bool:
         """Whether something is told of what is to be ignored."""
@@ -199,7 +204,12 @@ class Photographs:
         elif frame.measured is not None:
             points = torch.from_numpy(frame.measured() - self.origin).float()
             depth = sparse_depth(points, camera)
-        return View(as_image(fitted(frame, pixels, size, resolution)), camera, number, depth)
+        image = as_image(fitted(frame, pixels, size, resolution))
+        vehicle = None if frame.vehicle is None else frame.vehicle()
+        if vehicle is None:
+            return View(image, camera, number, depth)
+        ignored = fitted(frame, vehicle.astype(np.uint8), size, resolution) > 0
+        return View(image, camera, number, depth, torch.from_numpy(ignored))
 
 
 def without_masked(
@@ -218,7 +228,9 @@ def without_masked(
             raise InputError(
                 f"All of frame {view.frame} of {photographs.name} is masked; choose another frame."
             )
-        found.append(replace(view, ignored=mask))
+        if mask is not None:
+            view = replace(view, ignored=mask if view.ignored is None else mask | view.ignored)
+        found.append(view)
     return found
 
 

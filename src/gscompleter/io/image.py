@@ -114,6 +114,32 @@ def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
         return _checked(lambda: _over_black(image), told, "copy its file again")
 
 
+def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np.ndarray, "h w"]:
+    """The brightness, from 0 to 255, of an image whose longer side is shrunk to `side` pixels.
+
+    Of a JPEG file no more is decoded than that takes.
+
+    Args:
+        stored: The file, or its bytes.
+        side: In pixels.
+        name: What error messages call the latter.
+
+    Raises:
+        InputError: where it is missing, truncated or not an image.
+    """
+    with _decoded(stored, name) if isinstance(stored, bytes) else _opened(stored) as image:
+        scale = min(1.0, side / max(image.size))
+        size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
+        image.draft("L", size)
+        told = f"The image {quoted(name or str(stored))} is damaged"
+        return _checked(lambda: _shrunk(image, size), told, "copy it again")
+
+
+def _shrunk(image: Image.Image, size: tuple[int, int]) -> Float[np.ndarray, "h w"]:
+    grey = Image.fromarray(_over_black(image)).convert("L")
+    return np.array(grey.resize(size, Image.Resampling.BOX), np.float32)
+
+
 def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     """The z-depth in a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown.
 

@@ -21,7 +21,12 @@ KEPT = 32
 
 def features_of(view: StereoImage) -> Features:
     grey = cv2.cvtColor((view.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
-    return _features_in(grey.tobytes(), grey.shape)
+    pixels, descriptors = _features_in(grey.tobytes(), grey.shape)
+    if view.ignored is None:
+        return pixels, descriptors
+    columns, rows = pixels.astype(int).T
+    counted = ~view.ignored[rows, columns]
+    return pixels[counted], descriptors[counted]
 
 
 @lru_cache(KEPT)

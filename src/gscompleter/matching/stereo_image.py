@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from gscompleter.errors import InputError
 from gscompleter.types import View
@@ -25,6 +25,8 @@ class StereoImage:
     rotation: Float[np.ndarray, "3 3"]
     """Camera axes to world axes."""
     center: Float[np.ndarray, "3"]
+    ignored: Bool[np.ndarray, "h w"] | None = None
+    """True where nothing is matched; None where everything is."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -70,6 +72,7 @@ def _stereo_image(view: View, center: Float[np.ndarray, "3"]) -> StereoImage:
         camera.K.detach().cpu().double().numpy(),
         camera.c2w[:3, :3].detach().cpu().double().numpy(),
         center,
+        None if view.ignored is None else view.ignored.cpu().numpy(),
     )
 
 

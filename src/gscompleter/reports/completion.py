@@ -20,7 +20,7 @@ from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
 from gscompleter.kernels.sharing import side_by_side
 from gscompleter.metrics.coverage import Look, coverage_of
-from gscompleter.metrics.image import psnr, ssim
+from gscompleter.metrics.image import masked_psnr, ssim
 from gscompleter.render import Renderer, each_view
 from gscompleter.reports.depth_picture import limits_of, write_depth
 from gscompleter.reports.record import Limits, most_changed, record_of, write_record
@@ -32,6 +32,9 @@ from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompl
 GENERATED = "generated.ply"
 """The file with what was added, alone."""
 
+
+IGNORED = (1.0, 0.0, 1.0)
+"""Colour of what is ignored, in pictures of photographs."""
 
 Scores = dict[str, float | None]
 """By their names, what an image scores; None where there is no photograph."""
@@ -46,8 +49,17 @@ class Target:
     """Its number in the scene; None for a camera from elsewhere."""
     photograph: Float[Tensor, "h w 3"] | None = None
     """What the camera took, where it took anything. No stage sees it but `oracle`."""
+    ignored: Bool[Tensor, "h w"] | None = None
+    """True where that is to be ignored; None where all of it counts."""
     near: int | None = None
     """Number of the frame that a camera was derived from, where it was found and not named."""
+
+    @property
+    def view(self) -> View | None:
+        """The photograph with its camera; None where there is none."""
+        if self.photograph is None:
+            return None
+        return View(self.photograph, self.camera, self.frame, ignored=self.ignored)
 
 
 @dataclass(frozen=True)
@@ -87,20 +99,22 @@ class Images:
 
     before: Render
     after: Render
-    truth: Float[Tensor, "h w 3"] | None
+    truth: View | None
+    """The photograph; None where there is none."""
 
     def scores(self) -> Scores:
-        """PSNR (dB) and SSIM against the photograph; None where there is none."""
-        images = {"before": self.before.image, "after": self.after.image}
+        """PSNR (dB) and SSIM against what counts of the photograph; None where there is none."""
+        images, truth = {"before": self.before.image, "after": self.after.image}, self.truth
+        if truth is None:
+            return {f"{name}_{when}": None for name in ("psnr", "ssim") for when in images}
         return {
-            f"{metric.__name__}_{when}": None if self.truth is None else metric(image, self.truth)
-            for metric in (psnr, ssim)
-            for when, image in images.items()
+            **{f"psnr_{w}": masked_psnr(i, truth.image, truth.counted) for w, i in images.items()},
+            **{f"ssim_{w}": ssim(truth.compared(i), truth.image) for w, i in images.items()},
         }
 
 
 def compare(
-    completion: Completion, camera: Camera, truth: Float[Tensor, "h w 3"] | None, renderer: Renderer
+    completion: Completion, camera: Camera, truth: View | None, renderer: Renderer
 ) -> Images:
     """The context and the completed scene as `camera` sees them."""
     with torch.no_grad():
@@ -117,10 +131,10 @@ def at_photographs(completion: Completion, completer: GSCompleter) -> list[Image
     unless a proxy stood for the scene."""
     views = completion.views
     if completion.proxy is not None:
-        return [compare(completion, v.camera, v.image, completer.renderer) for v in views]
+        return [compare(completion, v.camera, v, completer.renderer) for v in views]
     after = contexts_of(completer.at(completion, views))
     seen = zip(completion.begun, after, views, strict=True)
-    return [Images(first, last, view.image) for first, last, view in seen]
+    return [Images(first, last, view) for first, last, view in seen]
 
 
 def score_held_out(
@@ -131,7 +145,7 @@ def score_held_out(
 
     def score(held_out: HeldOut) -> dict[str, Any]:
         view = held_out.view
-        scores = compare(completion, view.camera, view.image, renderer).scores()
+        scores = compare(completion, view.camera, view, renderer).scores()
         return {"frame": view.frame, **scores, "is_check": held_out.is_check}
 
     return list(each_view(completion.added)(score, photographs))
@@ -155,6 +169,7 @@ def summarize(
                 **scored,
                 "gain": gain,
                 "contradicted": contradicted_share(view),
+                "ignored": ignored_share(view),
             }
             for view, scored, gain in zip(
                 completion.views, scores[:count], gains_of(completion), strict=True
@@ -206,6 +221,11 @@ def contradicted_share(view: View) -> float:
     return 0.0 if view.contradicted is None else view.contradicted.float().mean().item()
 
 
+def ignored_share(view: View) -> float:
+    """Share of a photograph that is ignored."""
+    return 0.0 if view.ignored is None else view.ignored.float().mean().item()
+
+
 def counts(completion: Completion) -> dict[str, int]:
     """How many Gaussians were given and added and, of a scene that was doubted, set aside."""
     found = {"context": len(completion.context), "added": len(completion.added)}
@@ -242,7 +262,7 @@ def write_report(
     """
     context_images = at_photographs(completion, completer)
     target_images = [
-        compare(completion, result.target, target.photograph, completer.renderer)
+        compare(completion, result.target, target.view, completer.renderer)
         for target, result in zip(targets, completion.targets, strict=True)
     ]
     scores = side_by_side(Images.scores, [*context_images, *target_images])
@@ -251,6 +271,7 @@ def write_report(
     pictured = folder / "images"
     pictured.mkdir()
     results = zip(completion.targets, target_images, strict=True)
+    write_ignored(pictured, completion.views)
     limits = [write_pictures(pictured, n, *pair) for n, pair in enumerate(results, start=1)]
     surroundings = around()
     shown = most_changed(surroundings.looks)
@@ -296,6 +317,21 @@ def write_pictures(
         for when, depth in depths.items():
             write_depth(folder / f"target{number}_depth_{when}.png", depth, limits)
     return limits
+
+
+def write_ignored(folder: Path, views: Sequence[View]) -> None:
+    """Write each photograph of which something is ignored, with that in the colour `IGNORED`.
+
+    Raises:
+        InputError: where a file cannot be written.
+    """
+    painted = {}
+    for number, view in enumerate(views, start=1):
+        if view.ignored is not None:
+            colour = view.image.new_tensor(IGNORED)
+            image = torch.where(view.ignored[..., None], colour, view.image)
+            painted[folder / f"context{number}_ignored.png"] = image
+    write_images(painted)
 
 
 def write_looks(folder: Path, looks: Sequence[Look]) -> None:
@@ -384,7 +420,7 @@ def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:
     if result.reference is not None:
         found["reference"] = result.reference.image
     if images.truth is not None:
-        found["truth"] = images.truth
+        found["truth"] = images.truth.image
     return found
 
 

@@ -87,6 +87,7 @@ def completion_page(folder: Path) -> str:
             "targets": side_by_side(lambda row: each(row[0], *row[1]), rows),
             "coverage": coverage_sentence(summary),
             "around": list(around(found, gallery)),
+            "ignored": list(ignored_pictures(summary, gallery)),
             "cameras": cameras_of(found),
             "cameras_caption": cameras_caption(found),
             "yaw": YAW,
@@ -225,6 +226,14 @@ def around(found: Finished, gallery: Gallery) -> Iterator[tuple[Slider, str]]:
     for number, look in enumerate(found.record.around, start=1):
         slider = gallery.slider(f"around{number}", f"Camera {number} around the photographs")
         yield slider, f"{percent(look.before, 0)} → {percent(look.after, 0)} covered"
+
+
+def ignored_pictures(summary: Summary, gallery: Gallery) -> Iterator[tuple[Picture, str]]:
+    """The photographs of the context of which something is ignored, with that painted over."""
+    for number, row in enumerate(summary.context, start=1):
+        if row.ignored > 0:
+            caption = f"Photograph {row.frame}, {percent(row.ignored)} of it ignored (magenta)"
+            yield gallery.photo(f"context{number}_ignored.png", caption), caption
 
 
 def cameras_of(found: Finished) -> Markup | None:

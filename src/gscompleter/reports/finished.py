@@ -51,6 +51,8 @@ class ContextRow(Scores):
     """By how much it is brighter than it is compared, by channel; None where it is not."""
     contradicted: float = 0.0
     """Share of it that the others contradict, because something moved."""
+    ignored: float = 0.0
+    """Share of it that is ignored, because it stays the same while the camera moves."""
 
 
 @dataclass(frozen=True)

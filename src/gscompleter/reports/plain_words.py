@@ -30,6 +30,17 @@ def moved(shares: Mapping[int | None, float]) -> str | None:
     )
 
 
+def left_out(shares: Iterable[float]) -> str | None:
+    """What is said where these shares of photographs are ignored."""
+    most = max(shares, default=0.0)
+    if most == 0:
+        return None
+    return (
+        f"Up to {percent(most)} of a photograph stays the same while the camera moves, as the "
+        "bonnet of a vehicle does: it is ignored, in scores too (images/context*_ignored.png)."
+    )
+
+
 def exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
     """What is said where Ψ evened out the exposures of photographs by these gains."""
     factors = [factor for gain in gains for factor in gain or ()]
@@ -73,6 +84,9 @@ def opened(summary: Summary) -> Iterator[str]:
     seen_to_move = moved({row.frame: row.contradicted for row in summary.context})
     if seen_to_move is not None:
         yield seen_to_move
+    carried = left_out(row.ignored for row in summary.context)
+    if carried is not None:
+        yield carried
     if summary.settings.get("context") is None:
         yield (
             f"Nobody named the photographs to work with: {summary.scene.used} of "

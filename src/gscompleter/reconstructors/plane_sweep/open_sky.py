@@ -85,11 +85,11 @@ def sky_shown(rig: Rig, sky_of_second: OtherMask) -> Mask:
     return even_above(first) & (at_infinity(first.size, sky_of_second, rig, 0, 1) == 1)
 
 
-def without(found: Measured, sky: Mask) -> Measured:
-    """What was measured elsewhere than in `sky`."""
-    full = found.at_size(sky.shape)
+def without(found: Measured, where: Mask) -> Measured:
+    """What was measured elsewhere than `where` it does not count, as in the sky."""
+    full = found.at_size(where.shape)
     weight, confidence = (
-        np.where(sky, np.float32(0), share) for share in (full.weight, full.confidence)
+        np.where(where, np.float32(0), share) for share in (full.weight, full.confidence)
     )
     return replace(full, weight=weight, confidence=confidence)
 

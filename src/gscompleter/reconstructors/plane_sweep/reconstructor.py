@@ -93,9 +93,14 @@ def ranged(views: Sequence[View]) -> list[View]:
 
 
 def matched(rig: Rig, views: Sequence[View]) -> list[Measured]:
-    """Measure depth in each of `views` by stereo; more than two large ones at half their size."""
+    """Measure depth in each of `views` by stereo, outside of what is ignored; more than two large
+    views at half their size."""
     is_halved = len(views) > 2 and min(min(image.size) for image in rig.images) >= HALVED_FROM
-    return measured(rig.halved() if is_halved else rig, *depth_range_of(views))
+    found = measured(rig.halved() if is_halved else rig, *depth_range_of(views))
+    return [
+        one if image.ignored is None else without(one, image.ignored)
+        for one, image in zip(found, rig.images, strict=True)
+    ]
 
 
 def surfaces_of(image: StereoImage, found: Measured) -> Layer:

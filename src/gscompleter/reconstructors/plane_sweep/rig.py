@@ -57,7 +57,8 @@ def halved(image: StereoImage) -> StereoImage:
     rows = even[::2] + even[1::2]
     pixels = (rows[:, ::2] + rows[:, 1::2]) / 4
     K = image.K * np.array([[0.5], [0.5], [1.0]])
-    return replace(image, image=pixels.astype(np.float32), K=K)
+    ignored = None if image.ignored is None else image.ignored[::2, ::2]
+    return replace(image, image=pixels.astype(np.float32), K=K, ignored=ignored)
 
 
 def at_half_size(transform: Float32[np.ndarray, "3 4"]) -> Float32[np.ndarray, "3 4"]:

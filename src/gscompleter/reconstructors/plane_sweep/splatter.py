@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -62,10 +62,12 @@ class Splatter:
         even = list(map(View.evened, views, gains.to(device)))
         parts = [self.splat(view, depth) for view, depth in zip(even, depths, strict=True)]
         every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
-        chosen = self.chosen(every, on_cpu, layers, transforms)
+        counted = as_rows([view.counted for view in on_cpu])
+        chosen = self.chosen(every, on_cpu, layers, transforms) & counted
         behind = self.skies_behind(even, depths)
         made = merge([every[chosen], *(gaussians.to("cpu") for _, gaussians, _ in behind)])
-        fitted = with_sky_of(made, self.fitted(made, on_cpu, gains), on_cpu[0].camera)
+        known = [self.without_ignored(made, *pair) for pair in zip(on_cpu, gains, strict=True)]
+        fitted = with_sky_of(made, self.fitted(made, known, gains), on_cpu[0].camera)
         rows = torch.cat([torch.arange(len(part)) for part in parts])[chosen]
         numbers = torch.cat([torch.full((len(part),), i) for i, part in enumerate(parts)])[chosen]
         more = [torch.full((len(pixels),), i) for i, _, pixels in behind]
@@ -108,6 +110,14 @@ class Splatter:
             start += gap.numel()
         return kept
 
+    def without_ignored(self, made: Gaussians, view: View, gain: Float[Tensor, "3"]) -> View:
+        """`view`, with the scene as it is made in place of what is ignored, so that nothing is
+        fitted to that."""
+        if view.ignored is None:
+            return view
+        drawn = self.renderer.render(made, view.camera).image * gain
+        return replace(view, image=torch.where(view.ignored[..., None], drawn, view.image))
+
     def fitted(
         self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
     ) -> Gaussians:
@@ -139,6 +149,6 @@ def gains_among(layers: Sequence[Layer], transforms: Transforms) -> Float[Tensor
     return torch.from_numpy(gains).float()
 
 
-def as_rows(masks: Sequence[Mask]) -> Bool[Tensor, "n"]:
+def as_rows(masks: Sequence[Mask | Tensor]) -> Bool[Tensor, "n"]:
     """Masks of the views one after the other, row by row."""
-    return torch.cat([torch.from_numpy(mask).reshape(-1) for mask in masks])
+    return torch.cat([torch.as_tensor(mask).reshape(-1) for mask in masks])
