@@ -7,6 +7,7 @@ texture that is a fixed function of the world point, so that all views agree on 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -66,6 +67,13 @@ def camera_at(
     c2w[:3, 3] = torch.tensor([x, y, z]) * unit
     K = torch.tensor([[focal * size, 0.0, size / 2], [0.0, focal * size, size / 2], [0, 0, 1]])
     return Camera(c2w.float(), K.float(), size, size, near=0.5 * unit, far=20.0 * unit)
+
+
+def unchecked(camera: Camera, **changes: object) -> Camera:
+    """Change a camera into one that its constructor refuses, as damaged memory might."""
+    other = copy(camera)
+    vars(other).update(changes)
+    return other
 
 
 def texture(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:

@@ -77,7 +77,10 @@ def refused(path: Path, text: str, sentence: str) -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("holes: {dilatation: 5}", "no setting 'holes.dilatation'; choose one of max_alpha, dil"),
+        (
+            "holes: {dilatation: 5}",
+            "no setting 'holes.dilatation'; choose one of max_alpha, min_covered, dil",
+        ),
         ("holes: {dilation: many}", "holes.dilation must be a valid integer, got 'many'"),
         ("holes: {dilation: '5'}", "holes.dilation must be a valid integer, got '5'"),
         ("holes: {dilation: 2.5}", "holes.dilation must be a valid integer, got 2.5"),

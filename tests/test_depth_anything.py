@@ -23,6 +23,7 @@ from depth_anything_fixtures import (
 )
 from feed_forward_fixtures import Case, extra
 from gscompleter import GSCompleter, InputError
+from gscompleter.config import CompleterConfig, HoleConfig
 from gscompleter.geometry import project, rotation_about, rotations_from, unproject
 from gscompleter.reconstructors import depth_anything, load_reconstructor
 from gscompleter.reconstructors.depth_anything import (
@@ -510,7 +511,10 @@ def psi_of(config: DepthAnythingConfig | NestedConfig) -> FromDepth | AnyViewGau
 def test_smoke_a_completion_runs_with_random_weights(config):
     """It says nothing of quality: only that all stages take what such a model gives."""
     views = [view_of(Room(), camera_at(x, size=48), i) for i, x in enumerate((-0.3, 0.1))]
-    completion = GSCompleter(psi_of(config))(views, camera_at(0.7, yaw=12, size=48))
+    anywhere = CompleterConfig(holes=HoleConfig(min_covered=0.0))
+    completion = GSCompleter(psi_of(config), config=anywhere)(
+        views, camera_at(0.7, yaw=12, size=48)
+    )
     (result,) = completion.targets
     assert result.reference is not None
     assert completion.scene.means.isfinite().all()

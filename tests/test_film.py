@@ -56,7 +56,7 @@ def completion() -> Completion:
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     made = TargetCompletion(target, drawn, drawn, mask, None, 0, False, DepthAffine(), right)
     scene = merge([context, right])
-    return Completion(scene, context, (view,), (1.0,), (made,), {"total": 0.0})
+    return Completion(scene, context, (view,), ((),), (made,), {"total": 0.0})
 
 
 def decoded(path: Path) -> tuple[dict, np.ndarray]:

@@ -18,7 +18,7 @@ from gscompleter import InputError, View
 from gscompleter.kernels import stereo
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.render.cpu import MAX_SIDE, CpuRenderer, arrays_of, length_of
-from scenes import camera_at, random_gaussians
+from scenes import camera_at, random_gaussians, unchecked
 
 ODD = [np.nan, np.inf, -np.inf, 3e38, -3e38, 1e19, -1e19, 1e-38, 0.0]
 
@@ -27,7 +27,7 @@ import sys
 sys.path.insert(0, sys.argv[1])
 from dataclasses import replace
 from gscompleter.render.cpu import CpuRenderer
-from scenes import camera_at, random_gaussians
+from scenes import camera_at, random_gaussians, unchecked
 camera, gaussians, drawn = camera_at(size=40), random_gaussians(50, sh_degree=1), 0
 def draw(gaussians, camera):
     global drawn
@@ -43,12 +43,12 @@ for odd in map(float, sys.argv[2:]):
     for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)):
         K = camera.K.clone()
         K[row, column] = odd
-        draw(gaussians, replace(camera, K=K))
+        draw(gaussians, unchecked(camera, K=K))
     for row in range(3):
         c2w = camera.c2w.clone()
         c2w[row, 3] = odd
-        draw(gaussians, replace(camera, c2w=c2w))
-    draw(gaussians, replace(camera, near=odd))
+        draw(gaussians, unchecked(camera, c2w=c2w))
+    draw(gaussians, unchecked(camera, near=odd))
 print(drawn)
 """
 
@@ -101,7 +101,7 @@ def test_whatever_becomes_an_index_lies_within_the_image(odd):
 
 @pytest.mark.parametrize("size", [(0, 5), (-1, 5), (MAX_SIDE + 1, 5), (10**9, 10**9)])
 def test_an_image_that_cannot_be_numbered_is_refused(size):
-    camera = replace(camera_at(size=16), width=size[0], height=size[1])
+    camera = unchecked(camera_at(size=16), width=size[0], height=size[1])
     with pytest.raises(InputError, match="cannot be drawn"):
         CpuRenderer().render(random_gaussians(3), camera)
 

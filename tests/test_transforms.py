@@ -153,7 +153,7 @@ def test_a_wrong_transforms_json_is_refused(tmp_path, change, sentence):
 
 
 def test_a_folder_without_a_json_and_one_that_is_no_json_are_refused(tmp_path):
-    with pytest.raises(InputError, match="transforms.json"):
+    with pytest.raises(InputError, match="nerfstudio"):
         load_views(tmp_path)
     (tmp_path / "transforms.json").write_text("{")
     with pytest.raises(InputError, match="JSON"):

@@ -259,11 +259,10 @@ def locate(file: WeightsFile, network: Network, folder: Path | None, download: b
             return path
         except (OSError, RuntimeError) as error:
             failure = f" (the download failed: {error})"
-    needed = " and ".join(
-        f"{f.name} (from {f.url}) into {place_of(f, folder).parent}"
-        for f in (network.backbone, network.linear)
-    )
-    raise WeightsNotAvailable(f"LPIPS lacks {path.name}{failure}; put {needed}.")
+    files = (network.backbone, network.linear)
+    places = " and ".join(dict.fromkeys(str(place_of(f, folder).parent) for f in files))
+    needed = " and ".join(f.url for f in files)
+    raise WeightsNotAvailable(f"LPIPS lacks {path.name}{failure}; put {needed} into {places}.")
 
 
 def read_weights(path: Path, file: WeightsFile) -> Mapping[str, Tensor]:
