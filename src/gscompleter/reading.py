@@ -13,13 +13,13 @@ from typing import Any, BinaryIO
 from gscompleter.errors import InputError, quoted
 
 MAX_BYTES = 1 << 33
-"""Of any file that is read at once."""
+"""Largest file that is read at once, in bytes."""
 MAX_TEXT = 1 << 23
-"""Of a text file, in bytes."""
+"""Longest text file, in bytes."""
 MAX_LINE = 4096
-"""Of a line, in characters."""
+"""Longest line, in characters."""
 MAX_DEPTH = 64
-"""Lists and dictionaries within one another; numpy knows no more dimensions."""
+"""Deepest nesting of lists and dictionaries; numpy knows no more dimensions."""
 
 _KINDS = {
     stat.S_IFDIR: "folder",

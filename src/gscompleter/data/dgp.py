@@ -32,7 +32,7 @@ ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26
 """Bytes at the beginning of a file that tell whether it is a scene."""
 MAX_SWEEP = 1 << 28
-"""Bytes of the points of a sweep."""
+"""Largest points of a sweep, in bytes."""
 
 
 def holds_dgp(path: Path) -> bool:

@@ -23,9 +23,9 @@ from gscompleter.data.poses import pose_defect
 from gscompleter.errors import InputError
 
 FEWEST, MOST = 6, 12
-"""Photographs of a camera that are looked at; of fewer nothing is told."""
+"""Photographs of a camera that a vehicle is searched in: none is found in fewer."""
 SIDE, MIN_SIDE = 256, 16
-"""Longer side of the small copies that are looked at, and the least of the shorter, in pixels."""
+"""Longer side of the small copies of them, and the least of the shorter, in pixels."""
 MAX_TURN = 25.0
 """Degrees by which the direction of travel and the downward axis of a camera on a vehicle may be
 off their means."""
@@ -39,14 +39,14 @@ ACROSS = 0.4
 """Smallest cosine between the normal of an edge and the motion of the ground through the image at
 which the ground would have moved the edge away."""
 HORIZON = 0.1
-"""Where the ground begins below the vanishing point, as a share of the image's height."""
+"""First row of the ground, below the vanishing point, as a share of the image's height."""
 STRICT, LENIENT = 0.55, 0.4
 """Cost of a column of an outline: to decide whether there is a vehicle, and to follow its outline
 where that is faint."""
 STEEPEST = 4
 """Rows by which an outline rises or falls at most from a column to the next."""
 BEND_COST = 0.1
-"""What each of these rows costs, against an edge that stays in every photograph."""
+"""Cost of each of these rows, against an edge that stays in every photograph."""
 MIN_WIDTH = 0.25
 """Smallest share of the columns in which the outline stays although the ground would move it."""
 MIN_SUPPORT = 0.6

@@ -46,9 +46,9 @@ class Format:
 
 
 SCENE_DEPTH = 2
-"""How far below a folder scenes are looked for, for an error message that names them."""
+"""Levels of folders below the given one whose scenes an error message names."""
 MAX_NAMED = 4
-"""Scenes that it names."""
+"""Most scenes that it names."""
 
 FORMATS = {
     "chunks": Format(holds_chunks, open_chunks),
@@ -142,7 +142,7 @@ def refuse_scenes_below(path: Path) -> None:
 
 
 def _holds_own_photographs(path: Path, files: bool = True) -> bool:
-    """Whether a folder has one for photographs in it, or with `files` photographs themselves."""
+    """Tell whether a folder has one for photographs in it or, with `files`, photographs."""
     if any(os.path.isdir(path / name) for name in FOLDERS):
         return True
     return files and any(name.lower().endswith(ENDINGS) for name in os.listdir(path))

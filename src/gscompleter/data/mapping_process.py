@@ -201,7 +201,7 @@ class Attempt:
     models: list[Any]
     """The largest first; they do not connect."""
     was_held: bool = False
-    """Whether the focal length was held at first."""
+    """True if the focal length was held at first."""
 
     @property
     def quality(self) -> tuple[bool, int, int]:

@@ -38,11 +38,11 @@ POSES = "colmap"
 MIN_PHOTOGRAPHS = 3
 """With two, neither the focal length nor a wrong match can be told."""
 MIN_SHARE = 0.25
-"""Of the photographs: with fewer in the model it is a failure rather than a part of the scene."""
+"""Smallest share of the photographs in a model: one of fewer is a failure, not a part of a scene."""
 WANTED_SHARE = 0.5
-"""With fewer, other focal lengths are tried."""
+"""Share of the photographs in a model below which other focal lengths are tried."""
 MIN_POINTS = 30
-"""As many as COLMAP wants in common with a photograph before it places its camera."""
+"""Fewest points of a model: as many as COLMAP wants in common with one photograph."""
 MAX_THREADS = 4
 MAX_NAMED = 5
 """Photographs that a note names at most."""
@@ -76,7 +76,7 @@ class FoundPoses:
 
     @property
     def is_too_little(self) -> bool:
-        """Whether so few photographs or points were placed that there is nothing to go on with."""
+        """True if there are too few photographs or points in the model to go on with."""
         enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * self.photographs)
         return self.registered < enough or self.points < MIN_POINTS
 
@@ -174,8 +174,8 @@ def _listed(folder: Path) -> list[str]:
 
 
 def is_own(folder: Path) -> bool:
-    """Whether photographs are looked for in a folder: not where it is hidden, holds masks, depth
-    maps or smaller copies, or is a result of ours."""
+    """Tell whether a folder may hold photographs of the user: not one that is hidden, of masks,
+    depth maps or smaller copies, or a result of ours."""
     if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
         return False
     return not os.path.isfile(folder / SUMMARY)
@@ -188,7 +188,7 @@ def _fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def _found_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
-    """What an earlier run found for these very photographs; None where none did, or too little."""
+    """Read what an earlier run found for these photographs; None for nothing or too little."""
     if not os.path.isfile(out / SUMMARY) or not os.path.isdir(out / "sparse" / "0"):
         return None
     content = read_json(out / SUMMARY, "name another folder")

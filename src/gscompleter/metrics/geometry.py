@@ -119,7 +119,7 @@ class Alignment:
     scale: float | None
     """Median z-depth of the context at the target, in scene units."""
     abs_rel: float | None
-    """Of the generated z-depth against the context's, in the overlap."""
+    """Relative error of the generated z-depth against the context's, in the overlap."""
     chamfer: float | None
     """In scene units."""
     f_score: float | None

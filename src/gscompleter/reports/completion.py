@@ -69,7 +69,7 @@ class HeldOut:
     view: View
     """In the frame of the result."""
     is_check: bool = False
-    """Whether it told, in a small copy, what of a given splat is supported."""
+    """True if a small copy of it checked the input splat."""
 
 
 @dataclass(frozen=True)

@@ -166,7 +166,7 @@ class Drawn:
 
     @cached_property
     def excess(self) -> float:
-        """How far the error of the image lies over the limit of that budget."""
+        """Error of the image above the limit of that budget."""
         shown = self.image.detach().clamp(0, 1)
         return errors(shown, self.broken).sum().item() - self.broken.limit
 
@@ -222,8 +222,8 @@ def error_slope(
 ) -> tuple[float, Float[Tensor, "n"]]:
     """Error against the photograph, and how it grows with each opacity."""
     variable, image = drawn_with(draw, opacities)
-    slope = gradient_of(image, ErrorBudget(view, "mse", 0.0), variable)
-    return squared_error(view.compared(image.detach()), view.image).item(), slope
+    gradient = gradient_of(image, ErrorBudget(view, "mse", 0.0), variable)
+    return squared_error(view.compared(image.detach()), view.image).item(), gradient
 
 
 def drawn_with(

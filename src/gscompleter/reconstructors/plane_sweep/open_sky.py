@@ -86,7 +86,7 @@ def sky_shown(rig: Rig, sky_of_second: OtherMask) -> Mask:
 
 
 def without(found: Measured, where: Mask) -> Measured:
-    """What was measured elsewhere than `where` it does not count, as in the sky."""
+    """Leave out what was measured `where` it does not count, as in the sky."""
     full = found.at_size(where.shape)
     weight, confidence = (
         np.where(where, np.float32(0), share) for share in (full.weight, full.confidence)
