@@ -22,7 +22,6 @@ REPORT_PER_PIXEL = 3e-6
 FILM_PER_PIXEL = 1.2e-6
 """Seconds that a frame of the film takes for each pixel of one of its halves."""
 
-
 CONTEXT = "context", 2.0
 STAGES = ("generate", 1.0), ("lift", 1.0), ("register", 1.0), ("integrate", 2.0)
 """Stages of a target and how they share its time about, where nothing was measured. What sees the

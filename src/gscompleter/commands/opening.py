@@ -160,7 +160,7 @@ def refuse_splat(path: Path) -> None:
     """
     if not os.path.isdir(path) and path.name.lower().endswith(SPLATS):
         raise InputError(
-            f"{quoted(str(path), 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
+            f"{quoted(path, 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
             "be the folder of its photographs, with or without cameras."
         )
 

@@ -30,7 +30,7 @@ from gscompleter.data.real_estate import holds_camera_files, open_camera_files
 from gscompleter.data.structure_from_motion import ENDINGS, is_own
 from gscompleter.data.transforms import holds_transforms, open_transforms
 from gscompleter.data.waymo import holds_waymo, open_waymo
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, listed, quoted
 
 
 @dataclass(frozen=True)
@@ -132,12 +132,11 @@ def refuse_scenes_below(path: Path) -> None:
         found = homes if len(homes) > 1 else []
     if not found:
         return
-    names = ", ".join(quoted(str(one.relative_to(path)), 20) for one in found[:MAX_NAMED])
-    more = f" and {len(found) - MAX_NAMED} more" if len(found) > MAX_NAMED else ""
+    names = listed([one.relative_to(path) for one in found], MAX_NAMED, 20)
     scenes = "one" if len(found) == 1 else f"{len(found)} scenes"
     raise InputError(
-        f"{quoted(str(path), 50)} is no scene itself, but holds {scenes} below it: {names}{more}; "
-        f"name one of them, as in {quoted(str(found[0]), 60)}."
+        f"{quoted(path, 50)} is no scene itself, but holds {scenes} below it: {names}; "
+        f"name one of them, as in {quoted(found[0], 60)}."
     )
 
 

@@ -23,7 +23,7 @@ from gscompleter.data.frame import DOWNSCALED
 from gscompleter.data.image_folders import MASKS
 from gscompleter.data.match_pairs import in_order
 from gscompleter.data.upright import Upright, write_upright
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, listed, quoted
 from gscompleter.io.files import SUMMARY, output_folder
 from gscompleter.io.json_file import read_json
 from gscompleter.progress import track
@@ -38,7 +38,7 @@ POSES = "colmap"
 MIN_PHOTOGRAPHS = 3
 """With two, neither the focal length nor a wrong match can be told."""
 MIN_SHARE = 0.25
-"""Smallest share of the photographs in a model: one of fewer is a failure, not a part of a scene."""
+"""Smallest share of the photographs in a model: fewer are a failure, not a part of the scene."""
 WANTED_SHARE = 0.5
 """Share of the photographs in a model below which other focal lengths are tried."""
 MIN_POINTS = 30
@@ -98,12 +98,8 @@ class FoundPoses:
             )
             place = " in it"
         if self.missing:
-            names = ", ".join(quoted(name) for name in self.missing[:MAX_NAMED])
-            more = len(self.missing) - MAX_NAMED
-            notes.append(
-                f"No camera was found{place} for {names}{f' and {more} more' if more > 0 else ''}; "
-                "they are left out."
-            )
+            names = listed(self.missing, MAX_NAMED)
+            notes.append(f"No camera was found{place} for {names}; they are left out.")
         return notes
 
 
@@ -244,7 +240,7 @@ def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> 
     lens = "" if defect is None else f", {defect}"
     raise InputError(
         f"COLMAP placed {found.registered} of {found.photographs} photographs in "
-        f"{quoted(str(photographs), 40)}, with {found.points:,} points{lens}, which is too little "
+        f"{quoted(photographs, 40)}, with {found.points:,} points{lens}, which is too little "
         "at any focal length; add sharp ones that overlap by two thirds, or name their cameras."
     )
 

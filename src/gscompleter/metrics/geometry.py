@@ -40,9 +40,8 @@ def abs_rel(
     Over the pixels of `where` with known (positive) truth; None where there is none. No scale
     is fitted beforehand: a wrong scale is one of the errors that registration has to remove.
     """
-    if truth is None or not num_known(truth, where):
+    if truth is None or not (known := where & (truth > 0)).any():
         return None
-    known = where & (truth > 0)
     d, t = depth[known].double(), truth[known].double()
     return ((d - t).abs() / t).mean().item()
 
