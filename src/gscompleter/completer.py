@@ -778,10 +778,10 @@ def followed_by(
 
 
 def check_any_completed(completion: Completion) -> None:
-    """Raise InputError if every target was refused, with the reason of the first."""
+    """Raise InputError with the reason of the first target if every target was refused."""
     reasons = [result.refused for result in completion.targets]
     if reasons and all(reason is not None for reason in reasons):
-        more = "" if len(reasons) == 1 else f" So do the other {len(reasons) - 1}."
+        more = "" if len(reasons) == 1 else f" The same holds for the other {len(reasons) - 1}."
         raise InputError(f"{reasons[0]}{more}", "target")
 
 

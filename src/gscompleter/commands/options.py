@@ -279,8 +279,8 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     """Take one case of each scene: the first of each protocol (of n-10 frames 0 and 10 for 20) or
     of a cases.json. The paper counts as many cases as scenes."""
     ego_mask: bool = True
-    """Ignore what stays the same while the camera moves, such as the bonnet of the vehicle that
-    carries it, likewise and for all methods."""
+    """Ignore parts of photographs that stay the same while the camera moves, such as the bonnet of
+    the vehicle that carries it, in all methods and in the scores."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to do, in all shards together."""
 

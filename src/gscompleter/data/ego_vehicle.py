@@ -66,7 +66,7 @@ MARGIN = 1
 
 @dataclass(frozen=True, eq=False)
 class EgoVehicle:
-    """The vehicle as a camera of it sees it, which is found when it is asked for."""
+    """Finds the vehicle in the photographs of one of its cameras, once it is asked for."""
 
     frames: tuple[Frame, ...]
     """Those of the camera, in their order."""

@@ -124,14 +124,13 @@ def refuse_scenes_below(path: Path) -> None:
         InputError: where it has one with cameras, or several with a folder of photographs each; it
             names them.
     """
-    if not os.path.isdir(path) or _holds_own_photographs(path):
+    if not os.path.isdir(path) or _has_image_folder(path) or _has_images(path):
         return
     found = list(_scenes_below(path, lambda folder: recognised(folder) is not None))
     if not found:
-        homes = list(_scenes_below(path, lambda folder: _holds_own_photographs(folder, False)))
-        found = homes if len(homes) > 1 else []
-    if not found:
-        return
+        found = list(_scenes_below(path, _has_image_folder))
+        if len(found) < 2:
+            return
     names = listed([one.relative_to(path) for one in found], MAX_NAMED, 20)
     scenes = "one" if len(found) == 1 else f"{len(found)} scenes"
     raise InputError(
@@ -140,11 +139,12 @@ def refuse_scenes_below(path: Path) -> None:
     )
 
 
-def _holds_own_photographs(path: Path, files: bool = True) -> bool:
-    """Tell whether a folder has one for photographs in it or, with `files`, photographs."""
-    if any(os.path.isdir(path / name) for name in FOLDERS):
-        return True
-    return files and any(name.lower().endswith(ENDINGS) for name in os.listdir(path))
+def _has_image_folder(path: Path) -> bool:
+    return any(os.path.isdir(path / name) for name in FOLDERS)
+
+
+def _has_images(path: Path) -> bool:
+    return any(name.lower().endswith(ENDINGS) for name in os.listdir(path))
 
 
 def _scenes_below(

@@ -52,8 +52,8 @@ class Frame:
     boxes: Callable[[], tuple[Box, ...]] | None = None
     """Reads boxes around what stands or moves there at about that time, in that frame."""
     vehicle: Callable[[], Bool[np.ndarray, "h w"] | None] | None = None
-    """Finds what of the photograph, as it is stored but of any size, shows the vehicle that carries
-    the camera; None where nobody is to look."""
+    """Finds the vehicle that carries the camera, in a copy of the stored photograph of any size;
+    None where it is not to be ignored."""
 
     def stored(self) -> Path | bytes | None:
         """The image file or its bytes; None where there is none."""

@@ -233,15 +233,15 @@ def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> 
     """Refuse a reconstruction with too little in it, or with a lens that no camera has.
 
     Raises:
-        InputError: where it is such a one; `defect` describes the lens.
+        InputError: where it is like that; `defect` describes the lens.
     """
     if not found.is_too_little and defect is None:
         return
     lens = "" if defect is None else f", {defect}"
     raise InputError(
         f"COLMAP placed {found.registered} of {found.photographs} photographs in "
-        f"{quoted(photographs, 40)}, with {found.points:,} points{lens}, which is too little "
-        "at any focal length; add sharp ones that overlap by two thirds, or name their cameras."
+        f"{quoted(photographs, 40)}, with {found.points:,} points{lens}, which is no usable "
+        "model; add sharp photographs that overlap by two thirds, or name their cameras."
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -52,21 +53,19 @@ def error_budgets(
     Returns:
         The budgets, that without the holes first.
     """
-    seen = replace(photograph, ignored=holes | ~photograph.counted)
-    budgets = [ErrorBudget(seen, "mse", 0.0)]
+
+    def budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
+        error = errors(image.clamp(0, 1), ErrorBudget(view, metric, 0.0)).sum().item()
+        if metric == "mse":
+            return ErrorBudget(view, metric, error_with_loss(error, max(tolerance, ROUNDING)))
+        return ErrorBudget(view, metric, error + ssim_tolerance)
+
+    budgets = [budget(replace(photograph, ignored=holes | ~photograph.counted), "mse")]
     if holes.any():
-        budgets.append(ErrorBudget(photograph, "mse", 0.0))
+        budgets.append(budget(photograph, "mse"))
     if min(photograph.image.shape[:2]) > 2 * RADIUS:
-        budgets.append(ErrorBudget(photograph, "dssim", 0.0))
-    before = [errors(image.clamp(0, 1), budget).sum().item() for budget in budgets]
-    limits = {
-        "mse": lambda error: error_with_loss(error, max(tolerance, ROUNDING)),
-        "dssim": lambda error: error + ssim_tolerance,
-    }
-    return tuple(
-        replace(budget, limit=limits[budget.metric](error))
-        for budget, error in zip(budgets, before, strict=True)
-    )
+        budgets.append(budget(photograph, "dssim"))
+    return tuple(budgets)
 
 
 def errors(image: Float[Tensor, "h w 3"], budget: ErrorBudget) -> Float[Tensor, "h w"]:

@@ -60,8 +60,7 @@ MAX_ON_PLANE = 0.8
 """Share of the outline on one plane from which the region is that plane: a ceiling or a wall."""
 NEAR_PLANES, MAX_NEAR_ON_PLANE = 5.0, 0.9
 """The same for that part of the outline which is more planes than this from infinity, where all
-planes meet, and twice as many as its far end.
-"""
+planes meet, and twice as many as its far end."""
 PLANE_TOLERANCE = 2.0
 """Planes of the sweep by which a pixel may miss a plane that it lies on."""
 ROUNDS = 20
