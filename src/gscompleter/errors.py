@@ -80,7 +80,7 @@ def shortened(message: str, most: int) -> str:
     return quoted(" ".join(words), most)
 
 
-def listed(names: Sequence[object], most: int, length: int | None = None) -> str:
+def names_listed(names: Sequence[object], most: int, length: int | None = None) -> str:
     """Write the first `most` names for a sentence, each `quoted`, as in "a, b and 7 more"."""
     shown = ", ".join(quoted(name, length) for name in names[:most])
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown

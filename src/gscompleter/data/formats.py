@@ -30,7 +30,7 @@ from gscompleter.data.real_estate import holds_camera_files, open_camera_files
 from gscompleter.data.structure_from_motion import ENDINGS, is_own
 from gscompleter.data.transforms import holds_transforms, open_transforms
 from gscompleter.data.waymo import holds_waymo, open_waymo
-from gscompleter.errors import InputError, listed, quoted
+from gscompleter.errors import InputError, names_listed, quoted
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def refuse_scenes_below(path: Path) -> None:
         found = list(_scenes_below(path, _has_image_folder))
         if len(found) < 2:
             return
-    names = listed([one.relative_to(path) for one in found], MAX_NAMED, 20)
+    names = names_listed([one.relative_to(path) for one in found], MAX_NAMED, 20)
     scenes = "one" if len(found) == 1 else f"{len(found)} scenes"
     raise InputError(
         f"{quoted(path, 50)} is no scene itself, but holds {scenes} below it: {names}; "

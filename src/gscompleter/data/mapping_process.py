@@ -77,9 +77,9 @@ class Job:
     """In the order of their names."""
     threads: int
     wanted: int
-    """Photographs that a model must have for the focal length not to be held at other values."""
+    """Fewest photographs in a model that end the search for a focal length."""
     min_points: int
-    """Points that it must have for that."""
+    """Fewest points in it that do."""
 
     @property
     def database(self) -> Path:
@@ -205,7 +205,7 @@ class Attempt:
 
     @property
     def quality(self) -> tuple[bool, int, int]:
-        """Sorts attempts: plausible lenses, then photographs, then points of the largest model."""
+        """Sort key: plausible lenses, then photographs, then points of the largest model."""
         if not self.models:
             return False, 0, 0
         model = self.models[0]

@@ -23,7 +23,7 @@ from gscompleter.data.frame import DOWNSCALED
 from gscompleter.data.image_folders import MASKS
 from gscompleter.data.match_pairs import in_order
 from gscompleter.data.upright import Upright, write_upright
-from gscompleter.errors import InputError, listed, quoted
+from gscompleter.errors import InputError, names_listed, quoted
 from gscompleter.io.files import SUMMARY, output_folder
 from gscompleter.io.json_file import read_json
 from gscompleter.progress import track
@@ -98,7 +98,7 @@ class FoundPoses:
             )
             place = " in it"
         if self.missing:
-            names = listed(self.missing, MAX_NAMED)
+            names = names_listed(self.missing, MAX_NAMED)
             notes.append(f"No camera was found{place} for {names}; they are left out.")
         return notes
 

@@ -114,7 +114,7 @@ class Alignment:
     overlap: float
     """Share of the target's pixels that belong to both."""
     pixels: int
-    """How many pixels that is."""
+    """Number of these pixels."""
     scale: float | None
     """Median z-depth of the context at the target, in scene units."""
     abs_rel: float | None
