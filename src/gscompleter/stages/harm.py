@@ -158,16 +158,16 @@ class Drawn:
     @cached_property
     def broken(self) -> ErrorBudget:
         """The budget that is exceeded most, relative to its limit."""
-        shown = self.image.detach().clamp(0, 1)
-        totals = [errors(shown, budget).sum().item() for budget in self.check.budgets]
-        pairs = zip(totals, self.check.budgets, strict=True)
-        return max(pairs, key=lambda pair: pair[0] / max(pair[1].limit, 1e-12))[1]
+        return max(self.check.budgets, key=lambda one: self.error(one) / max(one.limit, 1e-12))
 
     @cached_property
     def excess(self) -> float:
         """Error of the image above the limit of that budget."""
-        shown = self.image.detach().clamp(0, 1)
-        return errors(shown, self.broken).sum().item() - self.broken.limit
+        return self.error(self.broken) - self.broken.limit
+
+    def error(self, budget: ErrorBudget) -> float:
+        """Compute the error of the image that `budget` limits."""
+        return errors(self.image.detach().clamp(0, 1), budget).sum().item()
 
     def to_lower(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
         """Which of `added` are to give way."""
