@@ -39,7 +39,7 @@ def test_a_view_from_where_the_target_stands_tells_no_depth():
 
 
 def test_the_paper_excludes_no_view_for_a_small_baseline():
-    """Of views that are all turned too far the least turned wins, wherever it stands."""
+    """The least turned view wins if all are turned too far, wherever it stands."""
     views, target = [view(0.001, 50), view(1.0, 60)], camera_at(0.0)
     assert select_anchor(target, views).index == 1
     assert select_anchor(target, views, CompleterConfig.paper().anchor).index == 0

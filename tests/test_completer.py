@@ -491,7 +491,7 @@ def test_nothing_is_added_before_what_an_earlier_target_sees(monkeypatch):
 
 @cache
 def antialiased_room() -> Gaussians:
-    """What the photographs show, in Gaussians for antialiased rendering."""
+    """Reconstruct the photographs in Gaussians for antialiased rendering."""
     mode = replace(gaussians_of(photographs()[0])[:0], is_antialiased=True)
     return merge([in_mode_of(mode, gaussians_of(v), v.camera) for v in photographs()])
 

@@ -35,7 +35,7 @@ Painter = Callable[[Tensor, int], Tensor]
 
 
 def bonnet(size: int = SIZE, height: float = 0.17) -> Tensor:
-    """Where a bonnet is: arched, over the bottom of the image."""
+    """Mask of a bonnet: arched, over the bottom of the image."""
     x = torch.linspace(-1, 1, size)
     top = size * (1 - height + 0.07 * x.abs() ** 2.5)
     return torch.arange(size)[:, None] + 0.5 >= top

@@ -10,7 +10,7 @@ from gscompleter.data.chunks import open_chunks
 from gscompleter.data.colmap.binary import read_images
 from gscompleter.data.point_cloud import read_point_cloud
 from gscompleter.data.upright import write_upright
-from gscompleter.errors import InputError, numbers_listed, quoted
+from gscompleter.errors import InputError, names_listed, numbers_listed, quoted
 from gscompleter.io.image import read_pixels
 from gscompleter.weights.reading import check_kind
 
@@ -72,7 +72,9 @@ def test_what_matters_of_a_long_error_is_kept():
     assert str(error).endswith("/a.png is not an image; copy it again.")
 
 
-def test_numbers_are_summarized():
+def test_names_and_numbers_are_summarized():
+    assert names_listed(["a", "bb\nb", "c"], 2) == "a, bb b and 1 more"
+    assert names_listed([], 2) == ""
     assert numbers_listed([]) == ""
     assert numbers_listed([3]) == "3"
     assert numbers_listed([2, 1, 0, 2]) == "0-2"

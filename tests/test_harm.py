@@ -111,7 +111,7 @@ def test_where_halving_does_not_help_only_the_worst_pixels_are_given_up(monkeypa
 
 
 def test_the_whole_photograph_is_judged_with_the_holes_of_the_context():
-    """What is added in a hole may not make it worse than the hole itself."""
+    """A hole may not become worse by what is added in it."""
     view, context, added = half_a_room()
     dark = replace(view, image=0.02 * view.image)
     frozen = load_renderer("cpu").freeze(context, CAMERA)

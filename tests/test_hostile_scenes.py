@@ -24,7 +24,7 @@ from pose_files import WRITERS, write_photographs
 
 
 def sentence(path: Path) -> str:
-    """What the user is told when all of a scene is read."""
+    """Read all of a scene; return the error message."""
     with pytest.raises(InputError) as error:
         read(path)
     assert len(str(error.value)) < LONGEST_MESSAGE

@@ -151,7 +151,7 @@ def test_a_failed_reconstruction_is_refused(
     assert run(monkeypatch, command, given, "--out", out, "--quiet") == 2
     said = capsys.readouterr().err
     assert told in said
-    assert "add sharp ones" in said
+    assert "add sharp photographs" in said
     assert len(said) < 300
     assert not out.exists()
 

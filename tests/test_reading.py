@@ -12,7 +12,7 @@ from splat_files import made, plausible
 
 @pytest.fixture
 def others(tmp_path):
-    """What is no regular file, by its kind."""
+    """Create something that is no regular file, by its kind."""
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "device").symlink_to("/dev/zero")

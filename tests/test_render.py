@@ -142,7 +142,7 @@ def test_one_gaussian_on_a_pixel_centre_by_hand(renderer):
 @pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
 @pytest.mark.parametrize("scales", [(0.05, 0.05, 0.05), (0.05, 0.01, 0.3)], ids=["round", "thin"])
 def test_one_antialiased_gaussian_by_hand(renderer, scales):
-    """What the low-pass spreads it over more pixels, it lacks in opacity: the sum over the image is
+    """The low-pass widens a splat and lowers its opacity as much: the sum over the image is
     that of a Gaussian without it."""
     camera = camera_at(size=33, focal=1.0)
     gaussian = replace(one((0.0, 0.0, 2.0)), scales=torch.tensor([scales]), is_antialiased=True)
@@ -158,7 +158,7 @@ def test_one_antialiased_gaussian_by_hand(renderer, scales):
 
 @pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
 def test_what_is_too_thin_to_be_seen_antialiased_has_no_gradient(renderer):
-    """Of no extent, and so small that squares of its size underflow."""
+    """A Gaussian of no extent, and one so small that squares of its size underflow."""
     for scale in (0.0, 1e-25):
         thin = replace(one((0.0, 0.0, 2.0), scale=scale), is_antialiased=True)
         thin = replace(thin, scales=thin.scales.requires_grad_())

@@ -78,7 +78,7 @@ DEFAULT = Room().boxes[0]
 BOX = ((-0.8, -0.1, 1.0), (0.7, 1.5, 1.6))
 CUPBOARDS = (((-3.0, -1.5, 2.0), (-1.2, 1.5, 2.6)), ((1.0, -0.9, 3.0), (3.0, 1.5, 3.4)))
 FORWARD, ASIDE = ((0.0, 0.2), (0.0, 0.0)), ((-0.1, 0.0), (0.1, 0.0))
-"""Where two photographs are taken, in x and z."""
+"""Positions of two photographs, in x and z."""
 WHITE_ROOMS = {
     "ceiling": ((DEFAULT, *Room().boxes[1:]), False, FORWARD),
     "hall behind a box": ((HALL, BOX), False, FORWARD),

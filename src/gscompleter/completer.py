@@ -289,8 +289,7 @@ class GSCompleter:
         with clock("context"):
             wide = None if reference is None else reference.camera
             sight = self.sight(completion, target, wide)
-        result = nothing_added(sight, sight.window.crop(self.holes(sight)))
-        result = self.refused(result)
+        result = self.begun_at(sight)
         reason = nothing_to_do(result, completion.views)
         if reason is not None:
             return followed_by(completion, replace(result, notes=(reason,)), clock.seconds)
@@ -363,8 +362,9 @@ class GSCompleter:
         (image,) = self.synthesize([sight], at_views)
         return View(sight.window.crop(image.image), sight.window.target)
 
-    def refused(self, result: TargetCompletion) -> TargetCompletion:
-        """Refuse a target that sees too little of the scene to continue it."""
+    def begun_at(self, sight: Sight) -> TargetCompletion:
+        """Begin the result of a target; refuse one that sees too little of the scene."""
+        result = nothing_added(sight, sight.window.crop(self.holes(sight)))
         covered = surfaces_in(result.before, result.target).valid.float().mean().item()
         least = self.config.holes.min_covered
         if covered >= least:
@@ -383,10 +383,7 @@ class GSCompleter:
         clock = Clock()
         with clock("context"):
             sights = [self.sight(completion, target) for target in targets]
-            results = [
-                nothing_added(sight, sight.window.crop(self.holes(sight))) for sight in sights
-            ]
-            results = [self.refused(result) for result in results]
+            results = [self.begun_at(sight) for sight in sights]
             asked = [nothing_to_do(result, completion.views) is None for result in results]
             at_views = contexts_of(self.at(completion, completion.views))
         with clock("generate"):
@@ -781,10 +778,10 @@ def followed_by(
 
 
 def check_any_completed(completion: Completion) -> None:
-    """Raise InputError if every target was refused, with the reason of the first."""
+    """Raise InputError with the reason of the first target if every target was refused."""
     reasons = [result.refused for result in completion.targets]
     if reasons and all(reason is not None for reason in reasons):
-        more = "" if len(reasons) == 1 else f" So do the other {len(reasons) - 1}."
+        more = "" if len(reasons) == 1 else f" The same holds for the other {len(reasons) - 1}."
         raise InputError(f"{reasons[0]}{more}", "target")
 
 

@@ -1,7 +1,7 @@
 """What the user is told when the input is wrong."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -80,18 +80,19 @@ def shortened(message: str, most: int) -> str:
     return quoted(" ".join(words), most)
 
 
-def numbers_listed(numbers: Iterable[int], most: int = 3) -> str:
-    """Write whole numbers for a sentence, as in "0-39, 52 and 12 others".
+def names_listed(names: Sequence[object], most: int, length: int | None = None) -> str:
+    """Write the first `most` names for a sentence, each `quoted`, as in "a, b and 7 more"."""
+    shown = ", ".join(quoted(name, length) for name in names[:most])
+    return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
-    Args:
-        numbers: In any order.
-        most: Runs of consecutive numbers that are written out.
-    """
+
+def numbers_listed(numbers: Iterable[int]) -> str:
+    """Write whole numbers for a sentence, the first three runs, as in "0-39, 52 and 12 others"."""
     found = sorted(set(numbers))
     starts = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(found)) if b != a + 1), len(found)]
     runs = [found[start:stop] for start, stop in pairwise(starts)]
-    shown = ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs[:most] if r)
-    others = sum(map(len, runs[most:]))
+    shown = ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs[:3] if r)
+    others = sum(map(len, runs[3:]))
     return f"{shown} and {others} others" if others else shown
 
 

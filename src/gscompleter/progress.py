@@ -76,7 +76,7 @@ class Work:
     expected: Sequence[tuple[str, float]] = ()
     """Stages in their order, and the seconds that each is expected to take."""
     is_timed: bool = True
-    """Whether these are seconds, or tell only how the stages share the time."""
+    """True if these are seconds; else only their ratios count."""
     position: int = 0
     """How many of these are behind."""
     planned: Activity | None = None
@@ -384,7 +384,7 @@ def expecting(seconds: Sequence[tuple[str, float]], is_timed: bool = True) -> It
             and about how many seconds each takes; one that is left out takes none. Once some are
             over, the others are taken to be as much faster or slower. Empty where nothing tells.
         is_timed: Whether these are seconds. Else only their ratios count, for the share that is
-            done, and how long it takes is told by counted steps alone.
+            done, and counted steps alone show how long it takes.
     """
     shown = _shown.get()
     if shown is not None:

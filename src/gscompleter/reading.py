@@ -13,13 +13,13 @@ from typing import Any, BinaryIO
 from gscompleter.errors import InputError, quoted
 
 MAX_BYTES = 1 << 33
-"""Of any file that is read at once."""
+"""Largest file that is read at once, in bytes."""
 MAX_TEXT = 1 << 23
-"""Of a text file, in bytes."""
+"""Longest text file, in bytes."""
 MAX_LINE = 4096
-"""Of a line, in characters."""
+"""Longest line, in characters."""
 MAX_DEPTH = 64
-"""Lists and dictionaries within one another; numpy knows no more dimensions."""
+"""Deepest nesting of lists and dictionaries; numpy knows no more dimensions."""
 
 _KINDS = {
     stat.S_IFDIR: "folder",
@@ -28,6 +28,7 @@ _KINDS = {
     stat.S_IFCHR: "device",
     stat.S_IFBLK: "device",
 }
+_HOLDERS = (list, tuple, dict, set, frozenset)
 
 
 def check_file(path: Path) -> None:
@@ -125,15 +126,13 @@ def check_plain(value: Any, path: Path, most: int) -> None:
     waiting, count = [(value, 0)], 0
     while waiting:
         held, depth = waiting.pop()
+        if not isinstance(held, _HOLDERS):
+            continue
         parts = held.values() if isinstance(held, dict) else held
-        count += len(parts) if isinstance(held, _HOLDERS) else 0
+        count += len(parts)
         if depth > MAX_DEPTH or count > most:
             raise InputError(f"{quoted(path)} is nested too deeply or without end; write it again.")
-        if isinstance(held, _HOLDERS):
-            waiting += [(part, depth + 1) for part in parts if isinstance(part, _HOLDERS)]
-
-
-_HOLDERS = (list, tuple, dict, set, frozenset)
+        waiting += [(part, depth + 1) for part in parts if isinstance(part, _HOLDERS)]
 
 
 def _check_size(path: Path, file: BinaryIO, most: int) -> None:

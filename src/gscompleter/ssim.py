@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 RADIUS, SIGMA = 5, 1.5
-"""Of the Gaussian window, in pixels."""
+"""Radius and standard deviation of the Gaussian window, in pixels."""
 
 
 def ssim_map(

@@ -390,9 +390,9 @@ class SceneContext:
     max_alpha: float = COVERED
     """A pixel of the target that the scene covers by less is a hole."""
     correct_color: bool = True
-    """Whether a Φ with weights brings its colours to those of the photographs."""
+    """True if a Φ with weights adapts its colours to those of the photographs."""
     source_depth: Literal["context", "monocular"] = "context"
-    """Where PE-Field takes the depth of the photograph from, unless its own settings name it."""
+    """Source of the photograph's depth for PE-Field, unless its own settings name one."""
     believed: Float[Tensor, "h w"] | None = None
     """The alpha of the scene at the target as far as photographs support it; None where it is not
     doubted."""
@@ -514,7 +514,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """How far the render of a photograph may be off, by one measure, whatever is added."""
+    """Largest error that the render of a photograph may have, whatever is added."""
 
     view: View
     """The photograph; what it ignores does not count."""
@@ -540,8 +540,8 @@ class Completion:
     """The photographs, with the depth range that the completion works in, in the exposure of the
     context where Ψ evened theirs out."""
     budgets: tuple[tuple[ErrorBudget, ...], ...]
-    """What each of `views`, then of `witnesses`, asks of whatever is added. The first leaves out
-    where the scene had a hole at first, so that nothing makes up for what was good."""
+    """Error budgets of each of `views`, then of `witnesses`. The first of each leaves out the holes
+    of the context, so that closing them makes up for nothing."""
     targets: tuple[TargetCompletion, ...]
     """What happened so far, in the order of the targets."""
     seconds: Mapping[str, float]

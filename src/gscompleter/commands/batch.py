@@ -56,10 +56,10 @@ class Counts:
     skipped: int
     """Had a row before."""
     skipped_failed: int = 0
-    """Of those, how many say that they came to nothing."""
+    """Those of them whose row records a failure."""
 
     def sentence(self) -> str:
-        """Say all of it, and how to do again what failed before."""
+        """Summarize the counts, and name the option that retries what failed before."""
         before = f"there before {self.skipped}"
         if self.skipped_failed:
             before += f", {self.skipped_failed} of them failed (--again failures does these again)"
@@ -100,8 +100,8 @@ def run_batch(options: BatchOptions) -> None:
         with preparing("table"):
             show(place, jobs)
     counts = Counts(len(left) - failed, failed, len(share) - len(left), failed_before)
-    told = f"{counts.sentence()} All results: {options.out}/index.html"
-    console.print(told, markup=False, soft_wrap=True)
+    sentence = f"{counts.sentence()} All results: {options.out}/index.html"
+    console.print(sentence, markup=False, soft_wrap=True)
 
 
 def count_failed(place: Place, jobs: Iterable[Job]) -> int:

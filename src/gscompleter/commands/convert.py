@@ -27,8 +27,8 @@ class ConvertOptions(Settings):
     drop_nonfinite: bool = False
     """Leave out Gaussians that hold NaN or infinity."""
     plain: bool = False
-    """Keep what was generated but not the labels: a .ply without the property `generated`, which
-    some programs misread, and no labels beside other files."""
+    """Write all Gaussians without labels of which were generated: a .ply without the property
+    `generated`, which some programs misread, and no file of labels beside other formats."""
     overwrite: bool = False
     """Replace the file where there is one."""
     quiet: bool = False

@@ -22,11 +22,10 @@ REPORT_PER_PIXEL = 3e-6
 FILM_PER_PIXEL = 1.2e-6
 """Seconds that a frame of the film takes for each pixel of one of its halves."""
 
-
 CONTEXT = "context", 2.0
 STAGES = ("generate", 1.0), ("lift", 1.0), ("register", 1.0), ("integrate", 2.0)
-"""Stages of a target and how they share its time about, where nothing was measured. What sees the
-context comes first, once for all of them and for each; report and film take as long."""
+"""Stages of a target with their relative times, where none were measured. Rendering the context
+comes first, once before all targets and once for each; report and film take as long as that."""
 
 
 def expecting_completion(

@@ -44,7 +44,7 @@ CLASSIC = (
     "The page renders antialiased Gaussians as classic ones, small ones too opaque; what is saved "
     "is right, and `view` shows it as it is."
 )
-"""Of the page, which viser renders."""
+"""Note on the page, which viser renders, for an antialiased scene."""
 
 
 @dataclass(frozen=True)

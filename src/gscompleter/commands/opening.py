@@ -77,7 +77,7 @@ class Opened:
     """How many photographs there are, those included whose camera was not found."""
 
     def with_ego_vehicle(self) -> Opened:
-        """The same, where the vehicle that carries the camera is taken for a part of the scene."""
+        """Return the same, the vehicle that carries the camera being a part of the scene."""
         return replace(self, photographs=self.photographs.with_ego_vehicle())
 
 
@@ -160,7 +160,7 @@ def refuse_splat(path: Path) -> None:
     """
     if not os.path.isdir(path) and path.name.lower().endswith(SPLATS):
         raise InputError(
-            f"{quoted(str(path), 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
+            f"{quoted(path, 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
             "be the folder of its photographs, with or without cameras."
         )
 

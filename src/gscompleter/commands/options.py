@@ -251,7 +251,7 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     out: Path
     """Folder for the results, a new one or that of an earlier run to go on with."""
     protocol: tuple[str, ...] = ()
-    """Which frames are given and which are the target: n-10 (frames n and n + 10 for n + 20, then
+    """Choice of the given frames and the target: n-10 (frames n and n + 10 for n + 20, then
     n + 20 and n + 10 for n, for n = 0, 21, 42, …, which is how we read the n-k of the paper; see
     --one-per-scene), stress (0 and 30 for 99), or the path of an evaluation index; one or several.
     A cases.json needs none. sequence-4 (or sequence-4-steps-6) completes each clip view after view:
@@ -279,8 +279,8 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     """Take one case of each scene: the first of each protocol (of n-10 frames 0 and 10 for 20) or
     of a cases.json. The paper counts as many cases as scenes."""
     ego_mask: bool = True
-    """Ignore what stays the same while the camera moves, such as the bonnet of the vehicle that
-    carries it, likewise and for all methods."""
+    """Ignore parts of photographs that stay the same while the camera moves, such as the bonnet of
+    the vehicle that carries it, in all methods and in the scores."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to do, in all shards together."""
 

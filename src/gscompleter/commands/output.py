@@ -20,7 +20,7 @@ from gscompleter.reports.completion import HeldOut
 from gscompleter.types import Camera, View
 
 MAX_HELD_OUT = 8
-"""Photographs that were not used whose scores are told: each is drawn twice, like a target."""
+"""Most unused photographs that are scored: each is drawn twice, like a target."""
 
 
 def opened_as(options: SceneOptions, opened: Opened, task: Task) -> dict[str, Any]:

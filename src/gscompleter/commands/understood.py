@@ -9,7 +9,7 @@ from gscompleter.commands.opening import Opened, Task, scene_needs
 from gscompleter.commands.options import CompleteOptions, SceneOptions, most
 from gscompleter.data.formats import FORMATS
 from gscompleter.data.frame import Frame
-from gscompleter.errors import quoted
+from gscompleter.errors import names_listed, quoted
 from gscompleter.io.ply import note_infinite_opacities
 from gscompleter.memory import gigabytes, memory_bytes, needed_bytes
 from gscompleter.types import Camera, Gaussians
@@ -165,6 +165,5 @@ def time_line(options: CompleteOptions, task: Task, device: str) -> str:
 
 def frames_line(frames: Sequence[int | None]) -> str:
     """Numbers of frames, the first of many."""
-    named = ", ".join(map(str, frames[:MAX_NAMED]))
-    more = f" and {len(frames) - MAX_NAMED} more" if len(frames) > MAX_NAMED else ""
-    return f"{'frame' if len(frames) == 1 else 'frames'} {named}{more}"
+    names = names_listed([str(frame) for frame in frames], MAX_NAMED)
+    return f"{'frame' if len(frames) == 1 else 'frames'} {names}"

@@ -40,7 +40,7 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
     """
     check_once(words)
     check_command(words, names)
-    said, config = StringIO(), CompleterConfig()
+    printed, config = StringIO(), CompleterConfig()
     read = partial(
         tyro.cli,
         command,
@@ -49,15 +49,15 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     try:
-        with redirect_stderr(said):
+        with redirect_stderr(printed):
             config, words = config_named(auto_counted(words))
             return read(args=words, registry=registry_from(config))
     except SystemExit as stop:
         if not stop.code:
             raise
         options = options_in(lambda words: read(args=words, registry=registry_from(config)), words)
-        told = misspelt(words, options, names) or unboxed(said.getvalue(), words, names)
-        raise InputError(told) from None
+        sentence = misspelt(words, options, names) or unboxed(printed.getvalue(), words, names)
+        raise InputError(sentence) from None
 
 
 def check_command(words: Sequence[str], names: Collection[str]) -> None:
@@ -89,13 +89,11 @@ def misspelt(words: Sequence[str], options: Sequence[str], names: Collection[str
     """Name the option that is nearest to one that does not exist; None where there is none."""
     given = [word.split("=")[0] for word in words if word.startswith("--")]
     for word in given:
-        near = get_close_matches(word.replace("_", "-"), options, 1, NEAR)
-        if near and near[0] != word.replace("_", "-"):
-            command = command_in(words, names)
-            return (
-                f"There is no option {quoted(word)}; the nearest is {near[0]} (see {command} "
-                "--help)."
-            )
+        option = word.replace("_", "-")
+        near = get_close_matches(option, options, 1, NEAR)
+        if near and near[0] != option:
+            see = f"(see {command_in(words, names)} --help)"
+            return f"There is no option {quoted(word)}; the nearest is {near[0]} {see}."
     return None
 
 

@@ -19,10 +19,10 @@ Memory = Annotated[float, Interval(ge=0, lt=1)]
 
 @dataclass(frozen=True)
 class SynthesisConfig(Settings):
-    """How a Φ with weights is used. A Φ without any has no use for it."""
+    """Settings of a Φ with weights; others ignore them."""
 
     correct_color: bool = True
-    """Bring the colours of the synthesized image to those of the photographs. The paper takes the
+    """Adapt the colours of the synthesized image to those of the photographs. The paper takes the
     image as it is."""
     source_depth: Literal["context", "monocular"] = "context"
     """Depth of the photograph for PE-Field, where its own settings name none: that of the scene,
@@ -36,8 +36,8 @@ class AnchorConfig(Settings):
     selection: Literal["widest", "nearest"] = "widest"
     """`widest` baseline is the paper's rule; `nearest` view is its ablation without it."""
     min_baseline: Share = 0.01
-    """Smallest baseline to the target, as a share of the widest, of which a pair tells a depth. The
-    paper excludes no view."""
+    """Smallest baseline of an anchor to the target, as a share of the widest. The paper excludes no
+    view."""
     min_overlap: Share = 0.25
     """Smallest share of what the target observes of the scene that an anchor must see too, where
     any view does. The paper asks for none."""
@@ -117,8 +117,8 @@ class HoleConfig(Settings):
     Φ, what is lifted there joins the scene, and its depth continues that of its surroundings. Where
     the scene's depth is compared, a pixel stays covered from one half on."""
     min_covered: Share = 0.02
-    """Smallest share of the target's image that surfaces of the scene must cover for it to be
-    completed. A target that sees less of the scene has nothing to continue, and is refused."""
+    """Smallest share of the target's image that surfaces of the scene must cover. A target that
+    sees less of them is refused, for there is nothing to continue."""
     dilation: Pixels = 3
     """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
     neighbourhood: Pixels | None = 16
@@ -251,7 +251,7 @@ class CompleterConfig(Settings):
     where a hole reaches its border, so that a camera that moves on from the target does not meet
     the next hole there. The paper completes what the target itself sees."""
     ego_mask: bool = True
-    """Ignore what of the photographs stays the same while the camera moves, such as the bonnet of
+    """Ignore parts of photographs that stay the same while the camera moves, such as the bonnet of
     the vehicle that carries it. The paper takes photographs as they are."""
     synthesis: SynthesisConfig = SynthesisConfig()
     """How the target image is synthesized."""

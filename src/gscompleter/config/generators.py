@@ -50,8 +50,8 @@ class PEFieldSettings(DiffusionSettings):
     """Evaluations of the transformer. The paper takes 4, its authors' demonstration 28."""
     depth: Text | None = None
     """Where it takes the depth of the photograph from: context, the scene itself; monocular, a
-    published network; or the folder or hub id of another one. Without it, context, and monocular
-    with the settings `paper`."""
+    published network; or the folder or hub id of another one. Left out, it is context, or
+    monocular with the settings `paper`."""
     at_once: Annotated[int, Interval(ge=1, le=1000)] = 4
     """How many targets it denoises together, at most. Fewer need less memory."""
 

@@ -41,7 +41,7 @@ class Case:
     ignore_masked: bool = False
     """Whether what is masked in the photographs is ignored."""
     ego_mask: bool = True
-    """Whether the vehicle that carries the camera is ignored."""
+    """True if the vehicle that carries the camera is ignored."""
 
     @property
     def name(self) -> str:

@@ -32,7 +32,7 @@ ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26
 """Bytes at the beginning of a file that tell whether it is a scene."""
 MAX_SWEEP = 1 << 28
-"""Bytes of the points of a sweep."""
+"""Largest points of a sweep, in bytes."""
 
 
 def holds_dgp(path: Path) -> bool:
@@ -105,10 +105,10 @@ def _sweeps(content: Any) -> dict[str, Any]:
 
 
 def _points(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
-    """The points of a sweep in the world frame: the first three columns of its array `data`."""
+    """The points of a sweep in the world frame, without those that are not finite."""
     try:
         with open_file(path) as file, zipfile.ZipFile(file) as archive:
-            points = _array(archive, "data.npy")
+            points = _array(archive)
         finite = points[np.isfinite(points).all(axis=1)]
     except InputError:
         raise
@@ -117,15 +117,15 @@ def _points(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.
     return finite @ world_from_laser[:3, :3].T + world_from_laser[:3, 3]
 
 
-def _array(archive: zipfile.ZipFile, name: str) -> Float[np.ndarray, "n 3"]:
-    """Read the first three columns of an array that is no larger than it may be.
+def _array(archive: zipfile.ZipFile) -> Float[np.ndarray, "n 3"]:
+    """Read the first three columns of the array `data`.
 
     Raises:
-        ValueError: if it is, or is no table of numbers.
+        ValueError: if it is larger than `MAX_SWEEP`, or no table of numbers.
     """
-    if archive.getinfo(name).file_size > MAX_SWEEP:
+    if archive.getinfo("data.npy").file_size > MAX_SWEEP:
         raise ValueError
-    with archive.open(name) as file:
+    with archive.open("data.npy") as file:
         table = np.lib.format.read_array(file, allow_pickle=False)
     if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "fiu":
         raise ValueError

@@ -16,6 +16,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.lib.stride_tricks import sliding_window_view
 
 from gscompleter.data.frame import Frame
 from gscompleter.data.lens import Pinhole
@@ -23,9 +24,9 @@ from gscompleter.data.poses import pose_defect
 from gscompleter.errors import InputError
 
 FEWEST, MOST = 6, 12
-"""Photographs of a camera that are looked at; of fewer nothing is told."""
+"""Photographs of a camera that a vehicle is searched in: none is found in fewer."""
 SIDE, MIN_SIDE = 256, 16
-"""Longer side of the small copies that are looked at, and the least of the shorter, in pixels."""
+"""Longer side of the small copies of them, and the least of the shorter, in pixels."""
 MAX_TURN = 25.0
 """Degrees by which the direction of travel and the downward axis of a camera on a vehicle may be
 off their means."""
@@ -39,14 +40,14 @@ ACROSS = 0.4
 """Smallest cosine between the normal of an edge and the motion of the ground through the image at
 which the ground would have moved the edge away."""
 HORIZON = 0.1
-"""Where the ground begins below the vanishing point, as a share of the image's height."""
+"""First row of the ground, below the vanishing point, as a share of the image's height."""
 STRICT, LENIENT = 0.55, 0.4
 """Cost of a column of an outline: to decide whether there is a vehicle, and to follow its outline
 where that is faint."""
 STEEPEST = 4
 """Rows by which an outline rises or falls at most from a column to the next."""
 BEND_COST = 0.1
-"""What each of these rows costs, against an edge that stays in every photograph."""
+"""Cost of each of these rows, against an edge that stays in every photograph."""
 MIN_WIDTH = 0.25
 """Smallest share of the columns in which the outline stays although the ground would move it."""
 MIN_SUPPORT = 0.6
@@ -65,7 +66,7 @@ MARGIN = 1
 
 @dataclass(frozen=True, eq=False)
 class EgoVehicle:
-    """The vehicle as a camera of it sees it, which is found when it is asked for."""
+    """Finds the vehicle in the photographs of one of its cameras, once it is asked for."""
 
     frames: tuple[Frame, ...]
     """Those of the camera, in their order."""
@@ -193,11 +194,6 @@ class Edges:
     across: Float[np.ndarray, "h w"]
     """Cosine between the normal of what stays and the motion of the ground."""
 
-    @property
-    def is_across(self) -> Bool[np.ndarray, "h w"]:
-        """Where the ground would have moved an edge away."""
-        return self.across >= ACROSS
-
 
 def find_static_region(
     images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 2"], first: int
@@ -265,29 +261,19 @@ def trace_outline(
     reward = edges.staying * (0.5 + 0.5 * edges.across) - cost
     reward = np.where((rows >= first) & (rows < limit), reward, -1.0)
     reward = np.concatenate([reward, np.zeros((1, width))])  # the lower edge: no vehicle there
-    total, came = reward[:, 0].copy(), np.zeros((height + 1, width), np.int64)
+    bends = np.array([0, *range(-STEEPEST, 0), *range(1, STEEPEST + 1)])  # of equals the first one
+    total, came = reward[:, 0], np.zeros((height + 1, width), np.int64)
     for column in range(1, width):
-        best, step = total.copy(), np.zeros(height + 1, np.int64)
-        for bend in (b for b in range(-STEEPEST, STEEPEST + 1) if b):
-            moved = shifted(total, bend) - BEND_COST * abs(bend)
-            step[moved > best], best = bend, np.maximum(best, moved)
-        came[:, column] = np.arange(height + 1) + step
-        total = best + reward[:, column]
+        padded = np.pad(total, STEEPEST, constant_values=-np.inf)
+        reached = sliding_window_view(padded, height + 1)[STEEPEST + bends]
+        reached = reached - BEND_COST * np.abs(bends)[:, None]
+        came[:, column] = np.arange(height + 1) + bends[reached.argmax(axis=0)]
+        total = reached.max(axis=0) + reward[:, column]
     outline = np.empty(width, np.int64)
     outline[-1] = total.argmax()
     for column in range(width - 1, 0, -1):
         outline[column - 1] = came[outline[column], column]
     return outline
-
-
-def shifted(values: Float[np.ndarray, "n"], by: int) -> Float[np.ndarray, "n"]:
-    """Shift values so that each place has what lay `by` places behind it; -inf where nothing."""
-    found = np.full_like(values, -np.inf)
-    if by > 0:
-        found[:-by] = values[by:]
-    else:
-        found[-by:] = values[:by]
-    return found
 
 
 def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
@@ -299,8 +285,9 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
     columns = np.nonzero(outline < height)[0]
     rows = outline[columns]
     kept = edges.staying >= PERSISTENT
-    staying, telling = (near_rows(mask)[rows, columns] for mask in (kept, kept & edges.is_across))
-    if staying.mean() < MIN_SUPPORT or telling.sum() < MIN_WIDTH * width:
+    across = kept & (edges.across >= ACROSS)
+    staying, staying_across = (near_rows(mask)[rows, columns] for mask in (kept, across))
+    if staying.mean() < MIN_SUPPORT or staying_across.sum() < MIN_WIDTH * width:
         return False
     elsewhere = ~below(outline - CLEAR, height)
     occurring = np.where(elsewhere, edges.occurring, 0)

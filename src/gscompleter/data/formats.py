@@ -30,7 +30,7 @@ from gscompleter.data.real_estate import holds_camera_files, open_camera_files
 from gscompleter.data.structure_from_motion import ENDINGS, is_own
 from gscompleter.data.transforms import holds_transforms, open_transforms
 from gscompleter.data.waymo import holds_waymo, open_waymo
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, names_listed, quoted
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Format:
 
 
 SCENE_DEPTH = 2
-"""How far below a folder scenes are looked for, for an error message that names them."""
+"""Levels of folders below the given one whose scenes an error message names."""
 MAX_NAMED = 4
-"""Scenes that it names."""
+"""Most scenes that it names."""
 
 FORMATS = {
     "chunks": Format(holds_chunks, open_chunks),
@@ -124,28 +124,27 @@ def refuse_scenes_below(path: Path) -> None:
         InputError: where it has one with cameras, or several with a folder of photographs each; it
             names them.
     """
-    if not os.path.isdir(path) or _holds_own_photographs(path):
+    if not os.path.isdir(path) or _has_image_folder(path) or _has_images(path):
         return
     found = list(_scenes_below(path, lambda folder: recognised(folder) is not None))
     if not found:
-        homes = list(_scenes_below(path, lambda folder: _holds_own_photographs(folder, False)))
-        found = homes if len(homes) > 1 else []
-    if not found:
-        return
-    names = ", ".join(quoted(str(one.relative_to(path)), 20) for one in found[:MAX_NAMED])
-    more = f" and {len(found) - MAX_NAMED} more" if len(found) > MAX_NAMED else ""
+        found = list(_scenes_below(path, _has_image_folder))
+        if len(found) < 2:
+            return
+    names = names_listed([one.relative_to(path) for one in found], MAX_NAMED, 20)
     scenes = "one" if len(found) == 1 else f"{len(found)} scenes"
     raise InputError(
-        f"{quoted(str(path), 50)} is no scene itself, but holds {scenes} below it: {names}{more}; "
-        f"name one of them, as in {quoted(str(found[0]), 60)}."
+        f"{quoted(path, 50)} is no scene itself, but holds {scenes} below it: {names}; "
+        f"name one of them, as in {quoted(found[0], 60)}."
     )
 
 
-def _holds_own_photographs(path: Path, files: bool = True) -> bool:
-    """Whether a folder has one for photographs in it, or with `files` photographs themselves."""
-    if any(os.path.isdir(path / name) for name in FOLDERS):
-        return True
-    return files and any(name.lower().endswith(ENDINGS) for name in os.listdir(path))
+def _has_image_folder(path: Path) -> bool:
+    return any(os.path.isdir(path / name) for name in FOLDERS)
+
+
+def _has_images(path: Path) -> bool:
+    return any(name.lower().endswith(ENDINGS) for name in os.listdir(path))
 
 
 def _scenes_below(

@@ -52,8 +52,8 @@ class Frame:
     boxes: Callable[[], tuple[Box, ...]] | None = None
     """Reads boxes around what stands or moves there at about that time, in that frame."""
     vehicle: Callable[[], Bool[np.ndarray, "h w"] | None] | None = None
-    """Finds what of the photograph, as it is stored but of any size, shows the vehicle that carries
-    the camera; None where nobody is to look."""
+    """Finds the vehicle that carries the camera, in a copy of the stored photograph of any size;
+    None where it is not to be ignored."""
 
     def stored(self) -> Path | bytes | None:
         """The image file or its bytes; None where there is none."""
@@ -87,25 +87,31 @@ class Frame:
             )
         return size
 
-    def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The photograph as it is stored."""
+    def needed(self) -> Path | bytes:
+        """Return the image file or its bytes.
+
+        Raises:
+            InputError: where there is none.
+        """
         stored = self.stored()
         if stored is None:
             place = "restore it" if self.image is None else f"put it at {quoted(self.image)}"
             raise InputError(
                 f"The image of {self.title} is missing; {place}, or choose another frame."
             )
+        return stored
+
+    def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The photograph as it is stored."""
+        stored = self.needed()
         if isinstance(stored, bytes):
             return decode_pixels(stored, capital(self.title))
         return read_pixels(stored)
 
     def small_pixels(self, side: int) -> Float[np.ndarray, "h w"]:
-        """The brightness of the photograph from 0 to 255, its longer side of at most `side`
-        pixels."""
-        stored = self.stored()
-        if stored is None:
-            return self.pixels()  # which says what is missing
-        return read_brightness(stored, side, capital(self.title))
+        """Read the brightness of the photograph, from 0 to 255, shrunk to at most `side` pixels on
+        its longer side."""
+        return read_brightness(self.needed(), side, capital(self.title))
 
     def defect(self, width: int, height: int) -> str | None:
         """What makes the camera of a photograph of that size impossible; None if nothing does."""

@@ -77,9 +77,9 @@ class Job:
     """In the order of their names."""
     threads: int
     wanted: int
-    """Photographs that a model must have for the focal length not to be held at other values."""
+    """Fewest photographs in a model that end the search for a focal length."""
     min_points: int
-    """Points that it must have for that."""
+    """Fewest points in it that do."""
 
     @property
     def database(self) -> Path:
@@ -109,10 +109,10 @@ def main() -> None:
     """Do the job in the file that the command line names."""
     teller = Teller(os.fdopen(os.dup(1), "w"))
     os.dup2(2, 1)  # nothing that COLMAP prints is taken for ours
-    told = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    photographs = [Upright(**one) for one in told["photographs"]]
-    images, work, model = (Path(told[name]) for name in ("images", "work", "model"))
-    job = Job(images, work, model, photographs, told["threads"], told["wanted"], told["min_points"])
+    task = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    photographs = [Upright(**one) for one in task["photographs"]]
+    images, work, model = (Path(task[name]) for name in ("images", "work", "model"))
+    job = Job(images, work, model, photographs, task["threads"], task["wanted"], task["min_points"])
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(SEED)
     find_features(job, teller)
@@ -201,11 +201,11 @@ class Attempt:
     models: list[Any]
     """The largest first; they do not connect."""
     was_held: bool = False
-    """Whether the focal length was held at first."""
+    """True if the focal length was held at first."""
 
     @property
     def quality(self) -> tuple[bool, int, int]:
-        """Sorts attempts: plausible lenses, then photographs, then points of the largest model."""
+        """Sort key: plausible lenses, then photographs, then points of the largest model."""
         if not self.models:
             return False, 0, 0
         model = self.models[0]
@@ -260,10 +260,10 @@ def focals_to_hold(job: Job) -> list[dict[int, float]]:
     those of `HELD_FOVS`."""
     with pycolmap.Database.open(job.database) as database:
         cameras = database.read_all_cameras()
-    told = {one.camera_id: one.focal_length for one in cameras if one.has_prior_focal_length}
+    in_exif = {one.camera_id: one.focal_length for one in cameras if one.has_prior_focal_length}
     sides = {one.camera_id: max(one.width, one.height) for one in cameras}
     return [
-        *([told] if len(told) == len(cameras) else []),
+        *([in_exif] if len(in_exif) == len(cameras) else []),
         *(
             {number: side / 2 / math.tan(math.radians(fov / 2)) for number, side in sides.items()}
             for fov in HELD_FOVS

@@ -32,7 +32,7 @@ FRONT = "CAM_FRONT"
 MAX_GAP = 1.5
 """Seconds from one sample to the next of a scene; those of nuScenes are half a second apart."""
 MAX_NUMBER = 1e12
-"""Of the entries of matrices, boxes and speeds."""
+"""Largest entry of matrices, boxes and speeds."""
 MAX_TIME = 1e12
 """Of a time in seconds."""
 MICROSECONDS = 1e12

@@ -160,7 +160,7 @@ class Photographs:
         return torch.from_numpy(self.sparse() - self.origin).float()
 
     def with_ego_vehicle(self) -> Photographs:
-        """The same, where the vehicle that carries the camera counts like all else."""
+        """Return the same, the vehicle that carries the camera being a part of the scene."""
         return replace(self, frames=tuple(replace(f, vehicle=None) for f in self.frames))
 
     @property

@@ -23,7 +23,7 @@ from gscompleter.data.frame import DOWNSCALED
 from gscompleter.data.image_folders import MASKS
 from gscompleter.data.match_pairs import in_order
 from gscompleter.data.upright import Upright, write_upright
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, names_listed, quoted
 from gscompleter.io.files import SUMMARY, output_folder
 from gscompleter.io.json_file import read_json
 from gscompleter.progress import track
@@ -38,11 +38,11 @@ POSES = "colmap"
 MIN_PHOTOGRAPHS = 3
 """With two, neither the focal length nor a wrong match can be told."""
 MIN_SHARE = 0.25
-"""Of the photographs: with fewer in the model it is a failure rather than a part of the scene."""
+"""Smallest share of the photographs in a model: fewer are a failure, not a part of the scene."""
 WANTED_SHARE = 0.5
-"""With fewer, other focal lengths are tried."""
+"""Share of the photographs in a model below which other focal lengths are tried."""
 MIN_POINTS = 30
-"""As many as COLMAP wants in common with a photograph before it places its camera."""
+"""Fewest points of a model: as many as COLMAP wants in common with one photograph."""
 MAX_THREADS = 4
 MAX_NAMED = 5
 """Photographs that a note names at most."""
@@ -76,7 +76,7 @@ class FoundPoses:
 
     @property
     def is_too_little(self) -> bool:
-        """Whether so few photographs or points were placed that there is nothing to go on with."""
+        """True if there are too few photographs or points in the model to go on with."""
         enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * self.photographs)
         return self.registered < enough or self.points < MIN_POINTS
 
@@ -98,12 +98,8 @@ class FoundPoses:
             )
             place = " in it"
         if self.missing:
-            names = ", ".join(quoted(name) for name in self.missing[:MAX_NAMED])
-            more = len(self.missing) - MAX_NAMED
-            notes.append(
-                f"No camera was found{place} for {names}{f' and {more} more' if more > 0 else ''}; "
-                "they are left out."
-            )
+            names = names_listed(self.missing, MAX_NAMED)
+            notes.append(f"No camera was found{place} for {names}; they are left out.")
         return notes
 
 
@@ -174,8 +170,8 @@ def _listed(folder: Path) -> list[str]:
 
 
 def is_own(folder: Path) -> bool:
-    """Whether photographs are looked for in a folder: not where it is hidden, holds masks, depth
-    maps or smaller copies, or is a result of ours."""
+    """Tell whether a folder may hold photographs of the user: not one that is hidden, of masks,
+    depth maps or smaller copies, or a result of ours."""
     if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
         return False
     return not os.path.isfile(folder / SUMMARY)
@@ -188,7 +184,7 @@ def _fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def _found_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
-    """What an earlier run found for these very photographs; None where none did, or too little."""
+    """Read what an earlier run found for these photographs; None for nothing or too little."""
     if not os.path.isfile(out / SUMMARY) or not os.path.isdir(out / "sparse" / "0"):
         return None
     content = read_json(out / SUMMARY, "name another folder")
@@ -237,15 +233,15 @@ def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> 
     """Refuse a reconstruction with too little in it, or with a lens that no camera has.
 
     Raises:
-        InputError: where it is such a one; `defect` describes the lens.
+        InputError: where it is like that; `defect` describes the lens.
     """
     if not found.is_too_little and defect is None:
         return
     lens = "" if defect is None else f", {defect}"
     raise InputError(
         f"COLMAP placed {found.registered} of {found.photographs} photographs in "
-        f"{quoted(str(photographs), 40)}, with {found.points:,} points{lens}, which is too little "
-        "at any focal length; add sharp ones that overlap by two thirds, or name their cameras."
+        f"{quoted(photographs, 40)}, with {found.points:,} points{lens}, which is no usable "
+        "model; add sharp photographs that overlap by two thirds, or name their cameras."
     )
 
 

@@ -13,7 +13,7 @@ from gscompleter.reading import read_bytes
 BYTES = 16
 """Of a point."""
 MAX_BYTES = 1 << 28
-"""Of a sweep."""
+"""Largest sweep, in bytes."""
 
 
 def read_sweep(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:

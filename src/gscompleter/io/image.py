@@ -115,14 +115,14 @@ def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np.ndarray, "h w"]:
-    """The brightness, from 0 to 255, of an image whose longer side is shrunk to `side` pixels.
+    """Read the brightness, from 0 to 255, of an image shrunk to `side` pixels on its longer side.
 
-    Of a JPEG file no more is decoded than that takes.
+    A JPEG file is decoded no larger than necessary.
 
     Args:
         stored: The file, or its bytes.
-        side: In pixels.
-        name: What error messages call the latter.
+        side: Longer side, in pixels.
+        name: Name of the bytes in error messages.
 
     Raises:
         InputError: where it is missing, truncated or not an image.
@@ -131,8 +131,8 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
-        told = f"The image {quoted(name or str(stored))} is damaged"
-        return _checked(lambda: _shrunk(image, size), told, "copy it again")
+        what = f"The image {quoted(name or str(stored))} is damaged"
+        return _checked(lambda: _shrunk(image, size), what, "copy it again")
 
 
 def _shrunk(image: Image.Image, size: tuple[int, int]) -> Float[np.ndarray, "h w"]:

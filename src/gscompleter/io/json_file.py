@@ -10,8 +10,7 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.reading import check_plain, read_bytes, read_head
 
 MAX_BYTES = 1 << 29
-"""Of a file."""
-
+"""Longest file, in bytes."""
 MAX_DIGITS = 20
 """Of an integer: those of 64 bits have no more. Longer ones fit into no array and no float."""
 

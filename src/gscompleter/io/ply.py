@@ -380,8 +380,8 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
 
 
 def drawable(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    """Which Gaussians hold neither NaN nor infinity nor a rotation of zeros. An opacity is finite
-    where its logit is not."""
+    """Mark the Gaussians without NaN, infinity and rotations of zeros. An opacity is finite where
+    its logit is not."""
     scales = gaussians.scales if gaussians.encoded is None else gaussians.encoded[:, :3]
     opacities, good = gaussians.opacities, (gaussians.quats != 0).any(1)
     tables = (gaussians.means, gaussians.quats, gaussians.scales, scales, gaussians.sh, opacities)

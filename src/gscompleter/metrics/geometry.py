@@ -40,9 +40,8 @@ def abs_rel(
     Over the pixels of `where` with known (positive) truth; None where there is none. No scale
     is fitted beforehand: a wrong scale is one of the errors that registration has to remove.
     """
-    if truth is None or not num_known(truth, where):
+    if truth is None or not (known := where & (truth > 0)).any():
         return None
-    known = where & (truth > 0)
     d, t = depth[known].double(), truth[known].double()
     return ((d - t).abs() / t).mean().item()
 
@@ -115,11 +114,11 @@ class Alignment:
     overlap: float
     """Share of the target's pixels that belong to both."""
     pixels: int
-    """How many pixels that is."""
+    """Number of these pixels."""
     scale: float | None
     """Median z-depth of the context at the target, in scene units."""
     abs_rel: float | None
-    """Of the generated z-depth against the context's, in the overlap."""
+    """Relative error of the generated z-depth against the context's, in the overlap."""
     chamfer: float | None
     """In scene units."""
     f_score: float | None

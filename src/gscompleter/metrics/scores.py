@@ -95,14 +95,14 @@ class Scores:
     depth_hole: float | None
     """The same where the context has a hole and the completion fills it."""
     depth_observed_pixels: int | None = None
-    """How many pixels `depth_observed` is the mean of."""
+    """Number of pixels that `depth_observed` is the mean of."""
     depth_hole_pixels: int | None = None
-    """How many pixels `depth_hole` is the mean of."""
+    """Number of pixels that `depth_hole` is the mean of."""
     depth_rim: float | None = None
     """Median relative difference of depth between what was added, drawn alone, and the context,
     where both cover the target: the step at the border of the holes."""
     align_pixels: int | None = None
-    """How many pixels of the target both cover: those of `depth_rim` and of the three below."""
+    """Number of pixels of the target that both cover: of `depth_rim` and the three below."""
     align_abs_rel: float | None = None
     """AbsRel of what was added against the context (`geometry.alignment`)."""
     align_chamfer: float | None = None
@@ -110,8 +110,8 @@ class Scores:
     align_f_score: float | None = None
     """F-score between the two."""
     registered_pixels: int | None = None
-    """How many pixels of the target the context covers and what was lifted falls on, as it was
-    registered and before any of it was filtered: those of the three below."""
+    """Number of pixels of the target that the context covers and lifted Gaussians fall on, as they
+    were registered and before any were filtered: of the three below."""
     registered_abs_rel: float | None = None
     """AbsRel of all that was lifted against the context (`geometry.primitive_alignment`)."""
     registered_chamfer: float | None = None

@@ -176,7 +176,7 @@ class Splats:
     opacities: Float32[ndarray, "n"]
     boxes: Integer[ndarray, "n 4"]
     factors: Float32[ndarray, "n"] | None = None
-    """What the opacities of antialiased Gaussians were multiplied by; None for others."""
+    """Factors that opacities of antialiased Gaussians were multiplied by; None for others."""
 
     def at_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
         """The same at other z-depths; what comes nearer than `near` gets an empty box."""

@@ -32,7 +32,6 @@ from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompl
 GENERATED = "generated.ply"
 """The file with what was added, alone."""
 
-
 IGNORED = (1.0, 0.0, 1.0)
 """Colour of what is ignored, in pictures of photographs."""
 
@@ -69,7 +68,7 @@ class HeldOut:
     view: View
     """In the frame of the result."""
     is_check: bool = False
-    """Whether it told, in a small copy, what of a given splat is supported."""
+    """True if a small copy of it checked the input splat."""
 
 
 @dataclass(frozen=True)
@@ -168,8 +167,8 @@ def summarize(
                 "frame": view.frame,
                 **scored,
                 "gain": gain,
-                "contradicted": contradicted_share(view),
-                "ignored": ignored_share(view),
+                "contradicted": share_of(view.contradicted),
+                "ignored": share_of(view.ignored),
             }
             for view, scored, gain in zip(
                 completion.views, scores[:count], gains_of(completion), strict=True
@@ -216,14 +215,9 @@ def covered_by(around: Around) -> dict[str, Any]:
     return {"coverage": coverage_of(around.looks).as_summary()} if around.looks else {}
 
 
-def contradicted_share(view: View) -> float:
-    """Share of a photograph that the others contradict."""
-    return 0.0 if view.contradicted is None else view.contradicted.float().mean().item()
-
-
-def ignored_share(view: View) -> float:
-    """Share of a photograph that is ignored."""
-    return 0.0 if view.ignored is None else view.ignored.float().mean().item()
+def share_of(mask: Bool[Tensor, "h w"] | None) -> float:
+    """Compute the share of an image in which `mask` is True; 0 without one."""
+    return 0.0 if mask is None else mask.float().mean().item()
 
 
 def counts(completion: Completion) -> dict[str, int]:
@@ -266,7 +260,7 @@ def write_report(
         for target, result in zip(targets, completion.targets, strict=True)
     ]
     scores = side_by_side(Images.scores, [*context_images, *target_images])
-    unused = {"held_out": score_held_out(completion, held_out, completer.renderer)}
+    unused = score_held_out(completion, held_out, completer.renderer)
     write_scenes(folder, completion, brought)
     pictured = folder / "images"
     pictured.mkdir()
@@ -277,8 +271,8 @@ def write_report(
     shown = most_changed(surroundings.looks)
     write_looks(pictured, shown)
     write_record(folder, record_of(completion, limits, shown, surroundings.photographs))
-    said = {**said, **covered_by(surroundings), **unused}
-    summary = summarize(completion, targets, scores, said)
+    facts = {**said, **covered_by(surroundings), "held_out": unused}
+    summary = summarize(completion, targets, scores, facts)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     return summary
 

@@ -64,7 +64,7 @@ class Tables:
     fid: Fid
     failures: tuple[Failure, ...]
     notes: tuple[str, ...] = ()
-    """What the scores have to be read with."""
+    """Notes on the scores, a sentence or two each."""
 
 
 @dataclass(frozen=True)

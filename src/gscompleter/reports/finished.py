@@ -60,7 +60,7 @@ class HeldOutRow(Scores):
     """A photograph that was not used."""
 
     is_check: bool = False
-    """Whether it told, in a small copy, what of a given splat is supported."""
+    """True if a small copy of it checked the input splat."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def moved(shares: Mapping[int | None, float]) -> str | None:
 
 
 def left_out(shares: Iterable[float]) -> str | None:
-    """What is said where these shares of photographs are ignored."""
+    """Describe the shares of photographs that are ignored; None where all of them is 0."""
     most = max(shares, default=0.0)
     if most == 0:
         return None

@@ -134,13 +134,13 @@ MIN_PIXELS = 500
 
 
 def _measured(key: str, pixels: str) -> Callable[[Step], float | None]:
-    """The score `key` where it was measured over enough pixels, of which `pixels` is the count."""
+    """Return a getter of the score `key`; None if it was measured over too few `pixels`."""
     number, count = _at(key), _at(pixels)
     return lambda step: number(step) if (count(step) or 0) >= MIN_PIXELS else None
 
 
 def _mean_and_median(key: str, title: str, digits: int, pixels: str) -> tuple[Column, Column]:
-    """Both over the tasks, of what was measured over enough pixels."""
+    """Columns of the mean and the median over the tasks, where enough pixels were measured."""
     mean = Column(key, title, digits, _measured(key, pixels))
     median = replace(
         mean, key=f"{key}_median", title=f"{title} (median)", over_tasks=statistics.median
@@ -149,7 +149,7 @@ def _mean_and_median(key: str, title: str, digits: int, pixels: str) -> tuple[Co
 
 
 def _pixels(key: str, title: str) -> Column:
-    """The median number of pixels over all tasks, also of those with too few to count."""
+    """Column of the median number of pixels over all tasks, those with too few included."""
     return Column(key, title, 0, _at(key), over_tasks=statistics.median)
 
 
@@ -168,7 +168,7 @@ ADDED = (
     *_mean_and_median("align_f_score", "F-score to context", 3, "align_pixels"),
     _pixels("align_pixels", "pixels of overlap"),
 )
-"""Of what was added against the scene before. All lengths are shares of the depth."""
+"""Added Gaussians against the scene before. All lengths are shares of the depth."""
 
 LIFTED = (
     *_mean_and_median("registered_abs_rel", "AbsRel of all lifted", 4, "registered_pixels"),
@@ -176,7 +176,7 @@ LIFTED = (
     *_mean_and_median("registered_f_score", "F-score of all lifted", 3, "registered_pixels"),
     _pixels("registered_pixels", "pixels of all lifted"),
 )
-"""The same of all that was lifted, as it was registered and before any of it was filtered."""
+"""The same of all lifted Gaussians, as registered and before any of them were filtered."""
 
 SEQUENCE = (
     Column("psnr_before", "PSNR before", 2, psnr_before),
@@ -203,19 +203,19 @@ NOTES = {
         "neither, so the row of reggs is not the paper's."
     ),
 }
-"""By method, what its row has to be read with."""
+"""Notes on the rows of methods, by method."""
 
 FEW_PIXELS = (
     f"A number of geometry counts where it was measured over at least {MIN_PIXELS} pixels; the "
     "columns of pixels are medians over all cases."
 )
-"""What the tables of geometry have to be read with."""
+"""Note on the tables of geometry."""
 
 NO_PIXELS = (
     "Some rows are of an earlier version, which counted no pixels, so their geometry is left out; "
     "scoring again adds it."
 )
-"""What tables with such rows have to be read with."""
+"""Note on tables with such rows."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ class Summary:
 
     @property
     def notes(self) -> list[str]:
-        """What the tables have to be read with, a sentence or two each."""
+        """Notes on the tables, a sentence or two each."""
         scores = [s["scores"] for rows in self.rows.values() for row in rows for s in row["steps"]]
         geometry = {
             FEW_PIXELS: bool(self.present((*GEOMETRY, *ADDED, *LIFTED))),

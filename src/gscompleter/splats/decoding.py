@@ -10,20 +10,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gscompleter.errors import InputError, quoted
-from gscompleter.reading import read_bytes
 from gscompleter.types import SH_C0, Gaussians, observed
 
 SLACK = 1 << 20
 """Bytes that any file may unpack to, however small it is."""
-
-
-def content(path: Path) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        InputError: where it cannot be read.
-    """
-    return read_bytes(path)
 
 
 def check_growth(path: Path, unpacked: int, packed: int, most: int) -> None:

@@ -43,7 +43,7 @@ class Format:
     arrange: Callable[[Gaussians], Gaussians] | None = None
     """The order that files of this kind hold their Gaussians in; None keeps the given one."""
     has_mode: bool = False
-    """Whether files of this kind can mark Gaussians as antialiased."""
+    """True if files of this kind can mark Gaussians as antialiased."""
 
 
 FORMATS = {

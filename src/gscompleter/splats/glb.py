@@ -21,7 +21,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.errors import InputError, quoted
-from gscompleter.splats.decoding import check_size, content, damaged, gaussians_of
+from gscompleter.reading import read_bytes
+from gscompleter.splats.decoding import check_size, damaged, gaussians_of
 from gscompleter.splats.frames import ABOUT_Z, half_turned, moved
 from gscompleter.types import Gaussians, merge
 
@@ -60,7 +61,7 @@ def read_glb(path: Path) -> Gaussians:
     Raises:
         InputError: where it cannot be read, holds no Gaussians, or holds them in another way.
     """
-    document = _document(path, content(path))
+    document = _document(path, read_bytes(path))
     try:
         placed = list(_placed_primitives(document))
         _check_repeats(document, [primitive for primitive, _ in placed])

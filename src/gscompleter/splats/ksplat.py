@@ -17,9 +17,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import read_bytes
 from gscompleter.splats.decoding import (
     check_size,
-    content,
     damaged,
     gaussians_of,
     harmonics,
@@ -73,7 +73,7 @@ def read_ksplat(path: Path) -> Gaussians:
     Raises:
         InputError: where it cannot be read, is truncated, or contradicts itself.
     """
-    data = content(path)
+    data = read_bytes(path)
     header = _header(path, data)
     end = HEADER + header.sections * SECTION_HEADER
     check_size(path, len(data), end)

@@ -25,9 +25,9 @@ from numpy import ndarray
 from PIL import Image
 
 from gscompleter.errors import InputError, quoted
+from gscompleter.reading import read_bytes
 from gscompleter.splats.decoding import (
     check_growth,
-    content,
     damaged,
     gaussians_of,
     harmonics,
@@ -93,10 +93,10 @@ def read_sog(path: Path) -> Gaussians:
         InputError: where something is absent, damaged, or of a version that is not known.
     """
     if path.is_dir():
-        return _read(Parts(path, lambda name: content(path / name)))
-    data = content(path)
+        return _read(Parts(path, lambda name: read_bytes(path / name)))
+    data = read_bytes(path)
     if not data.startswith(ZIP):
-        return _read(Parts(path, lambda name: content(path.parent / name)), path.name)
+        return _read(Parts(path, lambda name: read_bytes(path.parent / name)), path.name)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as bundle:
             if META not in bundle.namelist():

@@ -12,7 +12,8 @@ import numpy as np
 
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
-from gscompleter.splats.decoding import content, gaussians_of, harmonics
+from gscompleter.reading import read_bytes
+from gscompleter.splats.decoding import gaussians_of, harmonics
 from gscompleter.types import SH_C0, Gaussians
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -24,7 +25,7 @@ def read_splat(path: Path) -> Gaussians:
     Raises:
         InputError: where it cannot be read, or does not consist of whole rows.
     """
-    data = content(path)
+    data = read_bytes(path)
     if len(data) % ROW.itemsize:
         raise InputError(
             f"{quoted(path)} is truncated or no .splat: its {len(data):,} bytes are no multiple of "

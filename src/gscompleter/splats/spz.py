@@ -21,10 +21,10 @@ from numpy import ndarray
 from gscompleter.errors import InputError, quoted
 from gscompleter.io.files import replacing
 from gscompleter.io.ply import encode
+from gscompleter.reading import read_bytes
 from gscompleter.splats.decoding import (
     check_growth,
     check_size,
-    content,
     damaged,
     gaussians_of,
     harmonics,
@@ -82,7 +82,7 @@ def read_spz(path: Path) -> Gaussians:
     Raises:
         InputError: where it cannot be read, is truncated, or of a version that is not known.
     """
-    data = content(path)
+    data = read_bytes(path)
     if data.startswith(GZIP):
         header, streams = _from_gzip(path, data)
     else:

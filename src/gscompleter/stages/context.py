@@ -59,12 +59,11 @@ def has_texture(image: Float[Tensor, "h w 3"]) -> bool:
 def sort_by_frame(views: Sequence[View]) -> list[View]:
     """Sort photographs by frame number, so that no result depends on the order they were named in.
 
-    Views without a frame number keep their order, and all others with them.
+    If one of them has no frame number, all keep their order.
     """
-    frames = [view.frame for view in views if view.frame is not None]
-    if len(frames) < len(views):
+    if any(view.frame is None for view in views):
         return list(views)
-    return [view for _, view in sorted(zip(frames, views, strict=True), key=lambda pair: pair[0])]
+    return sorted(views, key=lambda view: view.frame or 0)
 
 
 def without_ignored(made: Reconstruction, views: Sequence[View]) -> Gaussians:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -52,21 +53,19 @@ def error_budgets(
     Returns:
         The budgets, that without the holes first.
     """
-    seen = replace(photograph, ignored=holes | ~photograph.counted)
-    budgets = [ErrorBudget(seen, "mse", 0.0)]
+
+    def budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
+        error = errors(image.clamp(0, 1), ErrorBudget(view, metric, 0.0)).sum().item()
+        if metric == "mse":
+            return ErrorBudget(view, metric, error_with_loss(error, max(tolerance, ROUNDING)))
+        return ErrorBudget(view, metric, error + ssim_tolerance)
+
+    budgets = [budget(replace(photograph, ignored=holes | ~photograph.counted), "mse")]
     if holes.any():
-        budgets.append(ErrorBudget(photograph, "mse", 0.0))
+        budgets.append(budget(photograph, "mse"))
     if min(photograph.image.shape[:2]) > 2 * RADIUS:
-        budgets.append(ErrorBudget(photograph, "dssim", 0.0))
-    before = [errors(image.clamp(0, 1), budget).sum().item() for budget in budgets]
-    limits = {
-        "mse": lambda error: error_with_loss(error, max(tolerance, ROUNDING)),
-        "dssim": lambda error: error + ssim_tolerance,
-    }
-    return tuple(
-        replace(budget, limit=limits[budget.metric](error))
-        for budget, error in zip(budgets, before, strict=True)
-    )
+        budgets.append(budget(photograph, "dssim"))
+    return tuple(budgets)
 
 
 def errors(image: Float[Tensor, "h w 3"], budget: ErrorBudget) -> Float[Tensor, "h w"]:
@@ -159,16 +158,16 @@ class Drawn:
     @cached_property
     def broken(self) -> ErrorBudget:
         """The budget that is exceeded most, relative to its limit."""
-        shown = self.image.detach().clamp(0, 1)
-        totals = [errors(shown, budget).sum().item() for budget in self.check.budgets]
-        pairs = zip(totals, self.check.budgets, strict=True)
-        return max(pairs, key=lambda pair: pair[0] / max(pair[1].limit, 1e-12))[1]
+        return max(self.check.budgets, key=lambda one: self.error(one) / max(one.limit, 1e-12))
 
     @cached_property
     def excess(self) -> float:
-        """How far the error of the image lies over the limit of that budget."""
-        shown = self.image.detach().clamp(0, 1)
-        return errors(shown, self.broken).sum().item() - self.broken.limit
+        """Error of the image above the limit of that budget."""
+        return self.error(self.broken) - self.broken.limit
+
+    def error(self, budget: ErrorBudget) -> float:
+        """Compute the error of the image that `budget` limits."""
+        return errors(self.image.detach().clamp(0, 1), budget).sum().item()
 
     def to_lower(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
         """Which of `added` are to give way."""
@@ -222,8 +221,8 @@ def error_slope(
 ) -> tuple[float, Float[Tensor, "n"]]:
     """Error against the photograph, and how it grows with each opacity."""
     variable, image = drawn_with(draw, opacities)
-    slope = gradient_of(image, ErrorBudget(view, "mse", 0.0), variable)
-    return squared_error(view.compared(image.detach()), view.image).item(), slope
+    gradient = gradient_of(image, ErrorBudget(view, "mse", 0.0), variable)
+    return squared_error(view.compared(image.detach()), view.image).item(), gradient
 
 
 def drawn_with(

@@ -77,7 +77,7 @@ class Exhibit:
     """None where there is nothing to compare with."""
     shots: tuple[Shot, ...] = ()
     remarks: tuple[str, ...] = ()
-    """What is missing of it, or not as in its file, a sentence each."""
+    """Notes on what is missing of it, or not as in its file, a sentence each."""
     place: Place = SAME
     """Where the frame lies that further cameras are given in."""
 

@@ -17,7 +17,7 @@ from gscompleter.errors import InputError
 from gscompleter.weights.published import PublishedWeights
 
 MAX_RETRIES = 2
-"""Of a request to the hub."""
+"""Retries of a request to the hub."""
 INSTALL = "pip install 'gscompleter[models]'"
 
 

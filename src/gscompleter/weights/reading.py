@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted, refuse_pointer
+from gscompleter.errors import InputError, names_listed, quoted, refuse_pointer
 from gscompleter.reading import open_file
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
@@ -196,5 +196,4 @@ def _broken(path: Path, wrong: str, name: str) -> InputError:
 
 
 def _some(keys: list[str]) -> str:
-    shown = ", ".join(quoted(key) for key in keys[:3]) or "nothing"
-    return f"{shown} and {len(keys) - 3} more" if len(keys) > 3 else shown
+    return names_listed(keys, 3) or "nothing"

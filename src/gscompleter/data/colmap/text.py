@@ -20,9 +20,9 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.reading import read_lines
 
 MAX_LINE = 1 << 22
-"""Of characters of the features of an image."""
+"""Longest line, in characters: the features of an image."""
 MAX_BYTES = 1 << 34
-"""Of a file."""
+"""Longest file, in bytes."""
 
 
 def read_cameras(path: Path) -> dict[int, Intrinsics]:

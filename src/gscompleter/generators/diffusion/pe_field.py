@@ -60,7 +60,7 @@ class PEField:
     """Depth of the photograph: of the scene itself, or `MonocularDepth`; None takes what the
     completer's settings name."""
     device: str = "cpu"
-    """Where a depth network runs that the completer's settings name."""
+    """Device of a depth network that the completer's settings name."""
     ids_dtype: torch.dtype = torch.bfloat16
     """What positions of the target are rounded to: bfloat16 as in the authors' run."""
     retries: int = 0

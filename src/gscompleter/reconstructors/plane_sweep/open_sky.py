@@ -60,8 +60,7 @@ MAX_ON_PLANE = 0.8
 """Share of the outline on one plane from which the region is that plane: a ceiling or a wall."""
 NEAR_PLANES, MAX_NEAR_ON_PLANE = 5.0, 0.9
 """The same for that part of the outline which is more planes than this from infinity, where all
-planes meet, and twice as many as its far end.
-"""
+planes meet, and twice as many as its far end."""
 PLANE_TOLERANCE = 2.0
 """Planes of the sweep by which a pixel may miss a plane that it lies on."""
 ROUNDS = 20
@@ -86,7 +85,7 @@ def sky_shown(rig: Rig, sky_of_second: OtherMask) -> Mask:
 
 
 def without(found: Measured, where: Mask) -> Measured:
-    """What was measured elsewhere than `where` it does not count, as in the sky."""
+    """Leave out what was measured `where` it does not count, as in the sky."""
     full = found.at_size(where.shape)
     weight, confidence = (
         np.where(where, np.float32(0), share) for share in (full.weight, full.confidence)
