@@ -170,11 +170,16 @@ class Drawn:
         return errors(self.image.detach().clamp(0, 1), budget).sum().item()
 
     def to_lower(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
-        """Which of `added` are to give way."""
-        if HALVINGS <= trial < HALVINGS + REMOVALS:
+        """Choose which of `added` give way.
+
+        SSIM is not linear in opacities: where it is broken, Gaussians at the worst pixels give way
+        from the first trial on.
+        """
+        is_first_order = self.broken.metric == "mse" and trial < HALVINGS
+        if not is_first_order and trial < HALVINGS + REMOVALS:
             return self.at_worst(added)
         gradient = gradient_of(self.image, self.broken, self.opacities)
-        if trial < HALVINGS:
+        if is_first_order:
             return fewest(gradient * self.opacities.detach() / 2, self.excess)
         return gradient != 0
 
