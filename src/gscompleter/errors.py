@@ -67,12 +67,13 @@ def quoted(value: object, length: int | None = None) -> str:
 def shortened(message: str, most: int) -> str:
     """Fit a message into one line of `most` characters.
 
-    The longest words, such as paths, are cut first, then the middle of the message.
+    The longest words, such as paths, are cut first, then the middle of the message. An address is
+    of no use in part, and is cut last.
     """
     line = " ".join(part.strip() for part in message.splitlines())
     words = quoted(line, 100 * most).split(" ")
     while (excess := len(" ".join(words)) - most) > 0:
-        longest = max(range(len(words)), key=lambda i: len(words[i]))
+        longest = max(range(len(words)), key=lambda i: len(words[i]) * ("://" not in words[i]))
         length = max(len(words[longest]) - excess, LONGEST_QUOTE)
         if length >= len(words[longest]):
             break
