@@ -9,7 +9,7 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH_INDEX := $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url $(TORCH_CPU_INDEX))
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow lint format types docs dist release-check evaluate bench gpu clean
+.PHONY: demo test test-slow golden check-golden lint format types docs dist release-check evaluate bench gpu clean
 
 demo: $(VENV)/installed
 	$(BIN)/gscompleter demo --out demo --overwrite
@@ -20,6 +20,13 @@ test: $(VENV)/installed-test
 
 test-slow: $(VENV)/installed-test
 	$(BIN)/python -m pytest -m slow
+
+# The net under a restructuring: `make golden` before it, `make check-golden` after it. ONLY=scenes, ONLY=texts.
+golden: $(VENV)/installed
+	$(BIN)/python benchmarks/golden.py record $(if $(ONLY),--only $(ONLY))
+
+check-golden: $(VENV)/installed
+	$(BIN)/python benchmarks/golden.py check $(if $(ONLY),--only $(ONLY))
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -1,0 +1,214 @@
+"""Record what the commands give, and compare a later state of the code with it.
+
+    python benchmarks/golden.py record [--only scenes|texts] [--data DIR] [--file FILE]
+    python benchmarks/golden.py check  [--only scenes|texts] [--data DIR] [--file FILE]
+
+`scenes` holds the SHA-256 of every .ply and the PSNR and SSIM of every view: 24 development cases
+with the settings `default` and `paper`, a trained splat at seven targets, and eight targets in
+sequence. `texts` holds the help of every command, and exit code and sentence of wrong input. Bytes
+are compared on the machine that recorded them; other machines round otherwise and compare scores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("GSCOMPLETER_DATA", ROOT.parent / "shared"))
+PROGRAM = (sys.executable, "-c", "from gscompleter.cli import run; run()")
+MEAN_TOLERANCE, CASE_TOLERANCE = 0.02, 0.1
+"""dB by which the mean PSNR, and the PSNR of one view, may fall on another machine."""
+COMMANDS = [
+    *("complete", "batch", "live", "clean", "demo", "evaluate", "tables", "index", "bench"),
+    *("models", "convert", "poses", "report", "strip", "view", "doctor", "warmup"),
+]
+
+
+def main() -> None:
+    """Record or check, as the command line asks; exit code 1 where something differs."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("action", choices=("record", "check"))
+    parser.add_argument("--only", choices=("scenes", "texts"))
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--file", type=Path, default=ROOT / "benchmarks" / "golden.json")
+    options = parser.parse_args()
+    sections = (options.only,) if options.only else ("scenes", "texts")
+    if "scenes" in sections and not (options.data / "data" / "cases.json").is_file():
+        parser.error(f"{options.data} has no data/cases.json; name the data by GSCOMPLETER_DATA")
+    known = json.loads(options.file.read_text()) if options.file.is_file() else {}
+    with tempfile.TemporaryDirectory() as folder:
+        present = {"scenes": lambda: run_scenes(options.data, Path(folder)), "texts": run_texts}
+        found = {"machine": describe_machine()} | {name: present[name]() for name in sections}
+    if options.action == "record":
+        content = json.dumps(known | found, indent=1, sort_keys=True, ensure_ascii=False)
+        options.file.write_text(content + "\n")
+    elif differences := compare(known, found):
+        sys.exit("\n".join([*differences, f"{len(differences)} differences"]))
+    else:
+        counts = ", ".join(f"{len(found[name])} {name}" for name in sections)
+        exact = "bytes" if known["machine"] == found["machine"] else "scores (another machine)"
+        print(f"equal: {counts}; compared: {exact}")
+
+
+def describe_machine() -> dict[str, str]:
+    """Describe what decides how numbers round: processor, vector instructions, libraries."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    model = next((line.split(": ")[1] for line in lines if line.startswith("model name")), "")
+    return {
+        "processor": model or platform.processor(),
+        "capability": torch.backends.cpu.get_cpu_capability(),
+        "torch": torch.__version__,
+    }
+
+
+def list_runs(data: Path) -> Iterator[tuple[str, list[str]]]:
+    """List the completions, by name, with their arguments."""
+    cases = json.loads((data / "data" / "cases.json").read_text())
+    size = [str(side) for side in cases["resolution"]]
+    for case in cases["cases"]:
+        context = [str(frame) for frame in case["context"]]
+        given = [str(data / "data" / case["scene"]), "--context", *context, "--resolution", *size]
+        given += ["--near", str(case["near"]), "--far", str(case["far"])]
+        for config in ("default", "paper"):
+            name = f"{case['scene']} {'+'.join(context)} to {case['target']}, {config}"
+            yield name, [*given, "--target", str(case["target"]), "--config", config]
+    splat = data / "splats" / "fox"
+    unseen = [str(frame) for frame in (27, 29, 31, 33, 35, 37, 39)]
+    given = [str(splat), "--scene", str(splat / "splat.ply"), "--resolution", "320"]
+    yield "fox splat, 7 targets", [*given, "--target", *unseen]
+    scene = str(data / "data" / "re10k_0d4de33c")
+    given = [scene, "--context", "0", "4", "--resolution", "256", "256", "--near", "1"]
+    frames = [str(frame) for frame in range(8, 24, 2)]
+    yield "re10k_0d4de33c, 8 targets", [*given, "--far", "100", "--target", *frames]
+
+
+def run_scenes(data: Path, folder: Path) -> dict[str, Any]:
+    """Run every completion, two at a time."""
+    runs = dict(list_runs(data))
+    with ThreadPoolExecutor(2) as pool:
+        outputs = [folder / str(number) for number in range(len(runs))]
+        return dict(zip(runs, pool.map(run_scene, runs.values(), outputs), strict=True))
+
+
+def run_scene(arguments: list[str], out: Path) -> dict[str, Any]:
+    """Run one completion into `out` and record its files and scores."""
+    words = [*arguments, "--quiet", "--threads", "1", "--out", str(out)]
+    subprocess.run([*PROGRAM, "complete", *words], check=True)
+    summary = json.loads((out / "summary.json").read_text())
+    views = [*summary["context"], *summary["targets"]]
+    keys = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
+    return {
+        "sha256": {
+            path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(out.glob("*.ply"))
+        },
+        "scores": [{key: view[key] for key in keys} for view in views],
+    }
+
+
+def run_texts() -> dict[str, Any]:
+    """Run every command with --help and with wrong input."""
+    lines = [[], ["--version"], ["--help"], ["complet"], *([name, "--help"] for name in COMMANDS)]
+    lines += [[name, "--no-such-option"] for name in COMMANDS]
+    lines += [
+        ["complete", "nowhere", "--out", "out"],
+        ["complete", ".", "--out", "out"],
+        ["complete", ".", "--out", "out", "--config", "no-such-config"],
+        ["complete", ".", "--out", "out", "--resolution", "0"],
+        ["complete", ".", "--out", "out", "--config.holes.dilation", "-1"],
+        ["complete", ".", "--out", "out", "--generator", "no-such-model"],
+        ["complete", ".", "--out", "out", "--seed", "-1"],
+        ["convert", "nothing.ply", "nothing.spz"],
+        ["strip", "nothing", "--out", "context.ply"],
+        ["clean", ".", "--scene", "nothing.ply", "--out", "out"],
+        ["view", "nothing.ply", "--save", "page.html"],
+        ["report", "nothing"],
+        ["live", "nothing"],
+        ["poses", "nothing", "--out", "out"],
+        ["batch", "nothing.csv", "--out", "out"],
+        ["evaluate", "nothing", "--protocol", "n-10", "--out", "out"],
+        ["tables", "nothing"],
+        ["models", "no-such-model"],
+        ["bench", "--cases", "nothing.json", "--out", "out"],
+    ]
+    with ThreadPoolExecutor(2) as pool:
+        names = [" ".join(["gscompleter", *words]) for words in lines]
+        return dict(zip(names, pool.map(run_text, lines), strict=True))
+
+
+def run_text(words: list[str]) -> dict[str, Any]:
+    """Run one command in an empty folder and record its exit code and texts."""
+    environment = dict(os.environ, COLUMNS="100", NO_COLOR="1")
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(
+            [*PROGRAM, *words], cwd=folder, env=environment, capture_output=True, text=True
+        )
+        left = sorted(path.name for path in Path(folder).iterdir())
+    clean = {"out": done.stdout, "err": done.stderr}
+    texts = {name: text.replace(folder, "FOLDER").splitlines() for name, text in clean.items()}
+    return {"exit": done.returncode, "left behind": left, **texts}
+
+
+def compare(known: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
+    """Describe every difference, in a line each."""
+    if not known:
+        return ["nothing was recorded; run `make golden` on the state to compare with"]
+    same_machine = known["machine"] == found["machine"]
+    match = match_bytes if same_machine else match_scores
+    differences = []
+    for name, row in found.get("scenes", {}).items():
+        differences += [f"{name}: {text}" for text in match(known["scenes"].get(name), row)]
+    if not same_machine and "scenes" in found:
+        fall = mean_psnr(known["scenes"]) - mean_psnr(found["scenes"])
+        differences += [f"mean PSNR fell by {fall:.3f} dB"] * (fall > MEAN_TOLERANCE)
+    for name, row in found.get("texts", {}).items():
+        before = known["texts"].get(name, {})
+        differences += [f"{name}: {key} differs" for key in row if row[key] != before.get(key)]
+    return differences
+
+
+def match_bytes(known: Mapping[str, Any] | None, found: Mapping[str, Any]) -> list[str]:
+    """List the files and scores that are not the same."""
+    if known is None:
+        return ["not recorded"]
+    names = sorted({*known["sha256"], *found["sha256"]})
+    files = [n for n in names if known["sha256"].get(n) != found["sha256"].get(n)]
+    scores = ["scores"] if known["scores"] != found["scores"] else []
+    return [f"{name} differs" for name in files + scores]
+
+
+def match_scores(known: Mapping[str, Any] | None, found: Mapping[str, Any]) -> list[str]:
+    """List the views whose PSNR fell by more than the tolerance."""
+    if known is None:
+        return ["not recorded"]
+    falls = [
+        before["psnr_after"] - after["psnr_after"]
+        for before, after in zip(known["scores"], found["scores"], strict=True)
+        if before["psnr_after"] is not None
+    ]
+    return [f"PSNR of a view fell by {fall:.3f} dB" for fall in falls if fall > CASE_TOLERANCE]
+
+
+def mean_psnr(scenes: Mapping[str, Any]) -> float:
+    """Average the PSNR after completion over all views that have one."""
+    values = [row["psnr_after"] for scene in scenes.values() for row in scene["scores"]]
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known)
+
+
+if __name__ == "__main__":
+    main()
