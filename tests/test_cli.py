@@ -21,6 +21,8 @@ import torch
 from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.cli import parsed
+from gscompleter.commands.renamed import warn_of
+from gscompleter.commands.row_options import options_of
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import (
     GENERATORS,
@@ -359,8 +361,15 @@ def test_a_single_setting_reaches_the_completion_and_its_summary(scene, tmp_path
 
 
 def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
-    words = ("--generator", "pe-field", "--generator-path", "a/b", "--generator-steps", 8)
-    words += ("--generator-retries", 2, "--generator-depth", "monocular", "--generator-at-once", 3)
+    words = ("--generator", "pe-field", "--generator-weights", "a/b", "--generator-steps", 8)
+    words += (
+        "--generator-retries",
+        2,
+        "--generator-depth",
+        "monocular",
+        "--generator-batch-size",
+        3,
+    )
     options = parsed([str(w) for w in complete(scene, tmp_path, *words, "--generator-offload")])
     assert options.synthesis.settings() == PEFieldSettings("a/b", 2, True, 8, "monocular", 3)
     words = ("--generator", "diffusers-inpaint", "--generator-prompt", "a quiet street")
@@ -368,6 +377,41 @@ def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
     assert options.synthesis.settings() == DiffusersInpaintSettings(prompt="a quiet street")
     options = parsed([str(word) for word in complete(scene, tmp_path)])
     assert options.synthesis.settings() == WarpInpaintSettings()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (("--keep-unsupported",), ("--no-prune",)),
+        (("--keep_unsupported",), ("--no-prune",)),
+        (("--film",), ("--video",)),
+        (("--generator-path", "a/b"), ("--generator-weights", "a/b")),
+        (("--generator-path=a/b",), ("--generator-weights", "a/b")),
+        (("--generator-at-once", 3), ("--generator-batch-size", 3)),
+    ],
+)
+def test_an_old_option_name_works_and_a_line_names_the_new_one(scene, tmp_path, capsys, old, new):
+    warn_of.cache_clear()
+    more = ("--generator", "pe-field")
+    options = [parsed(list(map(str, complete(scene, tmp_path, *more, *o)))) for o in (old, new)]
+    assert options[0] == options[1]
+    name = old[0].split("=")[0].replace("_", "-")
+    assert capsys.readouterr().err == (
+        f"gscompleter: {name} is now called {new[0]}; the old name stops working in the next "
+        "release.\n"
+    )
+
+
+def test_old_option_names_of_other_commands_and_of_rows_work_too(tmp_path, capsys):
+    warn_of.cache_clear()
+    words = ["evaluate", "cases.json", "--out", "o", "--again", "scores", "--ignore-masked"]
+    options = parsed(words)
+    assert (options.rerun, options.use_masks) == ("scores", True)
+    assert parsed(["batch", "m.csv", "--out", "o", "--again", "failures"]).rerun == "failures"
+    row = {"folder": "scene", "keep_unsupported": "true", "film": "no"}
+    options = options_of(row, tmp_path)
+    assert (options.no_prune, options.video) == (True, False)
+    assert capsys.readouterr().err.count("\n") == 4  # once each
 
 
 def test_help_knows_every_setting(monkeypatch, capsys):

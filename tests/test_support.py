@@ -325,7 +325,7 @@ def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = tmp_path / "splat.ply", tmp_path / "out"
     save_ply(splat, SCENE)
-    assert run(monkeypatch, *complete(scene, splat, out, "--keep-unsupported")) == 0
+    assert run(monkeypatch, *complete(scene, splat, out, "--no-prune")) == 0
     assert not (out / "removed.ply").exists()
     assert torch.equal(load_ply(out / "completed.ply").means[: len(SCENE)], SCENE.means)
 

@@ -38,7 +38,7 @@ class BatchOptions(EngineOptions):
     retries: Annotated[int, Interval(ge=0, le=100)] = 2
     """How often a job is tried again whose process was killed, or that failed with anything but a
     sentence on its input."""
-    again: Literal["nothing", "failures"] = "nothing"
+    rerun: Literal["nothing", "failures"] = "nothing"
     """What of an earlier run is done once more: jobs that failed."""
     each: tuple[str, ...] = ()
     """Options of `complete` for every row that has not its own, as in --each resolution=256."""
@@ -62,7 +62,7 @@ class Counts:
         """Summarize the counts, and name the option that retries what failed before."""
         before = f"there before {self.skipped}"
         if self.skipped_failed:
-            before += f", {self.skipped_failed} of them failed (--again failures does these again)"
+            before += f", {self.skipped_failed} of them failed (--rerun failures does these again)"
         return f"Done {self.done}, failed {self.failed}, {before}."
 
 
@@ -88,7 +88,7 @@ def run_batch(options: BatchOptions) -> None:
             engine = engine_for(options, place.name)
             claim_folder(place)
             share = jobs[number::count]
-            left = missing(share, place, options.again == "failures")
+            left = missing(share, place, options.rerun == "failures")
             names = {job.name for job in left}
             failed_before = count_failed(place, [job for job in share if job.name not in names])
         rounds = Rounds(place, BatchRows(place), left, options.retries)

@@ -86,7 +86,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         InputError: anything about the input that the user can mend; nothing is written then but
             cameras that were found.
     """
-    if options.film:
+    if options.video:
         check_writer()
     console = Console(stderr=True, quiet=options.quiet)
     with shown_on(None if options.quiet else console):
@@ -101,7 +101,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
                 done = Done(opened, task, cameras, completion)
                 summary = write_done(folder, options, done, explorer)
                 write_targets(folder, task)
-            if options.film:
+            if options.video:
                 photographs = list(cameras.values())
                 write_film(folder, completion, photographs, explorer.completer.renderer)
     return summary, completion
@@ -244,7 +244,7 @@ def completer_for(options: CompleteOptions, targets: Sequence[Target], device: s
 
 def stages_of(options: CompleteOptions) -> CompleterConfig:
     """The settings of the stages, with what has an option of its own."""
-    if not options.keep_unsupported:
+    if not options.no_prune:
         return options.config
     support = replace(options.config.support, keep_unsupported=True)
     return replace(options.config, support=support)
@@ -295,7 +295,7 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         )
     if not summary["targets"]:
         console.print(NO_TARGET)
-    elif options.film:
+    elif options.video:
         console.print(f"On the way through the holes: {options.out / FILM}", soft_wrap=True)
     covered = summary["coverage"]
     console.print(

@@ -25,7 +25,7 @@ PURPOSES = {
     "fid": "tables --fid",
     "live": "completing in the browser with gscompleter live",
     "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
-    "film": "complete --film",
+    "film": "complete --video",
     "ray": "batch --engine ray",
     "slurm": "batch --engine submitit",
     "waymo": "the Waymo Open Dataset 2, whose tables are parquet",

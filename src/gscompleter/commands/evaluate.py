@@ -71,7 +71,7 @@ def run_evaluation(options: EvaluateOptions) -> None:
     engine = engine_for(options, str(options.out.resolve()))
     with shown_on(shown):
         compile_kernels((config.device, config.reconstructor, config.generator))
-        counts = evaluate(tasks, methods, options.out, config, shard, options.again, engine)
+        counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
         told = f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}."
         console.print(told)
         # An empty shard, where there are more shards than cases, has nothing to show.
@@ -86,7 +86,7 @@ def source_of(options: EvaluateOptions) -> dict[str, Any]:
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
         "resolution": list(size) if isinstance(size, tuple) else size,
-        **({"ignore_masked": True} if options.ignore_masked else {}),
+        **({"ignore_masked": True} if options.use_masks else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
         **({} if options.ego_mask else {"ego_mask": False}),
     }
@@ -168,7 +168,7 @@ def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped], notes: list[s
         if options.resolution is not None:
             size = working_size(options.resolution)
             cases = [replace(case, resolution=size) for case in cases]
-        if options.ignore_masked:
+        if options.use_masks:
             cases = [replace(case, ignore_masked=True) for case in cases]
         cases = [replace(case, ego_mask=options.ego_mask) for case in cases]
         return [task_of(case) for case in cases]
@@ -200,17 +200,17 @@ def tasks_in_clips(
     for path in options.paths:
         for clip in usable(open_clips(path), skipped):
             notes += clip.notes
-            if options.ignore_masked and not clip.has_masks:
+            if options.use_masks and not clip.has_masks:
                 raise InputError(
                     f"Nothing says what is to be ignored in {clip.name}: it has neither masks nor "
-                    "boxes of what moves; leave --ignore-masked out."
+                    "boxes of what moves; leave --use-masks out."
                 )
             clip = clip if options.ego_mask else clip.with_ego_vehicle()
             for protocol in protocols:
                 if isinstance(protocol, ViewByView) and (reason := protocol.reason_to_skip(clip)):
                     skipped.append(Skipped(clip.name, reason))
                 size = working_size(resolution_of(options))
-                tasks = tasks_of(protocol, clip, size, options.ignore_masked)
+                tasks = tasks_of(protocol, clip, size, options.use_masks)
                 yield from tasks[:1] if options.one_per_scene else tasks
 
 

@@ -43,7 +43,7 @@ def stages_in_order(options: CompleteOptions, task: Task) -> list[tuple[str, flo
     """List what comes after the scene is opened, by the names that it is shown by, with its part of
     the time."""
     count = len(task.targets) or most(options)
-    ends = [("report", CONTEXT[1]), *([("film", CONTEXT[1])] if options.film else [])]
+    ends = [("report", CONTEXT[1]), *([("video", CONTEXT[1])] if options.video else [])]
     return [CONTEXT, *((CONTEXT, *STAGES) * count), *ends]
 
 
@@ -56,7 +56,7 @@ def timed_stages(options: CompleteOptions, task: Task) -> list[tuple[str, float]
     report = REPORT + REPORT_PER_PIXEL * pixel * (len(task.views) + count)
     film = FILM_PER_PIXEL * max(min(pixel, MAX_SIDE**2), (MIN_WIDTH // 2) ** 2) * FRAMES
     stages = [("context", context), ("target", count * each), ("report", report)]
-    return [*stages, ("film", film)] if options.film else stages
+    return [*stages, ("video", film)] if options.video else stages
 
 
 def pixels(view: View) -> int:

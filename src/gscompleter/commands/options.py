@@ -119,7 +119,7 @@ class CompletingOptions(SceneOptions, ModelOptions):
     scene: Path | None = None
     """A file of Gaussians to complete, which is kept as it is. Without it the context is
     reconstructed from the photographs."""
-    keep_unsupported: bool = False
+    no_prune: bool = False
     """Never set Gaussians of the scene aside that no photograph supports."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
     """Settings of the stages. `--config NAME` says where they start: default, paper, an ablation
@@ -148,8 +148,8 @@ class CompleteOptions(CompletingOptions):
     out: Path
     """Folder for completed.ply, generated.ply, context.ply, targets.json, images/, report.html,
     report.json and summary.json."""
-    film: bool = False
-    """Write film.mp4, too: about six seconds on the way through the holes, before and after side by
+    video: bool = False
+    """Write video.mp4, too: about six seconds on the way through the holes, before and after side by
     side."""
 
 
@@ -261,7 +261,7 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     methods: tuple[str, ...] = ("context", "full", "paper")
     """What to compare: context, full, paper, an ablation such as no-sa, densify-100, densify-800,
     distill, reggs; or a group of them: ablations, baselines, all."""
-    again: Literal["nothing", "failures", "scores"] = "nothing"
+    rerun: Literal["nothing", "failures", "scores"] = "nothing"
     """What of an earlier run is done once more: cases that failed, or all scores, from the
     predictions that were saved."""
     shard: str | None = None
@@ -272,7 +272,7 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     resolution: Size | None = None
     """What to work at, as `complete` has it. If not given, the resolution of the cases, or for
     scenes that of `complete`."""
-    ignore_masked: bool = False
+    use_masks: bool = False
     """Ignore what masks cover in the photographs, and boxes around what moves: nothing is made of
     it, and it does not count in the scores."""
     one_per_scene: bool = False

@@ -12,6 +12,7 @@ import tyro
 
 from gscompleter.batch.manifest import FOLDER
 from gscompleter.commands.options import CompleteOptions, LiveOptions
+from gscompleter.commands.renamed import new_name
 from gscompleter.commands.words import read_words, sentence_of
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError, quoted
@@ -46,7 +47,7 @@ def options_of(row: Mapping[str, Any], out: Path) -> CompleteOptions:
 def words_of(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """The options of a row as words of a command line, but for the scene."""
     for key, value in row.items():
-        name = f"{prefix}{key}".replace("_", "-")
+        name = new_name(f"{prefix}{key}".replace("_", "-"))
         if name in RESERVED:
             raise InputError(f"A row has no say in '{quoted(name)}'; the batch decides it.")
         if name == FOLDER or value is None:

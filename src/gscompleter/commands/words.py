@@ -17,6 +17,7 @@ from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
 from gscompleter.commands.generator_options import generator_flags
 from gscompleter.commands.options import FOUND
+from gscompleter.commands.renamed import use_new_names
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.errors import InputError, quoted
 
@@ -38,6 +39,7 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
         InputError: where they are wrong, or the config that they name is.
         SystemExit: where they ask for help, which is printed.
     """
+    words = use_new_names(words)
     check_once(words)
     check_command(words, names)
     printed, config = StringIO(), CompleterConfig()

@@ -33,7 +33,7 @@ class OracleSettings(GeneratorSettings):
 class DiffusionSettings(GeneratorSettings):
     """A generator with weights"""
 
-    path: Text | None = None
+    weights: Text | None = None
     """Its weights: a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the Hugging
     Face hub. Without it, the published ones of pe-field; diffusers-inpaint must be told."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 0
@@ -52,7 +52,7 @@ class PEFieldSettings(DiffusionSettings):
     """Where it takes the depth of the photograph from: context, the scene itself; monocular, a
     published network; or the folder or hub id of another one. Left out, it is context, or
     monocular with the settings `paper`."""
-    at_once: Annotated[int, Interval(ge=1, le=1000)] = 4
+    batch_size: Annotated[int, Interval(ge=1, le=1000)] = 4
     """How many targets it denoises together, at most. Fewer need less memory."""
 
 
