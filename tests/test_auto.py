@@ -16,7 +16,17 @@ from gscompleter.geometry import baseline_between
 from scenes import camera_at, photographed
 
 PLACES = ((-0.4, -4), (-0.2, 0), (0.0, 0), (0.3, 4), (0.5, 8))
-QUICK = ("--resolution", 48, "--near", 0.5, "--far", 20, "--config.exploration.side", 32, "--quiet")
+QUICK = (
+    "--resolution",
+    48,
+    "--near",
+    0.5,
+    "--far",
+    20,
+    "--config.next-best-view.image-size",
+    32,
+    "--quiet",
+)
 
 
 @pytest.fixture(scope="module")

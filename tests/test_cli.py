@@ -262,7 +262,12 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--sed", 1), "no option --sed; the nearest is --seed (see gscompleter complete --help)."),
         (("--drop_nonfinit",), "no option --drop_nonfinit; the nearest is --drop-nonfinite (see"),
         (("--qwertz", 1), "Unrecognized options: --qwertz, 1 (see gscompleter complete --help)."),
-        (("--config.registration.stepp", 1), "the nearest is --config.registration.step (see"),
+        (("--config.registration.lr-unitt", 1), "nearest is --config.registration.lr-unit (see"),
+        (
+            ("--config.harm.max-loss", 1),
+            "g --config.harm.max-loss is now called --config.psnr-guard.max-opacity-loss; use",
+        ),
+        (("--config.support.doubts=no",), "called --config.trust (full or photometric); use"),
         (("--device", "tpu"), "invalid choice 'tpu' for argument '--device'."),
         (("--near", "a" * 5000), "aaa…aaa"),
         (("--config",), "Missing value for argument '--config'."),
@@ -345,9 +350,9 @@ def test_single_settings_are_applied_over_those_that_are_named(scene, tmp_path, 
     assert config == replace(paper, registration=replace(paper.registration, iterations=7))
     file = tmp_path / "mine.yaml"
     file.write_text("base: paper\nmargin: 0.1\n")
-    changes = ("--config.harm.tolerance", 0.5, "--config.registration.mask_occluded", "True")
+    changes = ("--config.psnr-guard.max-drop", 0.5, "--config.registration.mask_occluded", "True")
     config = config_of(scene, tmp_path, monkeypatch, f"--config={file}", *changes)
-    assert (config.margin, config.harm.tolerance) == (0.1, 0.5)
+    assert (config.margin, config.psnr_guard.max_drop) == (0.1, 0.5)
     assert config.registration == replace(paper.registration, mask_occluded=True)
 
 
@@ -357,7 +362,7 @@ def test_a_single_setting_reaches_the_completion_and_its_summary(scene, tmp_path
     assert run(monkeypatch, *complete(scene, out, *more)) == 0
     config = json.loads((out / "summary.json").read_text())["settings"]["config"]
     assert config["registration"]["iterations"] == 3
-    assert config["registration"]["affine"]["bridge"] == "none"
+    assert config["alignment"]["align_at"] == "none"
 
 
 def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
@@ -419,7 +424,7 @@ def test_help_knows_every_setting(monkeypatch, capsys):
     said = capsys.readouterr().out
     for kind in GENERATORS.values():
         assert all(f"--generator-{f.name.replace('_', '-')}" in said for f in fields(kind))
-    assert "--config.registration.affine.min-agreement" in said
+    assert "--config.alignment.min-agreement" in said
     assert "How many further seeds are tried" in said
 
 

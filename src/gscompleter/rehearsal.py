@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import torch
 
-from gscompleter.config import SupportConfig
+from gscompleter.config import TrustConfig
 from gscompleter.generators import Request, load_generator
 from gscompleter.interpolation import smoothed
 from gscompleter.kernels.compiled import note_compiled
@@ -63,7 +63,7 @@ def render_with(renderer: str) -> None:
 
 def doubt_brought(_: str) -> None:
     """Ask what supports a scene that was brought, and fit the looks of Gaussians to it."""
-    gaussians, view, config = some_gaussians(), photographs()[0], SupportConfig()
+    gaussians, view, config = some_gaussians(), photographs()[0], TrustConfig()
     looks = gaussians.opacities.clone().requires_grad_(), gaussians.sh.clone().requires_grad_()
     frozen = load_renderer("cpu").freeze(gaussians, view.camera)
     run_by_run(gaussians, [view.camera])

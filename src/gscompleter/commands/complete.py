@@ -246,8 +246,8 @@ def stages_of(options: CompleteOptions) -> CompleterConfig:
     """The settings of the stages, with what has an option of its own."""
     if not options.no_prune:
         return options.config
-    support = replace(options.config.support, keep_unsupported=True)
-    return replace(options.config, support=support)
+    settings = replace(options.config.trust_settings, prune=False)
+    return replace(options.config, trust_settings=settings)
 
 
 def models_of(options: CompleteOptions) -> dict[str, Any]:

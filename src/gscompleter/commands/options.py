@@ -149,8 +149,8 @@ class CompleteOptions(CompletingOptions):
     """Folder for completed.ply, generated.ply, context.ply, targets.json, images/, report.html,
     report.json and summary.json."""
     video: bool = False
-    """Write video.mp4, too: about six seconds on the way through the holes, before and after side by
-    side."""
+    """Write video.mp4, too: about six seconds on the way through the holes, before and after side
+    by side."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from gscompleter.commands.generator_options import generator_flags
 from gscompleter.commands.options import FOUND
 from gscompleter.commands.renamed import use_new_names
 from gscompleter.config import CompleterConfig, load_config
+from gscompleter.config.renamed import refuse_old_options
 from gscompleter.errors import InputError, quoted
 
 NEAR = 0.75
@@ -41,6 +42,7 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
     """
     words = use_new_names(words)
     check_once(words)
+    refuse_old_options(words)
     check_command(words, names)
     printed, config = StringIO(), CompleterConfig()
     read = partial(
