@@ -272,7 +272,7 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         table.add_row(name, "", cell(row["psnr_before"]), cell(row["psnr_after"]), "")
     notes = []
     for row, target in zip(summary["targets"], completion.targets, strict=True):
-        name = name_of(row["frame"], row["near"])
+        name = name_of(row["frame"], row["derived_from"])
         notes += [f"{name}: {note}" for note in target.notes]
         hole = f"{100 * row['hole_fraction']:.1f} %"
         scores = cell(row["psnr_before"]), cell(row["psnr_after"])
@@ -281,8 +281,8 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
     console.print(table)
     for note in notes:
         console.print(note)
-    gains = [row["gain"] for row in summary["context"]]
-    contradicted = {row["frame"]: row["contradicted"] for row in summary["context"]}
+    gains = [row["exposure_gain"] for row in summary["context"]]
+    contradicted = {row["frame"]: row["dynamic_fraction"] for row in summary["context"]}
     carried = left_out(row["ignored"] for row in summary["context"])
     for sentence in filter(None, (exposures(gains), moved(contradicted), carried)):
         console.print(sentence, soft_wrap=True)
