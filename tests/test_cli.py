@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import struct
@@ -419,8 +420,33 @@ def test_old_option_names_of_other_commands_and_of_rows_work_too(tmp_path, capsy
     assert capsys.readouterr().err.count("\n") == 4  # once each
 
 
-def test_help_knows_every_setting(monkeypatch, capsys):
-    assert run(monkeypatch, "complete", "--help") == 0
+SHORT = {"complete": 13, "live": 14, "evaluate": 13, "batch": 9, "clean": 9, "bench": 10}
+"""Options, with those for help, that the help of a command shows."""
+
+
+@pytest.mark.parametrize("command", SHORT)
+def test_help_is_short_and_names_the_option_that_shows_all(monkeypatch, capsys, command):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run(monkeypatch, command, "--help") == 0
+    said = capsys.readouterr().out
+    assert "--help-all" in said
+    assert said.count("\n") < 60
+    assert "None" not in said
+    options = re.findall(r"^\S (?:-h, )?(--[a-z-]+)", said, re.MULTILINE)
+    assert len(options) <= SHORT[command]
+    assert run(monkeypatch, command, "--help-all") == 0
+    full = re.findall(r"^\S (?:-h, )?(--[a-z.-]+)", capsys.readouterr().out, re.MULTILINE)
+    assert set(options) - {"--help-all", "--config"} < set(full)
+
+
+@pytest.mark.parametrize("words", [("--help-all",), ("doctor", "--help-all"), ("-h",)])
+def test_every_command_has_both_kinds_of_help(monkeypatch, capsys, words):
+    assert run(monkeypatch, *words) == 0
+    assert capsys.readouterr().out.startswith("usage: gscompleter")
+
+
+def test_help_all_knows_every_setting(monkeypatch, capsys):
+    assert run(monkeypatch, "complete", "--help-all") == 0
     said = capsys.readouterr().out
     for kind in GENERATORS.values():
         assert all(f"--generator-{f.name.replace('_', '-')}" in said for f in fields(kind))

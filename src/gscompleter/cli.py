@@ -5,11 +5,12 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import select
 import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, TextIO, Union
 
 import tyro
 
@@ -79,20 +80,43 @@ def run() -> None:
     done: list[bool] = []
     # Whatever else is to be done at the end is registered later, and is done before.
     atexit.register(end_at_once, done)
-    main()
+    try:
+        main()
+    except BrokenPipeError:
+        if not is_closed(sys.stdout):
+            raise
+        drop(sys.stdout)
+        sys.exit(1)
     done.append(True)
 
 
 def end_at_once(done: Sequence[bool]) -> None:
     """End the process, where what it was for is `done` and all that it said is written."""
-    if not done:
-        return
-    try:
-        sys.stdout.flush()
-        sys.stderr.flush()
-    except OSError:
-        return  # Nobody listens any more: Python says so as it always does.
-    os._exit(0)
+    code = 0
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            drop(stream)
+            code = 1
+        except OSError:
+            return  # Python reports it.
+    if done:
+        os._exit(code)
+
+
+def is_closed(stream: TextIO) -> bool:
+    """Return True if the reader of a pipe, such as `head`, has ended."""
+    if not hasattr(select, "poll"):  # Windows
+        return False
+    poll = select.poll()
+    poll.register(stream.fileno(), select.POLLOUT)
+    return any(events & select.POLLERR for _, events in poll.poll(0))
+
+
+def drop(stream: TextIO) -> None:
+    """Discard all further output of a stream."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def main() -> None:

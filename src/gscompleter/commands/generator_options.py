@@ -56,14 +56,18 @@ def generator_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
     """How tyro reads GeneratorOptions: by name, and by the settings that any generator knows."""
     if info.type is not GeneratorOptions:
         return None
-    kinds = "; ".join(f"{name}: {kind.__doc__}" for name, kind in GENERATORS.items())
-    sentence = f"What synthesizes the image at a target. {kinds}."
     known: dict[str, list[tuple[str, StructFieldSpec]]] = {}
     for name, kind in GENERATORS.items():
         for spec in specs_of(kind):
             known.setdefault(spec.name, []).append((name, spec))
-    chosen = StructFieldSpec("generator", str, DEFAULT, sentence)
-    return StructConstructorSpec(options_from, (chosen, *map(flag, known.values())))
+    return StructConstructorSpec(options_from, (generator_field(), *map(flag, known.values())))
+
+
+def generator_field() -> StructFieldSpec:
+    """Return the option `--generator`."""
+    kinds = "; ".join(f"{name}: {kind.__doc__}" for name, kind in GENERATORS.items())
+    sentence = f"Model that synthesizes the image at a target. {kinds}."
+    return StructFieldSpec("generator", str, DEFAULT, sentence)
 
 
 def specs_of(kind: type[GeneratorSettings]) -> tuple[StructFieldSpec, ...]:

@@ -22,7 +22,7 @@ Command: Any = Union[  # noqa: UP007  (a command line has several)
     Annotated[CompleteOptions, tyro.conf.subcommand(COMPLETE)],
     Annotated[LiveOptions, tyro.conf.subcommand("live")],
 ]
-RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help")
+RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
 """Options that a batch settles for all of its jobs."""
 YES, NO = ("true", "yes", "1"), ("false", "no", "0", "")
 """What a cell of a CSV says of a flag."""

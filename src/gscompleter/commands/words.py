@@ -16,6 +16,7 @@ import tyro
 from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
 from gscompleter.commands.generator_options import generator_flags
+from gscompleter.commands.help import HELP_ALL, Rule, asks_for_help, rule_for_help
 from gscompleter.commands.options import FOUND
 from gscompleter.commands.renamed import use_new_names
 from gscompleter.config import CompleterConfig, load_config
@@ -41,6 +42,9 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
         SystemExit: where they ask for help, which is printed.
     """
     words = use_new_names(words)
+    show_all = HELP_ALL in words
+    helps = [rule_for_help(show_all)] if asks_for_help(words) else []
+    words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
     refuse_old_options(words)
     check_command(words, names)
@@ -55,7 +59,7 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
     try:
         with redirect_stderr(printed):
             config, words = config_named(auto_counted(words))
-            return read(args=words, registry=registry_from(config))
+            return read(args=words, registry=registry_from(config, *helps))
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -86,7 +90,8 @@ def options_in(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> li
     help_text = StringIO()
     with redirect_stdout(help_text), suppress(SystemExit):
         read([*words[:1], "--help"])
-    return re.findall(r"^[ │]*(?:-h, )?(--[a-z][\w.-]*)", help_text.getvalue(), re.MULTILINE)
+    found = re.findall(r"^[ │]*(?:-h, )?(--[a-z][\w.-]*)", help_text.getvalue(), re.MULTILINE)
+    return [*found, HELP_ALL]
 
 
 def misspelt(words: Sequence[str], options: Sequence[str], names: Collection[str]) -> str | None:
@@ -147,7 +152,7 @@ def config_named(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[str]]:
     return load_config(named.config), others
 
 
-def registry_from(config: CompleterConfig) -> ConstructorRegistry:
+def registry_from(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
     """How tyro reads our classes: a CompleterConfig begins as `config`."""
 
     def config_flags(info: StructTypeInfo) -> Any:
@@ -158,6 +163,8 @@ def registry_from(config: CompleterConfig) -> ConstructorRegistry:
     registry = ConstructorRegistry()
     registry.struct_rule(generator_flags)
     registry.struct_rule(config_flags)
+    for rule in rules:
+        registry.struct_rule(rule)
     return registry
 
 
