@@ -432,10 +432,10 @@ def test_help_is_short_and_names_the_option_that_shows_all(monkeypatch, capsys, 
     assert "--help-all" in said
     assert said.count("\n") < 60
     assert "None" not in said
-    options = re.findall(r"^\S (?:-h, )?(--[a-z-]+)", said, re.MULTILINE)
+    options = re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z-]+)", said, re.MULTILINE)
     assert len(options) <= SHORT[command]
     assert run(monkeypatch, command, "--help-all") == 0
-    full = re.findall(r"^\S (?:-h, )?(--[a-z.-]+)", capsys.readouterr().out, re.MULTILINE)
+    full = re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z.-]+)", capsys.readouterr().out, re.MULTILINE)
     assert set(options) - {"--help-all", "--config"} < set(full)
 
 
