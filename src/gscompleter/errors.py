@@ -1,6 +1,7 @@
 """What the user is told when the input is wrong."""
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -41,6 +42,15 @@ class InputError(ValueError):
 
 class OutputError(InputError):
     """A result cannot be written: nothing else could be written there either."""
+
+
+def warn_deprecated(old: str, new: str) -> None:
+    """Warn the caller of a function that used an old name of the public interface."""
+    warnings.warn(
+        f"{old} is deprecated and stops working in the next release; use {new}.",
+        DeprecationWarning,
+        stacklevel=3,
+    )
 
 
 def quoted(value: object, length: int | None = None) -> str:
