@@ -1,4 +1,4 @@
-"""Options of the command line that have a new name, and the names of the last release."""
+"""Options of the command line with a new name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RENAMED = {
     "again": "rerun",
     "ignore-masked": "use-masks",
 }
-"""Names of the last release with today's. They are accepted for one release."""
+"""Names of the last release with today's; they are accepted for one release."""
 
 
 def use_new_names(words: Sequence[str]) -> list[str]:
@@ -31,7 +31,7 @@ def use_new_name(word: str) -> str:
 
 
 def new_name(name: str) -> str:
-    """Return today's name of an option, written without dashes in front, and warn of an old one."""
+    """Return today's name of an option without dashes, and warn of an old one."""
     new = RENAMED.get(name.replace("_", "-"))
     if new is None:
         return name
@@ -41,7 +41,7 @@ def new_name(name: str) -> str:
 
 @cache
 def warn_of(old: str, new: str) -> None:
-    """Print on stderr, once in a process, that an option has a new name."""
+    """Print once per process that an option has a new name."""
     print(
         f"{PROGRAM}--{old} is now called --{new}; the old name stops working in the next release.",
         file=sys.stderr,

@@ -1,8 +1,4 @@
-"""Settings that are declared once: frozen dataclasses whose annotations say what is allowed.
-
-The command line is derived from them, and pydantic checks them wherever they come from. Nothing
-here needs torch, and pydantic is imported where something is checked.
-"""
+"""Settings as frozen dataclasses with validated annotations. Nothing here needs torch."""
 
 from __future__ import annotations
 
@@ -30,7 +26,7 @@ Seed = Annotated[int, Interval(ge=0, lt=2**62)]
 
 
 class Settings:
-    """What settings have in common: no unknown names, and only finite numbers."""
+    """Base of all settings: no unknown names, finite numbers only."""
 
     __pydantic_config__: ClassVar[Any] = {
         "extra": "forbid",
@@ -40,10 +36,10 @@ class Settings:
 
 
 def checked(settings: S, prefix: str = "") -> S:
-    """`settings`, once each value is seen to be of its type and in its range.
+    """Validate the types and ranges of all values.
 
     Raises:
-        InputError: where one is not. `prefix` and the name of the setting are its argument.
+        InputError: A value is wrong; its argument is `prefix` and the name of the setting.
     """
     from pydantic import TypeAdapter
 
@@ -52,11 +48,10 @@ def checked(settings: S, prefix: str = "") -> S:
 
 
 def updated(settings: S, changes: Mapping[str, Any], where: str = "") -> S:
-    """`settings` with `changes`, a mapping of names in which settings of settings are mappings too.
+    """Apply nested mappings of changes to settings.
 
     Raises:
-        InputError: where a name is unknown, or a value of the wrong type or out of range; it
-            begins with `where` the value stands.
+        InputError: A name is unknown or a value is wrong; the sentence begins with `where`.
     """
     from pydantic import TypeAdapter
 
@@ -67,7 +62,7 @@ def updated(settings: S, changes: Mapping[str, Any], where: str = "") -> S:
 
 @contextmanager
 def told(settings: object, where: str = "", prefix: str = "") -> Iterator[None]:
-    """What pydantic finds wrong with `settings` becomes a sentence."""
+    """Translate pydantic's errors into InputErrors."""
     from pydantic import ValidationError
 
     try:
@@ -79,7 +74,7 @@ def told(settings: object, where: str = "", prefix: str = "") -> Iterator[None]:
 
 
 def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """`values` with `changes`, mappings within mappings alike."""
+    """Merge nested mappings; `changes` win."""
     result = dict(values)
     for name, change in changes.items():
         nested = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
@@ -88,7 +83,7 @@ def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 
 
 def sentence_on(wrong: ErrorDetails, name: str, settings: object) -> str:
-    """What is wrong with the setting called `name`."""
+    """Write the sentence about the setting called `name`."""
     if wrong["type"] == "unexpected_keyword_argument":
         for part in wrong["loc"][:-1]:
             settings = getattr(settings, str(part))
