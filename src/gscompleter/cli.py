@@ -1,4 +1,4 @@
-"""The command line: options in, a command called, errors turned into exit codes."""
+"""Entry point of the command line: options in, a command called, exit codes out."""
 
 from __future__ import annotations
 
@@ -72,10 +72,9 @@ Command: Any = Union[  # noqa: UP007  (of as many as there are)
 
 
 def run() -> None:
-    """What the command `gscompleter` calls: `main`, in a process that is over with it.
+    """Run `main` and end the process at once: the command `gscompleter`.
 
-    Once all is done and said, Python would take back what it holds, torch's operators one by one,
-    which takes a fifth of a second.
+    Python would otherwise take a fifth of a second to free torch's operators.
     """
     done: list[bool] = []
     # Whatever else is to be done at the end is registered later, and is done before.
@@ -91,7 +90,7 @@ def run() -> None:
 
 
 def end_at_once(done: Sequence[bool]) -> None:
-    """End the process, where what it was for is `done` and all that it said is written."""
+    """Flush the output, and end the process if it is `done`."""
     code = 0
     for stream in (sys.stdout, sys.stderr):
         try:
@@ -120,7 +119,7 @@ def drop(stream: TextIO) -> None:
 
 
 def main() -> None:
-    """The command itself. Exit codes: 0 done, 2 the input is wrong, 1 anything else."""
+    """Run a command. Exit codes: 0 done, 2 wrong input, 1 anything else."""
     # Threads of torch that spin while they wait cost a busy machine ten times the work they do.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     words = sys.argv[1:]
@@ -153,5 +152,5 @@ def main() -> None:
 
 
 def parsed(words: Sequence[str]) -> Any:
-    """The options of the command that `words` name; raises as `read_words`."""
+    """Parse the options of the command; raises as `read_words`."""
     return read_words(words, Command, COMMANDS)

@@ -1,4 +1,4 @@
-"""The command `complete`: a scene folder in, a completed scene and its report out."""
+"""The command `complete`: complete a scene and report the result."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ from gscompleter.types import Camera, Completion, View
 
 
 def run_completion(options: CompleteOptions) -> None:
-    """Complete the scene of `options.folder`, write `options.out` and say what was done."""
+    """Complete the scene, and print a summary."""
     with saying_what_stays(options.out):
         if options.dry_run:
             plan_folder(options)
@@ -80,12 +80,7 @@ def run_completion(options: CompleteOptions) -> None:
 
 
 def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completion]:
-    """Complete the scene of `options.folder` and write `options.out`; also returns the summary.
-
-    Raises:
-        InputError: anything about the input that the user can mend; nothing is written then but
-            cameras that were found.
-    """
+    """Complete the scene, write `options.out`, and return the summary."""
     if options.video:
         check_writer()
     console = Console(stderr=True, quiet=options.quiet)
@@ -109,25 +104,20 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
 
 @dataclass(frozen=True)
 class Done:
-    """What was completed, and of what."""
+    """A finished completion and its input."""
 
     opened: Opened
     task: Task
-    """With the targets that it was completed for."""
+    """Task with its final targets."""
     cameras: Mapping[int, Camera]
-    """Those of all photographs that can be used, by their frames, in the frame of the result."""
+    """Cameras of all usable photographs by frame, in the frame of the result."""
     completion: Completion
 
 
 def write_done(
     folder: Path, options: CompleteOptions, done: Done, explorer: Explorer
 ) -> dict[str, Any]:
-    """Write everything into `folder` but the cameras of the targets and the film; returns the
-    summary.
-
-    Raises:
-        InputError: where a file cannot be written.
-    """
+    """Write all results but the targets and the video, and return the summary."""
     task, cameras = done.task, tuple(done.cameras.values())
     said = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
     with meanwhile(looks_around, options, done.completion, cameras, explorer) as looks:
@@ -146,11 +136,7 @@ def write_done(
 
 
 def plan_folder(options: CompleteOptions) -> None:
-    """Show what completing the scene of `options.folder` would do, and write the targets alone.
-
-    Raises:
-        InputError: as `complete_folder`.
-    """
+    """Write the targets and print the plan, without completing the scene."""
     console = Console(stderr=True, quiet=options.quiet)
     with shown_on(None if options.quiet else console):
         opened, task, explorer, _ = prepared(options, console)
@@ -166,11 +152,7 @@ def plan_folder(options: CompleteOptions) -> None:
 def prepared(
     options: CompleteOptions, console: Console
 ) -> tuple[Opened, Task, Explorer, Mapping[str, float]]:
-    """What is opened, what is to be done, by what, and the seconds that it took to find out.
-
-    Raises:
-        InputError: as `complete_folder`.
-    """
+    """Open the scene and load the models; also returns the seconds that this took."""
     check_output(options.out, replaceable(options))
     check_context(options)
     check_targets(options)
@@ -198,7 +180,7 @@ def prepared(
 def with_splat(
     task: Task, path: Path, options: CompleteOptions, opened: Opened, parts: Sequence[str]
 ) -> Task:
-    """`task` with the splat that was brought, once the kernels of these parts are compiled."""
+    """Compile the kernels, and add the input splat to the task."""
     with preparing("reading the scene"):
         task = with_witnesses(task, opened.photographs)
         given = load_splat(path, options.drop_nonfinite)
@@ -214,7 +196,7 @@ def with_splat(
 def said_in_advance(
     options: CompleteOptions, opened: Opened, task: Task, device: str
 ) -> dict[str, Any]:
-    """What `summary.json` says of a completion besides its scores."""
+    """Describe the input and the settings for `summary.json`."""
     auto = None if options.target else most(options)
     targets = {"target": list(options.target), "auto": auto}
     return {
@@ -226,7 +208,7 @@ def said_in_advance(
 
 
 def completer_for(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
-    """The models that the options name, and the settings of the stages."""
+    """Load the models of the options."""
     photographs = [
         View(target.photograph, target.camera, target.frame)
         for target in targets
@@ -243,7 +225,7 @@ def completer_for(options: CompleteOptions, targets: Sequence[Target], device: s
 
 
 def stages_of(options: CompleteOptions) -> CompleterConfig:
-    """The settings of the stages, with what has an option of its own."""
+    """Return the settings, changed by options that have a name of their own."""
     if not options.no_prune:
         return options.config
     settings = replace(options.config.trust_settings, prune=False)
@@ -251,7 +233,7 @@ def stages_of(options: CompleteOptions) -> CompleterConfig:
 
 
 def models_of(options: CompleteOptions) -> dict[str, Any]:
-    """The models that decided the result, for `summary.json`."""
+    """Describe the models for `summary.json`."""
     return {
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
@@ -261,7 +243,7 @@ def models_of(options: CompleteOptions) -> dict[str, Any]:
 
 
 def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOptions) -> None:
-    """Say what was done: a row per camera, and where it lies."""
+    """Print the scores per camera, the notes, and the location of the results."""
 
     def cell(value: float | None) -> str:
         return "–" if value is None else f"{value:.2f}"

@@ -1,4 +1,4 @@
-"""`--generator NAME` and `--generator-SETTING VALUE`, derived from each generator's settings."""
+"""Options `--generator NAME` and `--generator-SETTING VALUE`."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ DEFAULT = "warp-inpaint"
 
 @dataclass(frozen=True)
 class GeneratorOptions:
-    """How the image at a target comes about."""
+    """Choice of the generator."""
 
     name: str = DEFAULT
-    """The generator."""
+    """Name of the generator."""
     given: Mapping[str, Any] = field(default_factory=dict)
-    """Those of its settings that were given."""
+    """Settings that were given."""
 
     def settings(self) -> GeneratorSettings:
-        """The settings of the generator with what was given.
+        """Return the settings of the generator.
 
         Raises:
-            InputError: where there is no such generator, or it knows no such setting.
+            InputError: The generator or one of the settings does not exist.
         """
         kind = settings_class(self.name)
         for setting, value in self.given.items():
@@ -47,13 +47,13 @@ class GeneratorOptions:
         return kind(**self.given)
 
     def as_summary(self) -> dict[str, Any]:
-        """The generator and all its settings, for `summary.json`."""
+        """Describe the generator for `summary.json`."""
         settings = asdict(self.settings())
         return {"generator": self.name, **{PREFIX + name: settings[name] for name in settings}}
 
 
 def generator_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """How tyro reads GeneratorOptions: by name, and by the settings that any generator knows."""
+    """Tell tyro to read GeneratorOptions as the union of all generators' settings."""
     if info.type is not GeneratorOptions:
         return None
     known: dict[str, list[tuple[str, StructFieldSpec]]] = {}
@@ -65,23 +65,22 @@ def generator_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 def generator_field() -> StructFieldSpec:
     """Return the option `--generator`."""
-    kinds = "; ".join(f"{name}: {kind.__doc__}" for name, kind in GENERATORS.items())
+    kinds = "; ".join(
+        f"{name}: {(kind.__doc__ or '').rstrip('.')}" for name, kind in GENERATORS.items()
+    )
     sentence = f"Model that synthesizes the image at a target. {kinds}."
     return StructFieldSpec("generator", str, DEFAULT, sentence)
 
 
 def specs_of(kind: type[GeneratorSettings]) -> tuple[StructFieldSpec, ...]:
-    """Name, type, default and sentence of each setting of a class."""
+    """Return the fields of a class of settings."""
     spec = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(kind, kind(), False))
     assert isinstance(spec, StructConstructorSpec)
     return spec.fields
 
 
 def flag(known: Sequence[tuple[str, StructFieldSpec]]) -> StructFieldSpec:
-    """The flag for a setting. Each generator that knows it has a sentence and a default of its own.
-
-    The flag's own default is None, or False for a switch, which leaves it to the generator.
-    """
+    """Merge the fields of several generators with one name into one optional option."""
     first = known[0][1]
     sentences: dict[str, list[str]] = {}
     for name, spec in known:
@@ -98,7 +97,7 @@ def flag(known: Sequence[tuple[str, StructFieldSpec]]) -> StructFieldSpec:
 
 
 def options_from(generator: str, **values: Any) -> GeneratorOptions:
-    """The options with those values that were given."""
+    """Create the options from those values that were given."""
     given = {
         name.removeprefix(PREFIX): value
         for name, value in values.items()

@@ -73,6 +73,7 @@ class ModelOptions(RunOptions):
 
     @property
     def models(self) -> tuple[str, ...]:
+        """Names of the models in use."""
         return self.reconstructor, self.synthesis.name
 
 
@@ -203,6 +204,7 @@ class DemoOptions(RunOptions):
 
     @property
     def models(self) -> tuple[str, ...]:
+        """Names of the models in use."""
         return ModelOptions().models
 
 

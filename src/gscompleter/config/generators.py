@@ -21,12 +21,12 @@ class GeneratorSettings(Settings):
 
 @dataclass(frozen=True)
 class WarpInpaintSettings(GeneratorSettings):
-    """photographs warped to the target, holes filled with patches; needs no weights"""
+    """Photographs warped to the target, with holes filled by patches (needs no weights)."""
 
 
 @dataclass(frozen=True)
 class OracleSettings(GeneratorSettings):
-    """the real photograph of the target, for measurements"""
+    """The real photograph of the target, for measurements."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class DiffusionSettings(GeneratorSettings):
 
 @dataclass(frozen=True)
 class PEFieldSettings(DiffusionSettings):
-    """the paper's diffusion transformer"""
+    """The paper's diffusion transformer."""
 
     steps: Steps = 4
     """Denoising steps. The paper uses 4, its authors' demo 28."""
@@ -58,7 +58,7 @@ class PEFieldSettings(DiffusionSettings):
 
 @dataclass(frozen=True)
 class DiffusersInpaintSettings(DiffusionSettings):
-    """any inpainting pipeline of diffusers"""
+    """Any inpainting pipeline of diffusers."""
 
     steps: Steps | None = None
     """Denoising steps; the pipeline's own number if not given."""
