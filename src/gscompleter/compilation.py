@@ -21,7 +21,6 @@ BROUGHT = "brought"
 DRAWING = "cpu", BROUGHT
 """Parts that one process compiles while another compiles the rest."""
 MODELS = "warp-inpaint", "plane-sweep"
-"""Parts of the default models, which also render."""
 PARTS = *DRAWING, *MODELS
 """All parts with kernels, in the order of compilation."""
 
@@ -36,13 +35,11 @@ with staying():
 """Program of the second process. numba compiles a tenth faster in the block."""
 
 COMPILING = "compiling kernels for this machine, once"
-"""Name of the stage in the progress line."""
 SECONDS = 30
 """Approximate seconds for all parts on one core."""
 
 Process = subprocess.Popen[bytes]
 _begun: dict[str, Process] = {}
-"""Running process of each part that was started early."""
 
 
 def begin(names: Iterable[str]) -> None:
@@ -63,14 +60,7 @@ def begin(names: Iterable[str]) -> None:
 
 
 def compile_kernels(names: Sequence[str]) -> float | None:
-    """Compile the missing kernels of these parts.
-
-    Returns:
-        Seconds, or None if nothing was missing.
-
-    Raises:
-        subprocess.CalledProcessError: The other process failed and printed the reason.
-    """
+    """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
     from gscompleter.kernels.compiled import is_compiled
     from gscompleter.progress import expecting, stage
 

@@ -18,7 +18,6 @@ LONGEST_PATH = 250
 """Most characters of a quoted path."""
 
 POINTER = b"version https://git-lfs"
-"""First bytes of a git-lfs pointer."""
 
 
 class InputError(ValueError):
@@ -104,11 +103,7 @@ def numbers_listed(numbers: Iterable[int]) -> str:
 
 
 def refuse_pointer(path: Path) -> None:
-    """Refuse a git-lfs pointer in place of the file itself.
-
-    Raises:
-        InputError: The file is such a pointer.
-    """
+    """Raise InputError for a git-lfs pointer in place of the file itself."""
     if not os.path.isfile(path):
         return
     with suppress(OSError), path.open("rb") as file:
@@ -126,7 +121,6 @@ _REPR.maxlong = 4 * LONGEST_QUOTE
 
 
 def _written(value: object) -> str:
-    """Format a value like `repr`, shortened."""
     if isinstance(value, int) and value.bit_length() > 4 * LONGEST_QUOTE:
         return f"an integer of about {value.bit_length() * 0.30103:,.0f} digits"
     try:

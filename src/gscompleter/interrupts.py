@@ -23,13 +23,9 @@ def treat_stops_alike() -> None:
 
 @contextmanager
 def stops_deferred(state: str = "") -> Iterator[None]:
-    """Defer KeyboardInterrupt to the end of the block, to keep several steps together.
+    """Defer KeyboardInterrupt to the end of the block, in the main thread.
 
-    Outside the main thread it does nothing. `state` is the message of the interrupt, if it differs
-    from the usual one.
-
-    Raises:
-        KeyboardInterrupt: A signal arrived during the block.
+    `state` is its message, if it differs from the usual one.
     """
     came: list[int] = []
 

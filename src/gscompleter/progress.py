@@ -21,9 +21,7 @@ T = TypeVar("T")
 LOG_SECONDS = 10.0
 """Seconds between log lines of a long stage."""
 REFRESHES = 4
-"""Refreshes of the live line per second."""
 BAR_WIDTH = 24
-"""Width of the bar, in characters."""
 OVERDUE = 0.1
 """Remaining share of the elapsed time if a stage takes longer than expected."""
 
@@ -36,7 +34,6 @@ class Activity:
     total: int | None = None
     """Number of steps; None for a stage."""
     done: int = 0
-    """Finished steps."""
     prepares: bool = False
     """True if a log shows it only if it takes long."""
     begun: float = field(default_factory=lambda: time.monotonic())
@@ -72,9 +69,7 @@ class Work:
     is_timed: bool = True
     """True if these are seconds; otherwise relative times."""
     position: int = 0
-    """Number of finished expected stages."""
     planned: Activity | None = None
-    """Current expected stage."""
     begun: float = 0.0
     """Start of the expected stages, in seconds."""
     pace: float = 1.0

@@ -101,7 +101,6 @@ PARTS: dict[str, Callable[[str], None]] = {
     "warp-inpaint": synthesize_with,
     "plane-sweep": reconstruct_with,
 }
-"""Function of each part."""
 
 
 def rehearse(name: str) -> None:

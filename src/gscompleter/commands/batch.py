@@ -52,9 +52,7 @@ class Counts:
 
     done: int
     failed: int
-    """Jobs of this call whose row records a failure."""
     skipped: int
-    """Jobs that had a row before."""
     skipped_failed: int = 0
     """Skipped jobs whose row records a failure."""
 
@@ -148,7 +146,6 @@ class CompletingJob:
     """A callable that completes the scene of a job, in any process."""
 
     out: str
-    """Folder of the batch."""
     retries: int
 
     def __call__(self, job: Job) -> Outcome:
@@ -160,10 +157,7 @@ class CompletingJob:
 
 
 def completed(job: Job, place: Place) -> dict[str, Any]:
-    """Complete the scene of a job and return its row.
-
-    Models with weights are loaded once per worker.
-    """
+    """Complete the scene of a job and return its row."""
     import warnings
 
     from gscompleter.batch.costs import metered

@@ -47,7 +47,6 @@ from gscompleter.runs.methods import Models
 BEYOND = (1.0, 1.25, 1.5, 1.75)
 """Distances of the demo's targets from its two cameras, in baselines."""
 QUICK_ITERATIONS = 2
-"""Iterations of the baselines with `--quick`."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +229,6 @@ def case_tasks(bench: Bench, names: dict[BenchCase, str]) -> list[Task]:
 
 
 METHOD = "method "
-"""Prefix of the tasks of methods."""
 
 
 def method_tasks(bench: Bench, case: BenchCase) -> list[Task]:

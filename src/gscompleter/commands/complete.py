@@ -108,7 +108,6 @@ class Done:
 
     opened: Opened
     task: Task
-    """Task with its final targets."""
     cameras: Mapping[int, Camera]
     """Cameras of all usable photographs by frame, in the frame of the result."""
     completion: Completion

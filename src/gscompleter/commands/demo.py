@@ -27,9 +27,7 @@ PRINCIPAL_POINT_DX_PX = 31.086
 """Offset of the right image's principal point, in pixels."""
 BASELINE_M = 0.193001
 BEYOND = 1.0
-"""Distance of the targets from the two cameras, in baselines."""
 RESOLUTION = (250, 370)
-"""Half the size of the photographs."""
 
 
 def motorcycle_cameras(width: int, height: int) -> tuple[Camera, Camera]:

@@ -14,7 +14,6 @@ if TYPE_CHECKING:  # every command reads this file, and only this one needs it
     from packaging.requirements import Requirement
 
 DISTRIBUTION = "gscompleter"
-"""Name of the package on PyPI."""
 
 PURPOSES = {
     "cuda": "rendering on an NVIDIA GPU",
@@ -50,7 +49,6 @@ class Found:
     """One line of the result."""
 
     kind: str
-    """Heading of the line."""
     name: str
     there: bool
     told: str

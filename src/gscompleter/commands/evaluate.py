@@ -101,8 +101,7 @@ def run_tables(options: TablesOptions) -> None:
 def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> None:
     """Write the tables, plots and page of an evaluation, and print the tables unless `quiet`.
 
-    It repeats this while other shards add rows and `num_rows` rows are there, so that of shards
-    that finish together the last one writes complete tables.
+    It repeats this if other shards added rows meanwhile and all `num_rows` are there.
     """
     seen, there = None, rows_there(out)
     while seen is None or (there != seen and len(there) >= num_rows):

@@ -13,7 +13,6 @@ from gscompleter.reports.film import FRAMES, MAX_SIDE, MIN_WIDTH
 from gscompleter.types import View
 
 FINDING = 1.0
-"""Seconds to find a target."""
 REPORT = 1.0
 """Seconds to write scenes, pictures and the page, without `REPORT_PER_PIXEL`."""
 REPORT_PER_PIXEL = 3e-6

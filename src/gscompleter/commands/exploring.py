@@ -34,13 +34,11 @@ class Plan:
     """Targets and the estimated time of a completion."""
 
     task: Task
-    """Task with the planned targets."""
     holes: tuple[float, ...]
     """Hole fraction of each target, after completion of the previous ones."""
     seconds: float | None
     """Estimated seconds per target, or None if unknown."""
     context_seconds: float
-    """Seconds of the context."""
 
 
 def cameras_of(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:

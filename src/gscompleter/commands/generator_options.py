@@ -25,16 +25,10 @@ class GeneratorOptions:
     """Choice of the generator."""
 
     name: str = DEFAULT
-    """Name of the generator."""
     given: Mapping[str, Any] = field(default_factory=dict)
-    """Settings that were given."""
 
     def settings(self) -> GeneratorSettings:
-        """Return the settings of the generator.
-
-        Raises:
-            InputError: The generator or one of the settings does not exist.
-        """
+        """Return the settings, or raise InputError if one is unknown to the generator."""
         kind = settings_class(self.name)
         for setting, value in self.given.items():
             knowing = [name for name, kind in GENERATORS.items() if hasattr(kind, setting)]

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 SHOWN = 40
 """Most photographs on the page, in addition to the context."""
 THUMBNAIL = 160
-"""Longer side of these photographs, in pixels."""
 CLASSIC = (
     "The page renders antialiased Gaussians as classic ones, small ones too opaque; what is saved "
     "is right, and `view` shows it as it is."
@@ -52,14 +51,12 @@ class Prepared:
     """Everything that is loaded before the first completion."""
 
     options: CompleteOptions
-    """Options as for `complete`, with the frames of the context."""
     opened: Opened
     task: Task
     explorer: Explorer
     cameras: Mapping[int, Camera]
     """Cameras of all usable photographs by frame, in the frame of the result."""
     seconds: Mapping[str, float]
-    """Seconds of the preparation."""
 
 
 def run_live(options: LiveOptions) -> None:

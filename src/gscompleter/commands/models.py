@@ -15,7 +15,6 @@ from gscompleter.weights.fetching import INSTALL, cached, hub_is_installed, plac
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
 WIDEST = 1000
-"""Characters per line without a terminal."""
 
 
 def run_models(options: ModelsOptions) -> None:

@@ -52,9 +52,7 @@ from gscompleter.types import Camera, Gaussians, View
 MIN_SIZE = 16
 """Smallest side of an image, in pixels."""
 SPLATS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
-"""File extensions of splats."""
 MAX_DIGITS = 9
-"""Most digits of a frame number."""
 CHOSEN, CHOSEN_WITH_SCENE = 3, 8
 """Number of context photographs if none are named, without and with an input splat."""
 CHOSEN_FOR_ALL = 8
@@ -71,7 +69,6 @@ class Opened:
 
     photographs: Photographs
     format: str
-    """Name of the format, or `photographs` if the cameras had to be found."""
     number: int
     """Number of photographs, with those whose camera was not found."""
 
@@ -85,9 +82,7 @@ class ContextBudget:
     """Number of context photographs if none are named."""
 
     usable: int
-    """Usable photographs."""
     wanted: int
-    """Default number."""
     allowed: int
     """The default number, limited by memory but never below the minimum."""
 
@@ -114,9 +109,7 @@ class Task:
     scene: Gaussians | None = None
     """Input splat, or None to reconstruct the context."""
     brought: Brought | None = None
-    """File of the input splat."""
     method: str = "given"
-    """Method that found the frame."""
     said: str = "the frame of the photographs"
     """Description of `method` for the user."""
     witnesses: Sequence[View] | None = None

@@ -69,7 +69,6 @@ class ModelOptions(RunOptions):
     weights: Path | None = None
     """Weights file of the reconstructor; downloaded if not given."""
     synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
-    """Synthesis of the target image."""
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -86,14 +85,11 @@ class SceneOptions(ComputeOptions):
     PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
     them and they are kept in OUT/colmap."""
     context: tuple[Frame, ...] | None = None
-    """Frame numbers of the photographs to work with, counted in the order of their file paths."""
     out: Path
-    """Output folder."""
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
     mmdet3d, pandaset, chunks or real-estate-10k. Detected if not given."""
     scene: Path | None
-    """File of Gaussians."""
     resolution: Size = LONG_SIDE
     """Working size: the longest side in pixels (photographs are never enlarged), or height and
     width (photographs are scaled and cropped), or `full`."""
@@ -186,7 +182,6 @@ class CleanOptions(SceneOptions):
     device: Device = "auto"
     """Device to compute on."""
     config: CleaningConfig = CleaningConfig()
-    """Settings of the cleaning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,7 +208,6 @@ class EngineOptions(Options):
     """Options of every command that can run on several machines."""
 
     engine: EngineName | None
-    """Engine that runs the jobs."""
     workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
     """Number of workers; as many as fit if not given (one with SLURM)."""
     threads: Annotated[int, Interval(ge=1, le=1024)] | None = None

@@ -29,7 +29,7 @@ YES, NO = ("true", "yes", "1"), ("false", "no", "0", "")
 
 
 def options_of(row: Mapping[str, Any], out: Path) -> CompleteOptions:
-    """Parse a row; `out` is the output folder."""
+    """Parse a row, or raise InputError; `out` is the output folder."""
     if not isinstance(row.get(FOLDER), str):
         raise InputError("The row has no folder; give it the folder of a scene.")
     words = [COMPLETE, row[FOLDER], *words_of(row), "--out", str(out), "--overwrite", "--quiet"]

@@ -21,9 +21,7 @@ TOLD = {
     "splat": "by the splat",
     "features": "by matched features",
 }
-"""Descriptions of the sources of a depth range."""
 MAX_NAMED = 8
-"""Most frames that a line names."""
 SECONDS_PER_PIXEL = 2e-5
 """Seconds of `plane-sweep` per pixel on two cores of 2.8 GHz. Measured: 18 to 24 µs from 256 x 256
 to 427 x 640 pixels (docs/performance.md)."""

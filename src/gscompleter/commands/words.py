@@ -37,9 +37,7 @@ def sentence_of(error: InputError) -> str:
 def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> Any:
     """Parse a command line into one of the option classes of the union `command`.
 
-    Raises:
-        InputError: An option or the config is wrong.
-        SystemExit: Help was requested and is printed.
+    It raises InputError for wrong words, and SystemExit after printing the help.
     """
     words = use_new_names(words)
     show_all = HELP_ALL in words

@@ -20,7 +20,7 @@ Memory = Annotated[float, Interval(ge=0, lt=1)]
 
 @dataclass(frozen=True)
 class SynthesisConfig(Settings):
-    """Settings of generators with weights; other generators ignore them."""
+    """Synthesis of the target image by generators with weights; others ignore it."""
 
     correct_color: bool = True
     """Match the colours of the synthesized image to those of the photographs (not in the paper)."""
@@ -135,10 +135,7 @@ class HoleConfig(Settings):
 
 @dataclass(frozen=True)
 class DynamicMasksConfig(Settings):
-    """Detection of regions that moved between photographs.
-
-    Nothing is completed from these regions. A scene given by the user is not checked.
-    """
+    """Detection of regions that moved between photographs; not for an input splat."""
 
     min_color_difference: Annotated[float, Interval(gt=0, le=1)] | None = 0.12
     """Colour difference, in [0, 1], above which two photographs of a surface show different
@@ -147,7 +144,7 @@ class DynamicMasksConfig(Settings):
 
 @dataclass(frozen=True)
 class TrustConfig(Settings):
-    """Photometric trust in the Gaussians of a given scene, used if `trust` is photometric."""
+    """Photometric trust in the Gaussians of an input splat."""
 
     color_sigma: Annotated[float, Interval(gt=0, le=1)] = 0.08
     """Colour difference from a photograph, in [0, 1], at which trust drops to 1/e. It grows with
@@ -179,10 +176,7 @@ class RefineConfig(Settings):
 
 @dataclass(frozen=True)
 class ReconcileConfig(Settings):
-    """Refinement of added Gaussians against all photographs of a given scene.
-
-    It replaces `RefineConfig` if `trust` is photometric.
-    """
+    """Refinement against all photographs of an input splat, if `trust` is photometric."""
 
     iterations: Count = 60
     """Iterations of Adam; 0 keeps the lifted colours and opacities."""
@@ -260,34 +254,21 @@ class CompleterConfig(Settings):
     """Ignore image regions that stay the same while the camera moves, such as the bonnet of the
     car that carries it (paper: use all pixels)."""
     trust: Literal["full", "photometric"] = "photometric"
-    """Trust in a scene given with `--scene`: `photometric` counts a Gaussian as far as photographs
-    confirm it, `full` takes the scene as it is (paper)."""
+    """Trust in the splat of `--scene`: `photometric` counts a Gaussian as far as photographs
+    confirm it, `full` takes all as they are (paper)."""
     synthesis: SynthesisConfig = SynthesisConfig()
-    """Synthesis of the target image."""
     anchor: AnchorConfig = AnchorConfig()
-    """Choice of the photograph for the stereo pair."""
     alignment: AlignmentConfig = AlignmentConfig()
-    """Affine alignment of the lifted depths."""
     depth_agreement: DepthAgreementConfig = DepthAgreementConfig()
-    """Rejection of targets whose depths disagree with the scene."""
     registration: RegistrationConfig = RegistrationConfig()
-    """Registration of the lifted Gaussians along their rays."""
     free_space: FreeSpaceConfig = FreeSpaceConfig()
-    """Removal of new Gaussians from space that photographs show to be empty."""
     holes: HoleConfig = HoleConfig()
-    """Definition of the hole mask."""
     dynamic_masks: DynamicMasksConfig = DynamicMasksConfig()
-    """Detection of regions that moved between photographs."""
     trust_settings: TrustConfig = TrustConfig()
-    """Photometric trust in a given scene."""
     refine: RefineConfig = RefineConfig()
-    """Refinement of the opacities of added Gaussians."""
     reconcile: ReconcileConfig = ReconcileConfig()
-    """Refinement against all photographs of a given scene."""
     psnr_guard: PsnrGuardConfig = PsnrGuardConfig()
-    """Error budget of the photographs."""
     next_best_view: NextBestViewConfig = NextBestViewConfig()
-    """Search for target cameras."""
 
     @staticmethod
     def paper() -> CompleterConfig:

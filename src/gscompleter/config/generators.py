@@ -75,11 +75,7 @@ GENERATORS: dict[str, type[GeneratorSettings]] = {
 
 
 def settings_class(name: str) -> type[GeneratorSettings]:
-    """Return the class of a generator's settings.
-
-    Raises:
-        InputError: The name is unknown.
-    """
+    """Return the class of a generator's settings, or raise InputError for an unknown name."""
     if name not in GENERATORS:
         raise InputError(
             f"There is no generator '{quoted(name)}'; choose one of {', '.join(GENERATORS)}.",

@@ -36,11 +36,7 @@ class Settings:
 
 
 def checked(settings: S, prefix: str = "") -> S:
-    """Validate the types and ranges of all values.
-
-    Raises:
-        InputError: A value is wrong; its argument is `prefix` and the name of the setting.
-    """
+    """Validate types and ranges; InputErrors name `prefix` and the setting as their argument."""
     from pydantic import TypeAdapter
 
     with told(settings, prefix=prefix):
@@ -48,11 +44,7 @@ def checked(settings: S, prefix: str = "") -> S:
 
 
 def updated(settings: S, changes: Mapping[str, Any], where: str = "") -> S:
-    """Apply nested mappings of changes to settings.
-
-    Raises:
-        InputError: A name is unknown or a value is wrong; the sentence begins with `where`.
-    """
+    """Apply nested changes; the sentences of InputErrors begin with `where`."""
     from pydantic import TypeAdapter
 
     text = json.dumps(merged(asdict(settings), changes))  # type: ignore[call-overload]

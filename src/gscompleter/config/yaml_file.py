@@ -28,11 +28,7 @@ class PlainLoader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read the mapping of a YAML file, limited to JSON values.
-
-    Raises:
-        InputError: The file cannot be read, is too long, or is not such a mapping.
-    """
+    """Read the mapping in a YAML file, limited to JSON values, or raise InputError."""
     name, data = f"The config {quoted(path)}", read_bytes(path, LONGEST_FILE)
     try:
         content = json.loads(json.dumps(yaml.load(data.decode(), PlainLoader), default=str))
