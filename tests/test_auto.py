@@ -16,7 +16,17 @@ from gscompleter.geometry import baseline_between
 from scenes import camera_at, photographed
 
 PLACES = ((-0.4, -4), (-0.2, 0), (0.0, 0), (0.3, 4), (0.5, 8))
-QUICK = ("--resolution", 48, "--near", 0.5, "--far", 20, "--config.exploration.side", 32, "--quiet")
+QUICK = (
+    "--resolution",
+    48,
+    "--near",
+    0.5,
+    "--far",
+    20,
+    "--config.next-best-view.image-size",
+    32,
+    "--quiet",
+)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +53,7 @@ def test_without_a_target_cameras_are_found_and_completed(completed):
     assert 1 <= len(summary["targets"]) <= 2
     for target in summary["targets"]:
         assert target["frame"] is None
-        assert target["near"] in range(len(PLACES))
+        assert target["derived_from"] in range(len(PLACES))
         assert target["hole_fraction"] > 0.01
         assert target["psnr_after"] is None
     assert summary["gaussians"]["added"] > 0
@@ -67,7 +77,7 @@ def test_the_cameras_stand_beside_the_photographs_they_were_derived_from(scene, 
     assert len(found) == len(rows)
     for camera, row in zip(found, rows, strict=True):
         assert (camera.width, camera.height) == (48, 48)
-        assert baseline_between(camera, photographs.camera(row["near"], 48)) < 0.5
+        assert baseline_between(camera, photographs.camera(row["derived_from"], 48)) < 0.5
 
 
 def test_a_dry_run_writes_the_cameras_alone_and_shows_them(scene, tmp_path, monkeypatch, capsys):
@@ -95,7 +105,7 @@ def test_a_plan_begins_as_the_completion_and_can_be_given_back(
     (taken,) = load_cameras(out / "targets.json")
     assert torch.equal(planned.c2w, taken.c2w)
     summary = summary_of(out)
-    assert summary["targets"][0]["near"] is None
+    assert summary["targets"][0]["derived_from"] is None
     assert summary["coverage"]["after"] > summary["coverage"]["before"]
 
 

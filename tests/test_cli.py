@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import struct
@@ -21,6 +22,8 @@ import torch
 from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.cli import parsed
+from gscompleter.commands.renamed import warn_of
+from gscompleter.commands.row_options import options_of
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import (
     GENERATORS,
@@ -87,10 +90,10 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
     scores = {"psnr_before", "psnr_after", "ssim_before", "ssim_after"}
     assert [row["frame"] for row in summary["context"]] == [0, 1]
     assert all(
-        set(row) == {"frame", "gain", "contradicted", "ignored", *scores}
+        set(row) == {"frame", "exposure_gain", "dynamic_fraction", "ignored", *scores}
         for row in summary["context"]
     )
-    assert all(row["gain"] is None for row in summary["context"])  # two stay as they were taken
+    assert all(row["exposure_gain"] is None for row in summary["context"])  # as they were taken
     (target,) = summary["targets"]
     assert set(target) >= {"frame", "anchor", "anchor_fallback", "hole_fraction", "affine", *scores}
     assert (target["frame"], target["anchor"], target["anchor_fallback"]) == (2, 0, False)
@@ -260,7 +263,12 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--sed", 1), "no option --sed; the nearest is --seed (see gscompleter complete --help)."),
         (("--drop_nonfinit",), "no option --drop_nonfinit; the nearest is --drop-nonfinite (see"),
         (("--qwertz", 1), "Unrecognized options: --qwertz, 1 (see gscompleter complete --help)."),
-        (("--config.registration.stepp", 1), "the nearest is --config.registration.step (see"),
+        (("--config.registration.lr-unitt", 1), "nearest is --config.registration.lr-unit (see"),
+        (
+            ("--config.harm.max-loss", 1),
+            "g --config.harm.max-loss is now called --config.psnr-guard.max-opacity-loss; use",
+        ),
+        (("--config.support.doubts=no",), "called --config.trust (full or photometric); use"),
         (("--device", "tpu"), "invalid choice 'tpu' for argument '--device'."),
         (("--near", "a" * 5000), "aaa…aaa"),
         (("--config",), "Missing value for argument '--config'."),
@@ -343,9 +351,9 @@ def test_single_settings_are_applied_over_those_that_are_named(scene, tmp_path, 
     assert config == replace(paper, registration=replace(paper.registration, iterations=7))
     file = tmp_path / "mine.yaml"
     file.write_text("base: paper\nmargin: 0.1\n")
-    changes = ("--config.harm.tolerance", 0.5, "--config.registration.mask_occluded", "True")
+    changes = ("--config.psnr-guard.max-drop", 0.5, "--config.registration.mask_occluded", "True")
     config = config_of(scene, tmp_path, monkeypatch, f"--config={file}", *changes)
-    assert (config.margin, config.harm.tolerance) == (0.1, 0.5)
+    assert (config.margin, config.psnr_guard.max_drop) == (0.1, 0.5)
     assert config.registration == replace(paper.registration, mask_occluded=True)
 
 
@@ -355,12 +363,19 @@ def test_a_single_setting_reaches_the_completion_and_its_summary(scene, tmp_path
     assert run(monkeypatch, *complete(scene, out, *more)) == 0
     config = json.loads((out / "summary.json").read_text())["settings"]["config"]
     assert config["registration"]["iterations"] == 3
-    assert config["registration"]["affine"]["bridge"] == "none"
+    assert config["alignment"]["align_at"] == "none"
 
 
 def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
-    words = ("--generator", "pe-field", "--generator-path", "a/b", "--generator-steps", 8)
-    words += ("--generator-retries", 2, "--generator-depth", "monocular", "--generator-at-once", 3)
+    words = ("--generator", "pe-field", "--generator-weights", "a/b", "--generator-steps", 8)
+    words += (
+        "--generator-retries",
+        2,
+        "--generator-depth",
+        "monocular",
+        "--generator-batch-size",
+        3,
+    )
     options = parsed([str(w) for w in complete(scene, tmp_path, *words, "--generator-offload")])
     assert options.synthesis.settings() == PEFieldSettings("a/b", 2, True, 8, "monocular", 3)
     words = ("--generator", "diffusers-inpaint", "--generator-prompt", "a quiet street")
@@ -370,12 +385,72 @@ def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
     assert options.synthesis.settings() == WarpInpaintSettings()
 
 
-def test_help_knows_every_setting(monkeypatch, capsys):
-    assert run(monkeypatch, "complete", "--help") == 0
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (("--keep-unsupported",), ("--no-prune",)),
+        (("--keep_unsupported",), ("--no-prune",)),
+        (("--film",), ("--video",)),
+        (("--generator-path", "a/b"), ("--generator-weights", "a/b")),
+        (("--generator-path=a/b",), ("--generator-weights", "a/b")),
+        (("--generator-at-once", 3), ("--generator-batch-size", 3)),
+    ],
+)
+def test_an_old_option_name_works_and_a_line_names_the_new_one(scene, tmp_path, capsys, old, new):
+    warn_of.cache_clear()
+    more = ("--generator", "pe-field")
+    options = [parsed(list(map(str, complete(scene, tmp_path, *more, *o)))) for o in (old, new)]
+    assert options[0] == options[1]
+    name = old[0].split("=")[0].replace("_", "-")
+    assert capsys.readouterr().err == (
+        f"gscompleter: {name} is now called {new[0]}; the old name stops working in the next "
+        "release.\n"
+    )
+
+
+def test_old_option_names_of_other_commands_and_of_rows_work_too(tmp_path, capsys):
+    warn_of.cache_clear()
+    words = ["evaluate", "cases.json", "--out", "o", "--again", "scores", "--ignore-masked"]
+    options = parsed(words)
+    assert (options.rerun, options.use_masks) == ("scores", True)
+    assert parsed(["batch", "m.csv", "--out", "o", "--again", "failures"]).rerun == "failures"
+    row = {"folder": "scene", "keep_unsupported": "true", "film": "no"}
+    options = options_of(row, tmp_path)
+    assert (options.no_prune, options.video) == (True, False)
+    assert capsys.readouterr().err.count("\n") == 4  # once each
+
+
+SHORT = {"complete": 13, "live": 14, "evaluate": 13, "batch": 9, "clean": 9, "bench": 10}
+"""Options, with those for help, that the help of a command shows."""
+
+
+@pytest.mark.parametrize("command", SHORT)
+def test_help_is_short_and_names_the_option_that_shows_all(monkeypatch, capsys, command):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run(monkeypatch, command, "--help") == 0
+    said = capsys.readouterr().out
+    assert "--help-all" in said
+    assert said.count("\n") < 60
+    assert "None" not in said
+    options = re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z-]+)", said, re.MULTILINE)
+    assert len(options) <= SHORT[command]
+    assert run(monkeypatch, command, "--help-all") == 0
+    full = re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z.-]+)", capsys.readouterr().out, re.MULTILINE)
+    assert set(options) - {"--help-all", "--config"} < set(full)
+
+
+@pytest.mark.parametrize("words", [("--help-all",), ("doctor", "--help-all"), ("-h",)])
+def test_every_command_has_both_kinds_of_help(monkeypatch, capsys, words):
+    assert run(monkeypatch, *words) == 0
+    assert capsys.readouterr().out.startswith("usage: gscompleter")
+
+
+def test_help_all_knows_every_setting(monkeypatch, capsys):
+    assert run(monkeypatch, "complete", "--help-all") == 0
     said = capsys.readouterr().out
     for kind in GENERATORS.values():
         assert all(f"--generator-{f.name.replace('_', '-')}" in said for f in fields(kind))
-    assert "--config.registration.affine.min-agreement" in said
+    assert "--config.alignment.min-agreement" in said
     assert "How many further seeds are tried" in said
 
 

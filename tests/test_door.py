@@ -187,7 +187,7 @@ def test_too_few_photographs_beside_the_targets_are_refused(scene, tmp_path, mon
     ) in capsys.readouterr().err
 
 
-SMALL = ("--resolution", 32, "--config.reconcile.iterations", 10, "--quiet", "--keep-unsupported")
+SMALL = ("--resolution", 32, "--config.reconcile.iterations", 10, "--quiet", "--no-prune")
 """Where what is completed matters less than that it is."""
 
 

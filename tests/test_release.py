@@ -144,7 +144,7 @@ def test_doctor_tells_of_what_is_missing_and_for_what(monkeypatch, capsys):
     found = {(one["kind"], one["name"]): one for one in json.loads(capsys.readouterr().out)}
     assert found["packages", "numpy"]["there"]
     assert not found["extras", "film"]["there"]
-    assert "--film" in found["extras", "film"]["told"]
+    assert "--video" in found["extras", "film"]["told"]
     assert "pip install 'gscompleter[poses]'" in found["extras", "poses"]["told"]
     assert not found["extras", "ray"]["there"]
     assert "older than this extra" in found["extras", "ray"]["told"]

@@ -1,5 +1,6 @@
 """What a completion never imports."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -78,6 +79,17 @@ def test_what_is_wrong_ends_as_ever():
     done = ended("view", "nowhere", stdout=subprocess.PIPE)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words", [("complete", "--help-all"), ("doctor", "--help"), ("--version",)]
+)
+def test_a_reader_that_ends_early_leaves_no_traceback(words):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as closed:
+        done = ended(*words, stdout=closed)
+    assert done.stderr == ""
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

@@ -1,15 +1,16 @@
-"""The command line: options in, a command called, errors turned into exit codes."""
+"""Entry point of the command line: options in, a command called, exit codes out."""
 
 from __future__ import annotations
 
 import atexit
 import gc
 import os
+import select
 import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, TextIO, Union
 
 import tyro
 
@@ -71,32 +72,54 @@ Command: Any = Union[  # noqa: UP007  (of as many as there are)
 
 
 def run() -> None:
-    """What the command `gscompleter` calls: `main`, in a process that is over with it.
+    """Run `main` and end the process at once: the command `gscompleter`.
 
-    Once all is done and said, Python would take back what it holds, torch's operators one by one,
-    which takes a fifth of a second.
+    Python would otherwise take a fifth of a second to free torch's operators.
     """
     done: list[bool] = []
     # Whatever else is to be done at the end is registered later, and is done before.
     atexit.register(end_at_once, done)
-    main()
+    try:
+        main()
+    except BrokenPipeError:
+        if not is_closed(sys.stdout):
+            raise
+        drop(sys.stdout)
+        sys.exit(1)
     done.append(True)
 
 
 def end_at_once(done: Sequence[bool]) -> None:
-    """End the process, where what it was for is `done` and all that it said is written."""
-    if not done:
-        return
-    try:
-        sys.stdout.flush()
-        sys.stderr.flush()
-    except OSError:
-        return  # Nobody listens any more: Python says so as it always does.
-    os._exit(0)
+    """Flush the output, and end the process if it is `done`."""
+    code = 0
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            drop(stream)
+            code = 1
+        except OSError:
+            return  # Python reports it.
+    if done:
+        os._exit(code)
+
+
+def is_closed(stream: TextIO) -> bool:
+    """Return True if the reader of a pipe, such as `head`, has ended."""
+    if not hasattr(select, "poll"):  # Windows
+        return False
+    poll = select.poll()
+    poll.register(stream.fileno(), select.POLLOUT)
+    return any(events & select.POLLERR for _, events in poll.poll(0))
+
+
+def drop(stream: TextIO) -> None:
+    """Discard all further output of a stream."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def main() -> None:
-    """The command itself. Exit codes: 0 done, 2 the input is wrong, 1 anything else."""
+    """Run a command. Exit codes: 0 done, 2 wrong input, 1 anything else."""
     # Threads of torch that spin while they wait cost a busy machine ten times the work they do.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     words = sys.argv[1:]
@@ -129,5 +152,5 @@ def main() -> None:
 
 
 def parsed(words: Sequence[str]) -> Any:
-    """The options of the command that `words` name; raises as `read_words`."""
+    """Parse the options of the command; raises as `read_words`."""
     return read_words(words, Command, COMMANDS)

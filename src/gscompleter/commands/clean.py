@@ -1,4 +1,4 @@
-"""The command `clean`: a splat and its photographs in, the splat without its floaters out."""
+"""The command `clean`: remove floaters from a splat."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from gscompleter.types import Gaussians
 
 
 def run_clean(options: CleanOptions) -> None:
-    """Clean the splat of `options.scene`, write `options.out` and say what was done."""
+    """Clean the splat, and print a summary."""
     with saying_what_stays(options.out):
         summary = clean_splat(options)
         if not options.quiet:
@@ -52,12 +52,7 @@ def run_clean(options: CleanOptions) -> None:
 
 
 def clean_splat(options: CleanOptions) -> dict[str, Any]:
-    """Clean the splat of `options.scene` and write `options.out`; also returns the summary.
-
-    Raises:
-        InputError: anything about the input that the user can mend; nothing is written then but
-            cameras that were found.
-    """
+    """Clean the splat, write `options.out`, and return the summary."""
     console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, replaceable(options))
     check_context(options)
@@ -88,13 +83,13 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
 
 
 def splat_of(task: Task) -> Gaussians:
-    """The splat that was brought."""
+    """Return the input splat."""
     assert task.scene is not None
     return task.scene
 
 
 def scores(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str, Any]:
-    """How many Gaussians were taken out, and PSNR (dB) at the photographs before and after."""
+    """Count the removed Gaussians, and compute PSNR (dB) before and after."""
     given = splat_of(task)
     rows = []
     for view in track(task.views, "scores"):
@@ -109,11 +104,7 @@ def scores(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str
 
 
 def write(folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[str, Any]) -> None:
-    """Write the splat without what is `taken`, what was taken, and the summary.
-
-    Raises:
-        InputError: where nothing would be left, or a file cannot be written.
-    """
+    """Write the cleaned splat, the removed Gaussians and the summary."""
     given = splat_of(task)
     if taken.all():
         raise InputError(
@@ -126,7 +117,7 @@ def write(folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[s
 
 
 def tell(summary: Mapping[str, Any], out: Path) -> None:
-    """Say how much was taken out, what that did to the photographs, and where it lies."""
+    """Print the numbers of Gaussians and the change of PSNR."""
     rows, counts = summary["photographs"], summary["gaussians"]
     before, after = (
         torch.tensor([row[f"psnr_{when}"] for row in rows]) for when in ("before", "after")

@@ -1,4 +1,4 @@
-"""The command `models`: the published weights as a table, or as JSON for machines."""
+"""The command `models`: published weights as a table or JSON."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from gscompleter.weights.fetching import INSTALL, cached, hub_is_installed, plac
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
 WIDEST = 1000
-"""Characters in a line where no terminal limits them."""
 
 
 def run_models(options: ModelsOptions) -> None:
-    """Print what weights are published and which are on this machine."""
+    """Print the published weights and their location on this machine."""
     found = {name: cached(weights) for name, weights in PUBLISHED.items()}
     if options.json:
         print(
@@ -30,7 +29,7 @@ def run_models(options: ModelsOptions) -> None:
 
 
 def as_json(weights: PublishedWeights, path: Path | None) -> dict[str, object]:
-    """Everything that is known of a file, and where it is and belongs on this machine."""
+    """Describe weights and their location."""
     return {
         **asdict(weights),
         "url": weights.url,
@@ -41,7 +40,7 @@ def as_json(weights: PublishedWeights, path: Path | None) -> dict[str, object]:
 
 
 def tell(found: dict[str, Path | None]) -> None:
-    """Print the table and what its marks mean."""
+    """Print the table and its footnotes."""
     table = Table(box=None)
     for title in ("name", "model", "parameters", "views", "size", "code / weights", "cached"):
         table.add_column(title, no_wrap=title == "name")
@@ -63,7 +62,7 @@ def tell(found: dict[str, Path | None]) -> None:
 
 
 def cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:
-    """A row of the table."""
+    """Format a row of the table."""
     fewest, most = weights.views
     count = weights.parameters
     return (

@@ -26,7 +26,7 @@ from gscompleter.reports.record import spread
 from gscompleter.stages.candidates import resized, shrunk
 from gscompleter.types import Camera, Completion
 
-NAME = "film.mp4"
+NAME = "video.mp4"
 """The file in the output folder."""
 RATE = 24
 """Frames per second."""
@@ -53,7 +53,7 @@ MAX_PHOTOGRAPHS = 200
 def write_film(
     folder: Path, completion: Completion, photographs: Sequence[Camera], renderer: Renderer
 ) -> None:
-    """Write `film.mp4` into a folder that nobody reads yet; nothing where there is no target.
+    """Write `video.mp4` into a folder that nobody reads yet; nothing where there is no target.
 
     Args:
         folder: Where to.
@@ -99,7 +99,7 @@ def frames(
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """What `cameras` see before and after, there and back."""
     drawn = []
-    for camera in track(cameras, "film"):
+    for camera in track(cameras, "video"):
         drawn.append(frame(completion, camera, renderer))
         yield drawn[-1]
     yield from drawn[-2:0:-1]

@@ -81,7 +81,7 @@ def opened(summary: Summary) -> Iterator[str]:
             "The coordinates are large against the distances between the cameras, so the result is "
             "relative to a local origin; summary.json has it."
         )
-    seen_to_move = moved({row.frame: row.contradicted for row in summary.context})
+    seen_to_move = moved({row.frame: row.dynamic_fraction for row in summary.context})
     if seen_to_move is not None:
         yield seen_to_move
     carried = left_out(row.ignored for row in summary.context)
@@ -96,7 +96,7 @@ def opened(summary: Summary) -> Iterator[str]:
 
 def compared(summary: Summary) -> Iterator[str]:
     """Of what the scores mean."""
-    evened = exposures([row.gain for row in summary.context])
+    evened = exposures([row.exposure_gain for row in summary.context])
     if evened is not None:
         yield evened
     if summary.settings.get("uses_target_photographs"):
