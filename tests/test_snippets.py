@@ -29,7 +29,7 @@ from gscompleter.viewer.packages import Libraries
 from scenes import camera_at, photographed
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FRAMES = 11
 """Of the room that stands for SCENE: as many as the commands name."""
 SIDE = 32
