@@ -444,7 +444,7 @@ def test_depths_that_the_scene_contradicts_are_reported_and_not_added(tmp_path):
     (said,) = summary["targets"]
     assert said["added"] == 0
     assert said["affine"]["agreement"] < 0.1
-    assert "agrees with the depths of the synthesized image" in said["notes"][0]
+    assert "of the scene that the target sees agrees with the depths of the" in said["notes"][0]
     assert said["notes"][-1] == "Nothing of it was added."
     literal = replace(completer, config=CompleterConfig.paper())(context, target)
     assert len(literal.added) > 0

@@ -57,7 +57,10 @@ def test_a_rotation_may_be_rounded_and_planes_may_be_unknown():
         ({"image": torch.zeros(32, 32, 3, dtype=torch.uint8)}, "no tensor of floats"),
         ({"image": np.zeros((32, 32, 3))}, "no tensor of floats"),
         ({"depth": torch.zeros(16, 32)}, "The depth of a view has the shape"),
-        ({"ignored": torch.zeros(1, 1, dtype=torch.bool)}, "The ignored of a view has the shape"),
+        (
+            {"ignored": torch.zeros(1, 1, dtype=torch.bool)},
+            "The ignore mask of a view has the shape",
+        ),
     ],
 )
 def test_an_image_that_is_not_its_cameras_is_refused_at_once(change, sentence):

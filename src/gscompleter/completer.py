@@ -231,11 +231,11 @@ class GSCompleter:
         with clock("context"):
             cameras = [*targets, *(view.camera for view in (*views, *(witnesses or ())))]
             proxy = proxy_of(scene, cameras)
-            drawn = scene if proxy is None else proxy.scene
-            near, far = working_range(views, drawn, self.renderer)
+            rendered = scene if proxy is None else proxy.scene
+            near, far = working_range(views, rendered, self.renderer)
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
-            completion = Completion(drawn, scene, views, (), (), {}, others, proxy=proxy)
+            completion = Completion(rendered, scene, views, (), (), {}, others, proxy=proxy)
             if witnesses is not None and self.config.support.doubts:
                 completion = self.doubted(completion)
             completion = self.judged(completion)
@@ -255,8 +255,8 @@ class GSCompleter:
         """Begin from a reconstructed context: compute dynamic masks and error budgets."""
         clock = Clock()
         with clock("context"):
-            made = context.gaussians
-            completion = Completion(made, made, context.views, (), (), {}, gains=context.gains)
+            scene = context.gaussians
+            completion = Completion(scene, scene, context.views, (), (), {}, gains=context.gains)
             completion = self.judged(self.wary_of_what_moved(completion))
         return replace(completion, seconds=total(clock.seconds, context.seconds))
 
@@ -277,19 +277,19 @@ class GSCompleter:
         check_numbers(completion.context, len(completion.targets) + 1)
         clock = Clock()
         with clock("context"):
-            wide = None if reference is None else reference.camera
-            sight = self.sight(completion, target, wide)
-        result = self.begun_at(sight)
+            padded = None if reference is None else reference.camera
+            target_view = self.sight(completion, target, padded)
+        result = self.begun_at(target_view)
         reason = nothing_to_do(result, completion.views)
         if reason is not None:
             return followed_by(completion, replace(result, notes=(reason,)), clock.seconds)
         with clock("context"):
-            sight = self.without_unsupported(sight)
-        result = self.completed(sight, result, reference, clock)
-        reached = sight.completion if len(result.added) else completion
-        advanced = followed_by(reached, result, clock.seconds)
-        for kept in (self.frozen, self.small):
-            kept.grown(reached.drawn, advanced.drawn)
+            target_view = self.without_unsupported(target_view)
+        result = self.completed(target_view, result, reference, clock)
+        base = target_view.completion if len(result.added) else completion
+        advanced = followed_by(base, result, clock.seconds)
+        for cache in (self.frozen, self.small):
+            cache.grown(base.drawn, advanced.drawn)
         return advanced
 
     def completed(
@@ -344,10 +344,10 @@ class GSCompleter:
 
     def reference(self, completion: Completion, target: Camera) -> View:
         """Synthesize the image at a target, without padding, even if there is no hole."""
-        sight = self.sight(completion, target)
+        target_view = self.sight(completion, target)
         at_views = contexts_of(self.at(completion, completion.views))
-        (image,) = self.synthesize([sight], at_views)
-        return View(sight.window.crop(image.image), sight.window.target)
+        (image,) = self.synthesize([target_view], at_views)
+        return View(target_view.window.crop(image.image), target_view.window.target)
 
     def begun_at(self, sight: Sight) -> TargetCompletion:
         """Begin the result of a target; refuse the target if it sees too little of the scene."""
@@ -369,19 +369,25 @@ class GSCompleter:
         """Synthesize the images of all targets that have holes; also return the seconds."""
         clock = Clock()
         with clock("context"):
-            sights = [self.sight(completion, target) for target in targets]
-            results = [self.begun_at(sight) for sight in sights]
-            asked = [nothing_to_do(result, completion.views) is None for result in results]
+            target_views = [self.sight(completion, target) for target in targets]
+            results = [self.begun_at(target_view) for target_view in target_views]
+            has_hole = [nothing_to_do(result, completion.views) is None for result in results]
             at_views = contexts_of(self.at(completion, completion.views))
         with clock("generate"):
-            wanted = [sight for sight, needed in zip(sights, asked, strict=True) if needed]
-            found = iter(self.synthesize(wanted, at_views))
-        return [next(found) if needed else None for needed in asked], clock.seconds
+            open_views = [
+                target_view
+                for target_view, needed in zip(target_views, has_hole, strict=True)
+                if needed
+            ]
+            images = iter(self.synthesize(open_views, at_views))
+        return [next(images) if needed else None for needed in has_hole], clock.seconds
 
     def synthesize(self, sights: Sequence[Sight], at_views: Sequence[Render]) -> list[Synthesized]:
         """Synthesize the image of each padded target (stage 2)."""
-        asked = [(sight.window.wide, self.known(sight, at_views)) for sight in sights]
-        return synthesize_all(self.generator, asked) if asked else []
+        inputs = [
+            (target_view.window.wide, self.known(target_view, at_views)) for target_view in sights
+        ]
+        return synthesize_all(self.generator, inputs) if inputs else []
 
     def known(self, sight: Sight, at_views: Sequence[Render]) -> SceneContext:
         """Collect the input of Φ at a target."""
@@ -400,10 +406,10 @@ class GSCompleter:
     def lift(self, sight: Sight, reference: Synthesized) -> Lift:
         """Lift the pixels near holes to Gaussians in the antialiasing mode of the scene."""
         radius = self.config.holes.neighbourhood
-        wanted = None if radius is None else dilate(self.holes(sight), radius)
-        lifted = lift(self.reconstructor, reference, sight.anchor_view, wanted)
-        scene, made = sight.completion.drawn, lifted.gaussians
-        return replace(lifted, gaussians=in_mode_of(scene, made, reference.camera))
+        pixel_mask = None if radius is None else dilate(self.holes(sight), radius)
+        lifted = lift(self.reconstructor, reference, sight.anchor_view, pixel_mask)
+        scene, gaussians = sight.completion.drawn, lifted.gaussians
+        return replace(lifted, gaussians=in_mode_of(scene, gaussians, reference.camera))
 
     def register(
         self,
@@ -445,39 +451,41 @@ class GSCompleter:
     ) -> Gaussians:
         """Keep registered Gaussians in holes, outside of observed free space (stage 4)."""
         mask = dilate(self.holes(sight), self.config.holes.dilation)
-        wide, views = sight.window.wide, sight.completion.views
+        padded, views = sight.window.wide, sight.completion.views
         side, earlier = self.config.exploration.side, sight.completion.targets
-        completed = [result.target for result in earlier if len(result.added)]
-        aside = [shrunk(camera, side) for camera in (*sight.completion.bystanders, *completed)]
-        kept, placed = respect_free_space(
+        completed_cameras = [result.target for result in earlier if len(result.added)]
+        small_cameras = [
+            shrunk(camera, side) for camera in (*sight.completion.bystanders, *completed_cameras)
+        ]
+        kept, is_placed = respect_free_space(
             self.before_doubted(
-                keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide), sight
+                keep_in_holes(registration.gaussians, lifted.pixel_index, mask, padded), sight
             ),
-            wide,
-            [*(view.camera for view in views), *aside],
+            padded,
+            [*(view.camera for view in views), *small_cameras],
             [
                 *(self.as_believed(sight, f, v) for f, v in zip(frozen_views, views, strict=True)),
-                *self.small_renders(sight.completion, aside),
+                *self.small_renders(sight.completion, small_cameras),
             ],
             self.config.registration.footprint,
             self.config.free_space,
         )
-        kept = kept[placed]
+        kept = kept[is_placed]
         number = torch.full_like(kept.generated, sight.completion.next_number)
         return replace(kept, generated=number)
 
     def as_believed(self, sight: Sight, frozen: FrozenView, view: View) -> Render:
         """Weight the alpha of a photograph's render by trust."""
-        drawn = frozen.context
-        believed = self.believed(sight.completion, frozen, view.camera)
-        return drawn if believed is None else replace(drawn, alpha=believed)
+        render = frozen.context
+        alpha = self.believed(sight.completion, frozen, view.camera)
+        return render if alpha is None else replace(render, alpha=alpha)
 
     def before_doubted(self, kept: Gaussians, sight: Sight) -> Gaussians:
         """Move Gaussians in front of untrusted Gaussians that were not pruned."""
         if sight.believed is None or len(kept) == 0:
             return kept
-        camera, drawn = sight.window.wide, sight.completion.drawn
-        nearest = front(drawn, sight.frozen, camera)
+        camera, scene = sight.window.wide, sight.completion.drawn
+        nearest = front(scene, sight.frozen, camera)
         pixels, z = project(kept.means, camera)
         limit = sample(nearest[..., None], pixels, "nearest")[:, 0]
         covered = sample(sight.frozen.context.alpha[..., None], pixels, "nearest")[:, 0] > 0.1
@@ -500,32 +508,34 @@ class GSCompleter:
             refined, losses = refine_opacities(
                 kept, at_target, reference, near, near_views, config.refine
             )
-            drawings = [image_of(plan) for plan in planned]
+            images = [image_of(plan) for plan in planned]
         else:
             holes, degree = self.holes(sight), completion.context.sh_degree
             settings = config.reconcile.at_most(degree)
-            counted = [view.counted for view in completion.photographs]
-            plans = list(each_view(kept)(lambda v, c: v.plan_appearance(kept, c), frozen, counted))
-            observed = [first for first, *_ in budgets]
-            refined, losses = reconcile(
-                kept, sight.frozen, reference, holes, plans, observed, settings
+            valid_masks = [view.counted for view in completion.photographs]
+            plans = list(
+                each_view(kept)(lambda v, c: v.plan_appearance(kept, c), frozen, valid_masks)
             )
-            drawings = [in_colours(plan, refined.sh) for plan in plans]
-        return do_no_harm(refined, frozen, budgets, config.harm, drawings), losses
+            first_budgets = [first for first, *_ in budgets]
+            refined, losses = reconcile(
+                kept, sight.frozen, reference, holes, plans, first_budgets, settings
+            )
+            images = [in_colours(plan, refined.sh) for plan in plans]
+        return do_no_harm(refined, frozen, budgets, config.harm, images), losses
 
     def sight(self, completion: Completion, target: Camera, wide: Camera | None = None) -> Sight:
         """Render the scene at a target, padded if a hole reaches the border.
 
         A reference that was synthesized in advance determines the padding by its camera, `padded`.
         """
-        window = self.window(completion, target)
+        camera = self.window(completion, target)
         if wide is not None:
-            window = between(window.target, wide)
-        sight = self.without_stereo(completion, window)
-        if wide is None and is_enclosed(window.crop(self.holes(sight))):
-            sight = self.without_stereo(completion, bordered(window.target, 0, 0))
-        found = self.stereo(completion, sight.frozen.context, sight.window)
-        return replace(sight, stereo=found)
+            camera = between(camera.target, wide)
+        target_view = self.without_stereo(completion, camera)
+        if wide is None and is_enclosed(camera.crop(self.holes(target_view))):
+            target_view = self.without_stereo(completion, bordered(camera.target, 0, 0))
+        found = self.stereo(completion, target_view.frozen.context, target_view.window)
+        return replace(target_view, stereo=found)
 
     def without_stereo(self, completion: Completion, window: Window) -> Sight:
         """Render the scene at a padded target, without stereo among the photographs."""
@@ -580,17 +590,17 @@ class GSCompleter:
         """Compute the trust of every rendered Gaussian; generated and invisible ones have 1."""
         sums, kept = weight_sums(frozen), completion.num_kept
         seen = in_context(completion, sums[:kept])
-        found = support(evidence, seen, camera, self.config.support)
+        trust = support(evidence, seen, camera, self.config.support)
         values = torch.ones_like(sums)
-        values[:kept] = of_kept(completion, found)
+        values[:kept] = of_kept(completion, trust)
         return values
 
     def doubted(self, completion: Completion) -> Completion:
         """Add the photographs' observations of an input splat, before any target."""
-        views, drawn = completion.photographs, completion.drawn
+        views, scene = completion.photographs, completion.drawn
         frozen_views = self.at(completion, views)
-        evidence = gather_evidence(drawn, views, frozen_views, self.config.support)
-        return replace(completion, evidence=evidence)
+        observations = gather_evidence(scene, views, frozen_views, self.config.support)
+        return replace(completion, evidence=observations)
 
     def without_unsupported(self, sight: Sight) -> Sight:
         """Prune occluders: unobserved Gaussians that cover holes and that no photograph needs.
@@ -600,15 +610,15 @@ class GSCompleter:
         completion, config = sight.completion, self.config.support
         if completion.evidence is None or not completion.witnesses or config.keep_unsupported:
             return sight
-        doubtful = self.unseen_in_holes(sight, completion.evidence)
-        if not doubtful.any():
+        occluders = self.unseen_in_holes(sight, completion.evidence)
+        if not occluders.any():
             return sight
-        taken = self.not_needed(completion, doubtful)
-        if not taken.any():
+        removable = self.not_needed(completion, occluders)
+        if not removable.any():
             return sight
-        again = self.without_stereo(without(completion, taken), sight.window)
+        pruned_view = self.without_stereo(without(completion, removable), sight.window)
         # Stereo depends on the photographs only, which do not change.
-        return replace(again, stereo=sight.stereo)
+        return replace(pruned_view, stereo=sight.stereo)
 
     def not_needed(self, completion: Completion, doubtful: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """Find those of the given Gaussians that can be removed without harm to any photograph."""
@@ -616,22 +626,22 @@ class GSCompleter:
         cameras = [view.camera for view in views]
         around = each_view(rest)(partial(self.renderer.freeze, rest), cameras)
         self.frozen.forget()  # Free memory: the next scene lacks `doubtful`.
-        gone = not_needed(completion.drawn[doubtful], around, views)
-        return doubtful.masked_scatter(doubtful, gone)
+        removable = not_needed(completion.drawn[doubtful], around, views)
+        return doubtful.masked_scatter(doubtful, removable)
 
     def unseen_in_holes(self, sight: Sight, evidence: Evidence) -> Bool[Tensor, "n"]:
         """Find context Gaussians that cover holes and that no photograph shows."""
         completion, camera = sight.completion, sight.window.wide
-        drawn, holes = completion.drawn, self.holes(sight)
+        scene, holes = completion.drawn, self.holes(sight)
         everywhere = torch.ones_like(sight.alpha)
         layers = torch.stack([everywhere, holes.to(everywhere), 0 * everywhere], dim=-1)
         sums, covering, _ = sight.frozen.sums(layers).unbind(-1)
-        of_context = (covering > MIN_COVER) & (drawn.generated == 0)
+        is_occluder = (covering > MIN_COVER) & (scene.generated == 0)
         kept = completion.num_kept
         seen = shown(evidence, in_context(completion, sums[:kept]), camera)
-        of_context[:kept] &= of_kept(completion, seen) < UNSEEN
-        of_context[kept:] = False
-        return of_context
+        is_occluder[:kept] &= of_kept(completion, seen) < UNSEEN
+        is_occluder[kept:] = False
+        return is_occluder
 
     def window(self, completion: Completion, target: Camera) -> Window:
         """Pad a target camera by as much as the settings and Φ allow."""
@@ -644,8 +654,8 @@ class GSCompleter:
 
     def wary_of_what_moved(self, completion: Completion) -> Completion:
         """Add dynamic masks to the context views."""
-        views, drawn = completion.views, contexts_of(self.at(completion, completion.views))
-        masks = contradicted(views, drawn, self.config.contradiction)
+        views, renders = completion.views, contexts_of(self.at(completion, completion.views))
+        masks = contradicted(views, renders, self.config.contradiction)
         return replace(
             completion,
             views=tuple(
@@ -658,7 +668,7 @@ class GSCompleter:
         """Add the error budgets of all photographs, before any target."""
         config = self.config.harm
         tolerance = 0.0 if completion.evidence is not None else config.tolerance or 0.0
-        drawn = contexts_of(self.at(completion, completion.photographs))
+        renders = contexts_of(self.at(completion, completion.photographs))
         budgets = tuple(
             error_budgets(
                 view,
@@ -667,9 +677,9 @@ class GSCompleter:
                 tolerance,
                 config.ssim_tolerance,
             )
-            for view, render in zip(completion.photographs, drawn, strict=True)
+            for view, render in zip(completion.photographs, renders, strict=True)
         )
-        return replace(completion, budgets=budgets, begun=drawn[: len(completion.views)])
+        return replace(completion, budgets=budgets, begun=renders[: len(completion.views)])
 
     def at(self, completion: Completion, views: Sequence[View]) -> tuple[FrozenView, ...]:
         """Freeze the scene at the cameras of photographs."""
@@ -687,23 +697,23 @@ def ranged(view: View, near: float, far: float) -> View:
 
 def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:
     """Prune rendered Gaussians of the context."""
-    before, gone = completion.set_aside, in_context(completion, taken[: completion.num_kept])
-    aside = gone if before is None else before | gone
-    return replace(completion, drawn=completion.drawn[~taken], set_aside=aside)
+    before, new = completion.set_aside, in_context(completion, taken[: completion.num_kept])
+    pruned = new if before is None else before | new
+    return replace(completion, drawn=completion.drawn[~taken], set_aside=pruned)
 
 
 def in_context(completion: Completion, values: Shaped[Tensor, "kept"]) -> Shaped[Tensor, "m"]:
     """Map values of kept context Gaussians to all rendered ones; pruned ones get 0."""
-    aside = completion.set_aside
-    if aside is None:
+    pruned = completion.set_aside
+    if pruned is None:
         return values
-    return values.new_zeros(len(aside)).masked_scatter(~aside, values)
+    return values.new_zeros(len(pruned)).masked_scatter(~pruned, values)
 
 
 def of_kept(completion: Completion, values: Shaped[Tensor, "m"]) -> Shaped[Tensor, "kept"]:
     """Select the values of context Gaussians that are not pruned."""
-    aside = completion.set_aside
-    return values if aside is None else values[~aside]
+    pruned = completion.set_aside
+    return values if pruned is None else values[~pruned]
 
 
 def check_numbers(scene: Gaussians | None, num_targets: int) -> None:
@@ -788,13 +798,17 @@ def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
         )
     if affine.refuted:
         notes.append(
-            f"Only {affine.agreement:.0%} of the scene that the target sees agrees with the depths of "
-            "the synthesized image, and no other fit is better."
+            f"Only {affine.agreement:.0%} of the scene that the target sees agrees with the depths "
+            "of the synthesized image, and no other fit is better."
         )
     if affine.method == "median":
-        notes.append("RANSAC finds no reliable depth correction; the median depth ratio replaces it.")
+        notes.append(
+            "RANSAC finds no reliable depth correction; the median depth ratio replaces it."
+        )
     if affine.method == "identity":
-        notes.append("There is nothing to fit a depth correction to; the predicted depths are used.")
+        notes.append(
+            "There is nothing to fit a depth correction to; the predicted depths are used."
+        )
     return tuple(notes)
 
 

@@ -102,17 +102,17 @@ class Explorer:
     ) -> tuple[Completion, tuple[Choice, ...]]:
         """Repeatedly choose the best camera and complete the scene there."""
         with stage("finding targets"):
-            offers, step = self.offers(completion, cameras)
+            remaining, step = self.offers(completion, cameras)
         chosen: list[Choice] = []
         for _ in track(range(count), "target"):
-            choices = self.judged(completion, offers)
+            choices = self.judged(completion, remaining)
             choice = best(choices, [v.camera for v in completion.views], step, self.config)
             if choice is None:
                 break
             completion = complete(completion, choice.camera)
             chosen.append(choice)
             left = [c.candidate for c in choices if c.gain >= self.config.min_gain]
-            offers = [candidate for candidate in left if candidate is not choice.candidate]
+            remaining = [candidate for candidate in left if candidate is not choice.candidate]
         return completion, tuple(chosen)
 
     def offers(
@@ -140,31 +140,32 @@ class Explorer:
         self, completion: Completion, anchors: Sequence[Look], candidate: Candidate
     ) -> Choice:
         """Score one candidate; its gain is 0 if it is too close to a surface."""
-        look = self.look(completion, candidate.camera)
-        hole = look.holes.float().mean().item()
-        if is_close(look.render, candidate.nearest, self.config):
+        small_view = self.look(completion, candidate.camera)
+        hole = small_view.holes.float().mean().item()
+        if is_close(small_view.render, candidate.nearest, self.config):
             return Choice(candidate, hole, 0.0)
         overlaps = [
-            overlap_of(look.camera, look.render, anchor.camera, anchor.render) for anchor in anchors
+            overlap_of(small_view.camera, small_view.render, anchor.camera, anchor.render)
+            for anchor in anchors
         ]
         config, views = self.completer.config.anchor, completion.views
         anchor = select_anchor(candidate.camera, views, config, overlaps).index
-        return Choice(candidate, hole, gain(look.holes, overlaps[anchor], self.config))
+        return Choice(candidate, hole, gain(small_view.holes, overlaps[anchor], self.config))
 
     def look(self, completion: Completion, camera: Camera) -> Look:
         """Render the scene at a camera in a small image."""
         camera = shrunk(completion.ranged(camera), self.config.side)
         frozen = self.completer.renderer.freeze(completion.drawn, camera)
-        render, believed = frozen.context, self.completer.believed(completion, frozen, camera)
-        alpha = render.alpha if believed is None else believed
+        render, trusted = frozen.context, self.completer.believed(completion, frozen, camera)
+        alpha = render.alpha if trusted is None else trusted
         return Look(camera, render, hole_mask(alpha, self.completer.config.holes))
 
     def with_stand_ins(self, completion: Completion, camera: Camera) -> Completion:
         """Close the holes at a camera by grey placeholders."""
-        look = self.look(completion, self.completer.window(completion, camera).wide)
-        drawn, made = completion.drawn, stand_ins(look.render, look.holes, look.camera)
-        added = in_mode_of(drawn, made, look.camera)
-        return replace(completion, drawn=merge([drawn, added]))
+        view = self.look(completion, self.completer.window(completion, camera).wide)
+        scene, placeholders = completion.drawn, stand_ins(view.render, view.holes, view.camera)
+        added = in_mode_of(scene, placeholders, view.camera)
+        return replace(completion, drawn=merge([scene, added]))
 
 
 def with_bystanders(completion: Completion, cameras: Sequence[Camera]) -> Completion:

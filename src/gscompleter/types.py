@@ -184,8 +184,8 @@ class View(Movable):
             raise InputError(
                 "The image of a view is no tensor of floats of shape [h, w, 3]; convert it."
             )
-        for name in ("image", "depth", "ignored", "contradicted"):
-            pixels = getattr(self, name)
+        maps = {"depth": self.depth, "ignore mask": self.ignored, "dynamic mask": self.contradicted}
+        for name, pixels in {"image": image, **maps}.items():
             if pixels is not None and tuple(pixels.shape[:2]) != size:
                 raise InputError(
                     f"The {name} of a view has the shape {list(pixels.shape)}, and its camera has "
@@ -530,8 +530,8 @@ class Completion:
     @property
     def num_kept(self) -> int:
         """Number of context Gaussians, without pruned ones, at the start of `rendered_scene`."""
-        aside = 0 if self.set_aside is None else int(self.set_aside.sum())
-        return len(self.drawn_context) - aside
+        num_pruned = 0 if self.set_aside is None else int(self.set_aside.sum())
+        return len(self.drawn_context) - num_pruned
 
     @property
     def added(self) -> Gaussians:
@@ -541,8 +541,8 @@ class Completion:
     @property
     def removed(self) -> Bool[Tensor, "n"] | None:
         """Pruned Gaussians as a mask over `context`, or None if there are none."""
-        aside = self.set_aside
-        return aside if aside is None or self.proxy is None else aside[self.proxy.run]
+        pruned = self.set_aside
+        return pruned if pruned is None or self.proxy is None else pruned[self.proxy.run]
 
     @property
     def observed(self) -> Gaussians:

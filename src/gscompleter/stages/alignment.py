@@ -38,8 +38,8 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
     if len(x) < MIN_PIXELS:
         return DepthAffine()
     if len(x) > MAX_PIXELS:
-        drawn = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
-        x, y = x[drawn], y[drawn]
+        sample = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
+        x, y = x[sample], y[sample]
 
     if depth_spread(x) >= MIN_DEPTH_SPREAD:
         scale, shift = ransac_line(x, y, rng)
@@ -87,8 +87,8 @@ def ransac_line(
     points = torch.stack([x / y, 1 / y])
     counts = torch.cat(
         [
-            ((some @ points).sub_(1).abs_() < RESIDUAL_THRESHOLD).sum(dim=1)
-            for some in torch.stack([scales, shifts], dim=1).split(AT_ONCE)
+            ((batch @ points).sub_(1).abs_() < RESIDUAL_THRESHOLD).sum(dim=1)
+            for batch in torch.stack([scales, shifts], dim=1).split(AT_ONCE)
         ]
     )
     best = counts.where(scales > 0, -1).argmax()
@@ -149,8 +149,8 @@ def unless_contradicted(
     affine = replace(affine, agreement=agree)
     if agree >= config.min_agreement:
         return affine
-    own = fit_affine(predicted, context, rng)
-    if own.inliers >= max(MIN_INLIERS, 2 * agree):
-        return replace(own, agreement=own.inliers, contradicted=True)
+    refitted = fit_affine(predicted, context, rng)
+    if refitted.inliers >= max(MIN_INLIERS, 2 * agree):
+        return replace(refitted, agreement=refitted.inliers, contradicted=True)
     enough = len(x) >= MIN_SEEN * context.depth.numel()
     return replace(affine, refuted=enough and agree < (config.min_merged or 0.0))

@@ -93,8 +93,8 @@ def synthesize_all(
         Request(context.views[nearest_view(target, context.views)], target, context)
         for target, context in asked
     ]
-    answers = as_generator(generator).synthesize(requests)
-    return [as_view(answer, r.target) for answer, r in zip(answers, requests, strict=True)]
+    outputs = as_generator(generator).synthesize(requests)
+    return [as_view(output, r.target) for output, r in zip(outputs, requests, strict=True)]
 
 
 def as_view(answer: Synthesis, target: Camera) -> Synthesized:

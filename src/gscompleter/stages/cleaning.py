@@ -38,15 +38,15 @@ def superfluous(
     config: CleaningConfig = CleaningConfig(),
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians that can be removed together; generated and unobserved ones stay."""
-    doubtful = torch.zeros_like(scene.generated, dtype=torch.bool)
-    doubtful = unwanted(scene, doubtful, views, renderer, config) & (scene.generated == 0)
-    doubtful = unwanted(scene, doubtful, views, renderer, config) & doubtful
-    judges = [*views, *map(halved, views)]
+    removable = torch.zeros_like(scene.generated, dtype=torch.bool)
+    removable = unwanted(scene, removable, views, renderer, config) & (scene.generated == 0)
+    removable = unwanted(scene, removable, views, renderer, config) & removable
+    checks = [*views, *map(halved, views)]
     allowed = [
-        error_with_loss(error_of(scene, view, renderer).item(), config.tolerance) for view in judges
+        error_with_loss(error_of(scene, view, renderer).item(), config.tolerance) for view in checks
     ]
-    taken = without_needed(scene, doubtful, judges, allowed, renderer)
-    return guarded(scene, taken, judges, allowed, renderer)
+    removed = without_needed(scene, removable, checks, allowed, renderer)
+    return guarded(scene, removed, checks, allowed, renderer)
 
 
 def unwanted(
@@ -81,10 +81,10 @@ def change_without(
     plan = renderer.freeze(scene[:0], view.camera).plan(scene)
     full = scene.opacities
     left = torch.where(faded, full.clamp_max(FADED), full)
-    error, slope = error_slope(image_of(plan), view, left)
+    error, gradient = error_slope(image_of(plan), view, left)
     square = mean_squares(plan, left, probes, generator)
     # Difference of the parabola between zero and full opacity, expanded at `left`.
-    return (square * (left**2 - (full - left) ** 2) - slope * full) / max(error, LEAST)
+    return (square * (left**2 - (full - left) ** 2) - gradient * full) / max(error, LEAST)
 
 
 def mean_squares(
@@ -103,8 +103,8 @@ def mean_squares(
         squares = torch.zeros_like(opacities)
         for _ in range(probes):
             signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
-            (slope,) = torch.autograd.grad((signs * image).sum(), variable, retain_graph=True)
-            squares += slope**2
+            (gradient,) = torch.autograd.grad((signs * image).sum(), variable, retain_graph=True)
+            squares += gradient**2
     return squares / probes / image.numel()
 
 

@@ -17,10 +17,10 @@ def compared_depths(
     if config.bridge == "none":
         return None
     at_the_target = config.bridge == "target" or affine.contradicted
-    predicted, drawn = lift.anchor_depth, at_anchor
+    predicted, render = lift.anchor_depth, at_anchor
     if at_the_target:
-        predicted, drawn = lift.reference_depth, at_target
-    x, y = compared(predicted, drawn.depth_map())
+        predicted, render = lift.reference_depth, at_target
+    x, y = compared(predicted, render.depth_map())
     step = max(1, -(-len(x) // MAX_PAIRS))
     x, y = x[::step], y[::step]
     if len(x) == 0:

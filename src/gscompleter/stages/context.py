@@ -28,8 +28,8 @@ def init_context(
     reconstructor: Reconstructor, views: Sequence[View]
 ) -> tuple[Gaussians, Float[Tensor, "v 3"] | None]:
     """Reconstruct `G_ctx = Ψ(V_in)`; also return exposure gains if estimated (paper, Eq. 5)."""
-    made = reconstructed(reconstructor, views)
-    return without_ignored(made, views), made.gains
+    reconstruction = reconstructed(reconstructor, views)
+    return without_ignored(reconstruction, views), reconstruction.gains
 
 
 def check_texture(views: Sequence[View]) -> None:

@@ -107,12 +107,12 @@ def contradicted(
     """Compute a dynamic mask for each photograph by comparison with its neighbours."""
     if config.min_difference is None:
         return [torch.zeros_like(view.counted) for view in views]
-    sights = [small(view, render) for view, render in zip(views, renders, strict=True)]
-    votes = [torch.zeros_like(sight.known, dtype=torch.int32) for sight in sights]
+    photos = [small(view, render) for view, render in zip(views, renders, strict=True)]
+    votes = [torch.zeros_like(photo.known, dtype=torch.int32) for photo in photos]
     for one, other in neighbours([view.camera for view in views]):
-        answers = questioned(sights[one], sights[other], config.min_difference)
-        for index, answer, region in zip((one, other), answers, agreed(*answers), strict=True):
-            votes[index] += region.int() - (answer.confirmed & ~region).int()
+        pair = questioned(photos[one], photos[other], config.min_difference)
+        for index, comparison, region in zip((one, other), pair, agreed(*pair), strict=True):
+            votes[index] += region.int() - (comparison.confirmed & ~region).int()
     return [at_size(vote > 0, view.camera) for vote, view in zip(votes, views, strict=True)]
 
 
@@ -152,19 +152,19 @@ def compared(asked: Sight, other: Sight) -> Match:
     pixels, z = project(unproject(asked.depth, asked.camera), other.camera)
     framed = within(pixels, z, other.camera)
     known = framed & asked.known & (sample(other.known[..., None].float(), pixels)[..., 0] == 1)
-    seen = known & unhidden(pixels, z, other.depth)
-    if int(seen.sum()) < MIN_SHARED:
+    visible = known & unhidden(pixels, z, other.depth)
+    if int(visible.sum()) < MIN_SHARED:
         nothing = torch.zeros_like(known)
         return Match(pixels, z, framed, nothing, nothing.float(), 0.0)
-    differences = difference(asked, other, pixels, seen)
-    return Match(pixels, z, framed, known, differences, differences[seen].median().item())
+    differences = difference(asked, other, pixels, visible)
+    return Match(pixels, z, framed, known, differences, differences[visible].median().item())
 
 
 def answered(match: Match, depth: Float[Tensor, "_ _"], min_difference: float) -> Answer:
     """Mark visible surfaces as confirmed or in conflict, given the other depth map."""
-    seen = match.known & unhidden(match.pixels, match.z, depth)
-    denied = seen & (match.difference > max(min_difference, USUAL * match.usual))
-    return Answer(match, seen & ~denied, denied)
+    visible = match.known & unhidden(match.pixels, match.z, depth)
+    conflict = visible & (match.difference > max(min_difference, USUAL * match.usual))
+    return Answer(match, visible & ~conflict, conflict)
 
 
 def unhidden(
@@ -190,10 +190,10 @@ def difference(
     The largest channel counts, averaged over a patch, at the shift of the smallest difference.
     """
     gain, offset = robust_affine(sample(other.image, pixels)[seen], asked.image[seen])
-    evened = (gain * other.image + offset).clamp(0, 1)
+    normalized = (gain * other.image + offset).clamp(0, 1)
     least = torch.ones_like(asked.image[..., 0])
     for shift in product(range(-SHIFT, SHIFT + 1), repeat=2):
-        shown = sample(evened, pixels + pixels.new_tensor(shift))
+        shown = sample(normalized, pixels + pixels.new_tensor(shift))
         differs = (shown - asked.image).abs().amax(dim=-1)
         least = torch.minimum(least, averaged(differs))
     return least
@@ -209,10 +209,10 @@ def agreed(
     one: Answer, other: Answer
 ) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "other_h other_w"]]:
     """Find regions in which two photographs contradict each other, each in both images."""
-    yours = regions(other)
-    mine = common(regions(one), yours, one.match.pixels)
-    yours = common(yours, mine, other.match.pixels)
-    return common(mine, yours, one.match.pixels), yours
+    other_regions = regions(other)
+    own_regions = common(regions(one), other_regions, one.match.pixels)
+    other_regions = common(other_regions, own_regions, other.match.pixels)
+    return common(own_regions, other_regions, one.match.pixels), other_regions
 
 
 def regions(answer: Answer) -> Bool[Tensor, "h w"]:
@@ -222,8 +222,8 @@ def regions(answer: Answer) -> Bool[Tensor, "h w"]:
         np.pad(mask.cpu().numpy().astype(np.uint8), width)
         for mask in (answer.denied, answer.match.framed, answer.confirmed)
     )
-    denied, framed, confirmed = padded
-    whole = cv2.morphologyEx(denied, cv2.MORPH_CLOSE, disc(GAP))
+    conflict, framed, confirmed = padded
+    whole = cv2.morphologyEx(conflict, cv2.MORPH_CLOSE, disc(GAP))
     labels = labelled(cv2.morphologyEx(whole, cv2.MORPH_OPEN, disc(SPECK)))
     found = np.zeros_like(labels, dtype=bool)
     for region in (labels == label for label in range(1, labels.max() + 1)):

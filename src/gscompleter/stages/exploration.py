@@ -127,15 +127,16 @@ def stand_ins(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gau
 
 def miniature(completion: Completion, most: int = MAX_GAUSSIANS) -> Completion:
     """Simplify a completion for small images, with its photo observations."""
-    context, evidence, aside = completion.drawn_context, completion.evidence, completion.set_aside
+    context, observations = completion.drawn_context, completion.evidence
+    pruned = completion.set_aside
     rows, growth = thinning(context, most)
     context = thinned(context, most)
-    evidence = None if evidence is None else thinned_evidence(evidence, rows, growth)
-    aside = None if aside is None else aside[rows]
-    kept = context if aside is None else context[~aside]
-    drawn = merge([kept, thinned(completion.added, most)])
-    completion = replace(completion, proxy=None, evidence=evidence, set_aside=aside)
-    return replace(completion, drawn=drawn, context=context)
+    observations = None if observations is None else thinned_evidence(observations, rows, growth)
+    pruned = None if pruned is None else pruned[rows]
+    kept = context if pruned is None else context[~pruned]
+    rendered = merge([kept, thinned(completion.added, most)])
+    completion = replace(completion, proxy=None, evidence=observations, set_aside=pruned)
+    return replace(completion, drawn=rendered, context=context)
 
 
 def thinned_evidence(

@@ -67,16 +67,16 @@ def seen_through(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> Bool[Tensor, "n"]:
     """Find points in front of an observed surface, or inside the near distance of a camera."""
-    contradicted = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    in_free_space = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for camera, render in zip(cameras, renders, strict=True):
         pixels, z = project(points, camera)
         size = torch.tensor([camera.width, camera.height], device=pixels.device)
-        shows = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
-        nearest = torch.where(shows[:, None], pixels, 0.0).long().clamp_min(0)
+        visible = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
+        nearest = torch.where(visible[:, None], pixels, 0.0).long().clamp_min(0)
         x, y = torch.minimum(nearest, size - 1).unbind(-1)
         scene = render.depth_map()
         before = z < (1 + CLEARANCE) * scene.depth[y, x]
-        contradicted |= shows & scene.valid[y, x] & before
+        in_free_space |= visible & scene.valid[y, x] & before
         if camera.near is not None:
-            contradicted |= (points - camera.center).norm(dim=-1) < camera.near
-    return contradicted
+            in_free_space |= (points - camera.center).norm(dim=-1) < camera.near
+    return in_free_space

@@ -68,11 +68,11 @@ def error_budgets(
 def errors(image: Float[Tensor, "h w 3"], budget: ErrorBudget) -> Float[Tensor, "h w"]:
     """Compute what each pixel adds to the error that a budget limits; differentiable."""
     view = budget.view
-    compared = view.compared(image)
+    masked = view.compared(image)
     if budget.metric == "mse":
-        return (compared - view.image).square().mean(dim=-1) / view.counted.numel()
+        return (masked - view.image).square().mean(dim=-1) / view.counted.numel()
     inner = slice(RADIUS, -RADIUS)
-    dissimilar = (1 - ssim_map(compared, view.image).mean(dim=(0, 1)))[inner, inner]
+    dissimilar = (1 - ssim_map(masked, view.image).mean(dim=(0, 1)))[inner, inner]
     return pad(dissimilar / dissimilar.numel(), (RADIUS,) * 4)
 
 
@@ -99,10 +99,10 @@ def do_no_harm(
         drawings = [image_of(frozen.plan(added)) for frozen in frozen_views]
     before = [frozen.context.image for frozen in frozen_views]
     checks = [Check(*each) for each in zip(budgets, before, drawings, strict=True)]
-    opacities, asked = added.opacities, checks
+    opacities, active = added.opacities, checks
     for trial in range(HALVINGS + REMOVALS + 1):
-        worse = those_over(asked, opacities)
-        if not worse and len(asked) < len(checks):  # Faded Gaussians may have occluded others.
+        worse = those_over(active, opacities)
+        if not worse and len(active) < len(checks):  # Faded Gaussians may have occluded others.
             worse = those_over(checks, opacities)
         if not worse:
             break
@@ -111,7 +111,7 @@ def do_no_harm(
         opacities = torch.where(torch.stack(lowered).any(dim=0), left * opacities, opacities)
         if is_undone(added.opacities, opacities, config):
             return added[:0]
-        asked = [seen.check for seen in worse] if trial + 1 < HALVINGS else checks
+        active = [seen.check for seen in worse] if trial + 1 < HALVINGS else checks
     return replace(added, opacities=opacities, encoded=None)
 
 
@@ -178,8 +178,8 @@ class Drawn:
 
 def those_over(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[Drawn]:
     """Render all photographs and return those over budget."""
-    drawn = (Drawn.of(check, opacities) for check in checks)
-    return [seen for seen in drawn if seen.excess > 0]
+    rendered = (Drawn.of(check, opacities) for check in checks)
+    return [render for render in rendered if render.excess > 0]
 
 
 def is_undone(

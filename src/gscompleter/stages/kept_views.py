@@ -40,9 +40,9 @@ class KeptViews:
                 return self._renderer.freeze(missing[0], camera)
             return view if count == len(completion.drawn) else view.extended(missing[count])
 
-        found = tuple(each_view(completion.drawn)(up_to_date, cameras, known))
-        views.update(zip(keys, ((len(completion.drawn), view) for view in found), strict=True))
-        return found
+        frozen = tuple(each_view(completion.drawn)(up_to_date, cameras, known))
+        views.update(zip(keys, ((len(completion.drawn), view) for view in frozen), strict=True))
+        return frozen
 
     def forget(self) -> None:
         """Drop all frozen scenes to free their memory."""

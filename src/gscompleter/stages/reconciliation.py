@@ -50,19 +50,19 @@ def reconcile(
     if config.iterations == 0 or len(added) == 0:
         return added, ()
     fit = Fit(added, config)
-    planned = frozen_target.plan_appearance(added, holes)
-    at_target = planned.compared(reference.image, shares_of(holes))
+    plan = frozen_target.plan_appearance(added, holes)
+    at_target = plan.compared(reference.image, shares_of(holes))
     before = hole_error(frozen_target.context.image, reference, holes).clamp_min(1e-12)
-    asked = [Asked.by(*each) for each in zip(plans, budgets, strict=True)]
+    photos = [Asked.by(*each) for each in zip(plans, budgets, strict=True)]
     with torch.no_grad():
-        looks = fit.looks()
-        turns = Turns([photograph.excess(looks).item() for photograph in asked])
+        appearance = fit.looks()
+        turns = Turns([photograph.excess(appearance).item() for photograph in photos])
     weight = config.photograph_weight / config.views_per_step
     losses = []
     for _ in track(range(config.iterations), "Refining"):
-        looks = fit.looks()
-        loss = at_target(*looks) / before
-        for over in objections(looks, asked, turns, config.views_per_step):
+        appearance = fit.looks()
+        loss = at_target(*appearance) / before
+        for over in objections(appearance, photos, turns, config.views_per_step):
             loss = loss + weight * over
         fit.step(loss)
         losses.append(loss.item())

@@ -28,20 +28,22 @@ def not_needed(
     `around` is the scene without them, frozen at each photograph.
     """
     frozen, opacities = list(around), doubtful.opacities
-    told = [
+    measured = [
         error_slope(image_of(view.plan(doubtful)), photograph, opacities)
         for view, photograph in zip(frozen, views, strict=True)
     ]
-    missed = [-slope * opacities > LITTLE * error for error, slope in told]
-    spare = ~torch.stack(missed).any(dim=0)
-    if not spare.any():
-        return spare
-    candidates, kept = doubtful[spare], doubtful[~spare]
+    needed_alone = [-gradient * opacities > LITTLE * error for error, gradient in measured]
+    removable = ~torch.stack(needed_alone).any(dim=0)
+    if not removable.any():
+        return removable
+    candidates, kept = doubtful[removable], doubtful[~removable]
     for k, view in enumerate(frozen):  # In place, to save memory.
         frozen[k] = view.extended(kept)
     plans = [view.plan(candidates) for view in frozen]
-    gone = all_gone(candidates.opacities, lambda: plans, views, [error for error, _ in told])
-    return spare.masked_scatter(spare, gone)
+    unneeded = all_gone(
+        candidates.opacities, lambda: plans, views, [error for error, _ in measured]
+    )
+    return removable.masked_scatter(removable, unneeded)
 
 
 def without_needed(
@@ -58,8 +60,8 @@ def without_needed(
         # One at a time, to save memory.
         return (renderer.freeze(rest, view.camera).plan(candidates) for view in views)
 
-    gone = all_gone(candidates.opacities, plans, views, allowed)
-    return doubtful.masked_scatter(doubtful, gone)
+    unneeded = all_gone(candidates.opacities, plans, views, allowed)
+    return doubtful.masked_scatter(doubtful, unneeded)
 
 
 def all_gone(
@@ -91,14 +93,14 @@ def needed(
     """Find the missing Gaussians that a photograph needs back to be within its limit."""
     back = torch.zeros_like(missing)
     for _ in range(MAX_TRIALS):
-        out = missing & ~back
-        image = view.compared(plan(torch.where(out, 0.0, opacities)).image)
+        absent = missing & ~back
+        image = view.compared(plan(torch.where(absent, 0.0, opacities)).image)
         error = squared_error(image, view.image).item()
-        if error <= allowed or not out.any():
+        if error <= allowed or not absent.any():
             return back
-        _, slope = error_slope(image_of(plan), view, torch.where(out, FADED, 1.0) * opacities)
-        back = back | fewest(torch.where(out, -slope * opacities, 0.0), error - allowed)
-    return back | (missing & (slope != 0))
+        _, gradient = error_slope(image_of(plan), view, torch.where(absent, FADED, 1.0) * opacities)
+        back = back | fewest(torch.where(absent, -gradient * opacities, 0.0), error - allowed)
+    return back | (missing & (gradient != 0))
 
 
 def error_of(scene: Gaussians, view: View, renderer: Renderer) -> Float[Tensor, ""]:

@@ -64,10 +64,10 @@ def stereo_among(
     except InputError:
         return None
     frozen_views = [renderer.freeze(scene, view.camera) for view in views]
-    evidence = gather_evidence(scene, views, frozen_views, config)
+    observations = gather_evidence(scene, views, frozen_views, config)
     frozen = renderer.freeze(scene, camera)
-    values = support(evidence, weight_sums(frozen), camera, config)
-    return Stereo(frozen.context, believed_alpha(frozen, values))
+    trust = support(observations, weight_sums(frozen), camera, config)
+    return Stereo(frozen.context, believed_alpha(frozen, trust))
 
 
 def corrected(context: SceneContext, stereo: Stereo) -> SceneContext:
@@ -81,5 +81,5 @@ def corrected(context: SceneContext, stereo: Stereo) -> SceneContext:
         torch.where(better, shown.depth, scene.depth),
         torch.where(better, shown.alpha, scene.alpha),
     )
-    believed = torch.where(better, stereo.support, context.believed)
-    return replace(context, at_target=at_target, believed=believed)
+    trusted_alpha = torch.where(better, stereo.support, context.believed)
+    return replace(context, at_target=at_target, believed=trusted_alpha)

@@ -59,8 +59,8 @@ def gather_evidence(
 
     for _ in each_view(drawn)(gather, range(len(views))):
         pass
-    told = (torch.from_numpy(array).to(drawn.means) for array in (areas, agreement))
-    return Evidence(drawn.means, torch.stack([view.camera.center for view in views]), *told)
+    arrays = (torch.from_numpy(array).to(drawn.means) for array in (areas, agreement))
+    return Evidence(drawn.means, torch.stack([view.camera.center for view in views]), *arrays)
 
 
 def difference(render: Render, view: View) -> Float[Tensor, "h w"]:
@@ -83,10 +83,10 @@ def support(
     `sums` are the summed compositing weights of each Gaussian in its image.
     """
     seen = (evidence.areas, evidence.agreement, evidence.means, sums)
-    told = map(float32, (evidence.centers, *seen))
+    arrays = map(float32, (evidence.centers, *seen))
     limits = np.float32(math.radians(config.max_turn)), np.float32(ENOUGH)
     values = np.empty(len(sums), np.float32)
-    share(kernels.support, len(values), *told, place_of(camera), *limits, values)
+    share(kernels.support, len(values), *arrays, place_of(camera), *limits, values)
     return torch.from_numpy(values).to(sums)
 
 
@@ -118,11 +118,11 @@ def front(scene: Gaussians, frozen: FrozenView, camera: Camera) -> Float[Tensor,
     Untrusted Gaussians vary in depth; `STANDOFF` deviations before the mean hide most of them.
     Nearer Gaussians would occlude the scene in photographs from the side.
     """
-    drawn, z = frozen.context, z_depths(scene.means, camera).clamp_min(0.0)
-    unit = drawn.depth.max().clamp_min(1e-12)
+    render, z = frozen.context, z_depths(scene.means, camera).clamp_min(0.0)
+    unit = render.depth.max().clamp_min(1e-12)
     squares = frozen.blended((z / unit).clamp_max(2.0) ** 2)
-    mean = drawn.depth / unit
-    spread = (squares / drawn.alpha.clamp_min(1e-6) - mean**2).clamp_min(0.0).sqrt()
+    mean = render.depth / unit
+    spread = (squares / render.alpha.clamp_min(1e-6) - mean**2).clamp_min(0.0).sqrt()
     return unit * (mean - STANDOFF * spread).clamp_min(0.1 * mean)
 
 
