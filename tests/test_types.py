@@ -1,4 +1,4 @@
-"""Cameras and views that cannot be are refused where they are made."""
+"""Impossible cameras and views are refused where they are made."""
 
 import math
 from dataclasses import replace
@@ -82,7 +82,7 @@ def test_values_that_no_stage_can_work_with_are_refused_before_any_work():
 
 
 def unchecked(make, *arguments, **changes):
-    """Call `make` as without the types that these tests check everywhere."""
+    """Call `make` without the type checks of these tests."""
     from jaxtyping import config
 
     before = config.jaxtyping_disable
