@@ -115,7 +115,7 @@ def upward(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
 def in_the_open(
     point: Float[Tensor, "3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> bool:
-    """Return True if a photograph shows free space at a point, or none a surface before it."""
+    """Return True if a photograph sees through a point, or if none shows an occluder."""
     hidden = False
     for camera, render in zip(cameras, renders, strict=True):
         pixel, z = project(point, camera)

@@ -85,18 +85,17 @@ class Match:
     difference: Float[Tensor, "h w"]
     """Colour difference in [0, 1]."""
     usual: float
-    """Median difference of surfaces that both photographs see."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Agreement of another photograph with the surfaces of one photograph."""
+    """Agreement of one photograph with the surfaces of another."""
 
     match: Match
     confirmed: Bool[Tensor, "h w"]
-    """True where it sees the same colour."""
+    """True where it shows the same colour."""
     denied: Bool[Tensor, "h w"]
-    """True where it sees another colour."""
+    """True where it shows another colour."""
 
 
 def contradicted(
@@ -127,7 +126,7 @@ def neighbours(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
 
 
 def small(view: View, render: Render) -> Sight:
-    """Shrink a photograph to SIDE pixels; depths are sampled, not averaged."""
+    """Shrink a photograph to `IMAGE_SIDE` pixels; depths are sampled, not averaged."""
     camera = shrunk(view.camera, SIDE)
     size = camera.height, camera.width
     image = interpolate(view.image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)

@@ -121,7 +121,6 @@ class Check:
 
     budgets: Sequence[ErrorBudget]
     before: Float[Tensor, "h w 3"]
-    """Render without the added Gaussians."""
     draw: OpacityImage
     """Differentiable image in the opacities of the added Gaussians."""
 
