@@ -1,5 +1,4 @@
-"""A synthesized image is compared with the photographs: its colours are brought to theirs, and
-an image of something else is told of."""
+"""Comparison of a synthesized image with the photographs: exposure fit and consistency."""
 
 import pytest
 import torch
@@ -21,13 +20,13 @@ NOISE = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
 
 
 def observed() -> Warped:
-    """The left of the image; what is stored elsewhere means nothing."""
+    """Return the left of the image; pixels elsewhere have no meaning."""
     image = torch.where(SEEN[..., None], TRUTH, torch.zeros_like(TRUTH))
     return Warped(image, SEEN, torch.ones(96, 96), ())
 
 
 def told(*arguments) -> tuple[torch.Tensor, tuple[str, ...]]:
-    """The image and the notes of `checked`."""
+    """Return the image and the notes of `checked`."""
     found = checked(*arguments)
     return found.image, found.notes
 
@@ -78,7 +77,7 @@ def test_an_image_in_negative_is_no_colour_shift():
 
 @pytest.mark.parametrize("contrast", [0.5, 1.0])
 def test_the_limit_follows_the_contrast_of_the_scene(contrast):
-    """It is a share of what a single colour would leave, so that plain grey passes for nothing."""
+    """It is a fraction of the error of a single colour, so that plain grey never passes."""
     dull = 0.5 + contrast * (TRUTH - 0.5)
     found = compare(dull, dull, SEEN)
     assert found.agrees
@@ -145,7 +144,7 @@ def test_where_nothing_was_seen_nothing_is_said():
 
 
 class Talking:
-    """A generator of a user's own that tells something."""
+    """A user's generator with notes."""
 
     def __call__(self, nearest, target, context):
         image = torch.full((target.height, target.width, 3), 0.5)

@@ -1,4 +1,4 @@
-"""Stage 3, coarse: the affine is found, and its fallbacks say so."""
+"""Stage 3, coarse: the affine is found, and fallbacks are reported."""
 
 import pytest
 import torch
@@ -81,7 +81,7 @@ def test_the_same_seed_gives_the_same_fit():
 
 
 def checked(scale: float, context: torch.Tensor, config: AffineConfig = AffineConfig()):
-    """What becomes of an affine that fits the anchor, where the target sees `context`."""
+    """Check an affine that fits the anchor at a target with the depths `context`."""
     random = torch.Generator().manual_seed(0)
     through_anchor = DepthAffine(scale, 0.0, 0.9, "ransac")
     return unless_contradicted(
@@ -105,7 +105,7 @@ def test_an_affine_that_the_target_confirms_or_cannot_judge_stays():
 
 
 def unlike() -> torch.Tensor:
-    """Depths of no relation to any others."""
+    """Make depths without any relation to others."""
     return torch.rand(64, 64, generator=torch.Generator().manual_seed(5)) * 50
 
 

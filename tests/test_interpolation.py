@@ -1,4 +1,4 @@
-"""What is known in part is continued smoothly."""
+"""Values known in part of an image are continued smoothly."""
 
 import torch
 
