@@ -14,10 +14,7 @@ RADIUS, SIGMA = 5, 1.5
 def ssim_map(
     image: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "1 3 h w"]:
-    """Compute the structural similarity (Wang et al. 2004) around each pixel; differentiable.
-
-    Within RADIUS pixels of the border, windows are filled up with black.
-    """
+    """Compute structural similarity (Wang et al. 2004) around each pixel, padding with black."""
     offsets = torch.arange(2 * RADIUS + 1, dtype=image.dtype, device=image.device) - RADIUS
     line = torch.exp(-(offsets**2) / (2 * SIGMA**2))
     line = (line / line.sum()).repeat(3, 1)
