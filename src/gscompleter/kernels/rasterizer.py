@@ -1,23 +1,18 @@
 """Compiled tile rasteriser of 3D Gaussians, forward and backward, for CPUs.
 
-The image is cut into tiles of 16 × 16 pixels. Gaussians are projected to splats and entered into
-the lists of the tiles that they touch, front to back (`kernels/lists.py`). A tile walks its list; a
-splat touches the rows of its bounding box; a row of 16 pixels is one vector.
-LLVM does not find these vectors by itself, so the loop over the rows is written in its own language
-(the intrinsics below); it turns them into whatever the processor has.
+Gaussians are projected to splats and entered into the lists of the 16 × 16 tiles that they touch,
+front to back (`kernels/lists.py`). A row of a tile is one vector; LLVM does not find these vectors
+itself, so the loops over rows are intrinsics in its intermediate language.
 
-Two lists are walked at once, merged by depth: `context`, which is frozen and gets no gradient, and
-`new`, which does. Drawing a single scene leaves the context empty. Where new splats keep their
-place and change but their looks, the context is folded into their pixels once (`Fragments`).
+Two lists are merged by depth: the frozen `context`, and `new`, which gets gradients. If only the
+appearance of new splats changes, the context is baked into their pixels once (`Fragments`).
 
-Every kernel works on a range (begin, end) of its elements, or on the fragments of one, writes to
-its own part of the outputs and releases the interpreter lock: the caller shares ranges among
-threads, and the result does not depend on how.
+Kernels work on a range (begin, end) of elements or on fragments, write to their own outputs and
+release the interpreter lock. Results do not depend on how ranges are split among threads.
 
 A splat's falloff is `alpha = opacity * exp(-(s² + t²))` with whitened coordinates
-`s = u dx + v dy`, `t = w dy` of the offset (dx, dy) from its centre. `U = [[u, v], [0, w]]` obeys
-`UᵀU = ½ Σ⁻¹` for the 2D covariance Σ. Unlike the quadratic form of Σ⁻¹ it does not cancel for thin
-oblique splats.
+`s = u dx + v dy`, `t = w dy` of the offset (dx, dy) from its centre, and `U = [[u, v], [0, w]]`,
+`UᵀU = ½ Σ⁻¹` for the 2D covariance Σ. It does not cancel for thin oblique splats, as Σ⁻¹ would.
 """
 
 import math
@@ -30,10 +25,10 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 TILE = 16
-"""Side of a tile in pixels, and the number of pixels that one vector holds."""
+"""Side of a tile in pixels, and the number of lanes of a vector."""
 
 FIRST_ROWS = 1 << 14
-"""Rows of weights that there is room for at first, as many as a tile full of small splats has."""
+"""Initial number of rows for weights, enough for a tile full of small splats."""
 
 BLUR = np.float32(0.3)
 TANGENT_MARGIN = np.float32(0.15)
@@ -41,25 +36,25 @@ MIN_ALPHA = np.float32(1 / 255)
 MAX_ALPHA = np.float32(0.999)
 MIN_TRANSMITTANCE = np.float32(1e-4)
 SOLID = np.float32(0.5)
-"""Alpha above which a frozen splat is not folded with others. Where a pixel is closed among what is
-folded, its colour is off by at most `MIN_TRANSMITTANCE / SOLID`."""
+"""Alpha above which frozen splats are not baked; bounds colour errors by
+`MIN_TRANSMITTANCE / SOLID`."""
 
 X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
 """Columns of the splats."""
 NUM_SPLAT_COLUMNS = 9
 
 SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
-"""Columns of the gradients of an entry; green and blue follow red. SUM is the sum over pixels of
-`q = alpha dL/dalpha`, and the next five those of q times s, t, s², s t and t²."""
+"""Columns of an entry's gradients: sums of q = alpha dL/dalpha times 1, s, t, s², s t and t².
+
+Depth, red, green and blue follow."""
 NUM_GRADIENT_COLUMNS = 10
 
 OF_ALL, OF_OPACITY, OF_DEPTH, OF_COLOUR = range(4)
-"""Which gradients are wanted: all of them, or SUM, SUM_DEPTH or those of the three colours alone,
-which are then the only columns."""
+"""Gradients to compute: all columns, or only SUM, SUM_DEPTH or the three colours."""
 
 
 class Pinhole(NamedTuple):
-    """A camera, as the kernels want it."""
+    """A camera in the form that kernels read."""
 
     rotation: tuple[np.float32, ...]
     """Camera from world, nine numbers row by row."""
@@ -68,13 +63,13 @@ class Pinhole(NamedTuple):
     intrinsics: np.ndarray
     """fx, fy, cx, cy in pixels [4], float32."""
     near: np.float32
-    """Smallest z that is drawn."""
+    """Smallest z that is rendered."""
     width: int
     height: int
 
 
 class GaussianArrays(NamedTuple):
-    """Gaussians, or their gradients, all float32. See `gscompleter.types.Gaussians`."""
+    """Gaussians, or their gradients, all float32; see `gscompleter.types.Gaussians`."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -84,38 +79,35 @@ class GaussianArrays(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """Splats and, for each tile, the list of those that touch it, front to back."""
+    """Splats, and for each tile the list of those that touch it, front to back."""
 
     splats: np.ndarray
     """[n, 9] float32, columns X to BLUE."""
     opacities: np.ndarray
-    """[n] float32."""
     boxes: np.ndarray
-    """Pixels that a splat may touch, x from, x to, y from, y to (excluded) [n, 4] int16, or int32
-    in an image that is larger."""
+    """Pixels that a splat may touch: x from, x to, y from, y to (excluded) [n, 4], int16 or
+    int32."""
     tile_start: np.ndarray
-    """Where the list of each tile starts [tiles + 1] int64."""
+    """Start of the list of each tile [tiles + 1] int64."""
     entries: np.ndarray
     """Index of the splat [entries] int32."""
 
 
 class Frame(NamedTuple):
-    """An image, and what the backward pass needs of how it came about."""
+    """A rendered image, and the state that the backward pass needs."""
 
     image: np.ndarray
-    """[h, w, 3] float32."""
     depth: np.ndarray
-    """z-depth [h, w] float32, 0 where nothing is seen."""
+    """z-depth [h, w] float32, 0 for empty pixels."""
     alpha: np.ndarray
-    """[h, w] float32."""
     transmittance: np.ndarray
-    """What passes behind the last contribution [h, w] float32."""
+    """Transmittance behind the last contribution [h, w] float32."""
     last: np.ndarray
     """Position of the last contribution in the merged list of its tile, or -1 [h, w] int32."""
     used: np.ndarray
-    """How much of the two lists was walked until the tile was full [tiles, 2] int32."""
+    """Entries of both lists that were composited until the tile was full [tiles, 2] int32."""
     full: np.ndarray
-    """Whether no pixel of the tile lets anything more pass [tiles] bool."""
+    """True for tiles without any transmittance left [tiles] bool."""
 
 
 # ---- Vectors of 16 pixels in LLVM's intermediate representation ------------------------------
@@ -153,11 +145,7 @@ class _Lanes:
         return _Lanes(self.builder, self.builder.fsub(self._value_of(other), self.value))
 
     def times(self, factor, plus):
-        """self * factor + plus, rounded once where the processor can do that.
-
-        The rounding is asked for here and not left to the optimiser, so that the backward pass
-        arrives at the very alphas of the forward pass.
-        """
+        """Compute self * factor + plus with a single rounding, the same in both passes."""
         multiply_add = cgutils.get_or_insert_function(
             self.builder.module,
             ir.FunctionType(_FLOATS, [_FLOATS, _FLOATS, _FLOATS]),
@@ -167,7 +155,7 @@ class _Lanes:
         return _Lanes(self.builder, self.builder.call(multiply_add, arguments))
 
     def compare(self, relation, other):
-        """Mask of the lanes where the relation holds; it never holds for NaN."""
+        """Compare lane by lane; False for NaN."""
         return self.builder.fcmp_ordered(relation, self.value, self._value_of(other))
 
     def where(self, mask, otherwise):
@@ -176,10 +164,7 @@ class _Lanes:
 
 
 def _sums_of_lanes(builder, vectors):
-    """One vector whose lane k is the sum of the lanes of the k-th of up to sixteen vectors.
-
-    Two vectors are added into one, half of whose lanes stand for each, until one is left.
-    """
+    """Sum the lanes of each of up to sixteen vectors into one lane of the result."""
     values = [vector.value for vector in vectors]
     undefined = ir.Constant(_FLOATS, ir.Undefined)
     width = TILE
@@ -210,7 +195,7 @@ def _broadcast(builder, scalar, vector_type=_FLOATS):
 
 
 def _exp_of_negative(values):
-    """exp(-values) for values >= 0; everything beyond 80 is as good as 0."""
+    """Compute exp(-values) for values >= 0; beyond 80 it is practically 0."""
     builder = values.builder
     power = values * -_LOG2_E
     power = power.where(power.compare(">", -120.0), -120.0)
@@ -226,7 +211,7 @@ def _exp_of_negative(values):
 
 
 class _Rows:
-    """Rows of a tile's arrays, each row some vectors one after the other."""
+    """Rows of a tile's arrays, each of them several vectors."""
 
     def __init__(self, context, builder, array_type, array, vector_type, vectors_per_row):
         self.builder, self.vector_type = builder, vector_type
@@ -247,7 +232,7 @@ class _Rows:
 
 
 class _Splat:
-    """A splat and the tile it is drawn to, as the intrinsics receive them."""
+    """A splat relative to its tile, as the intrinsics receive it."""
 
     def __init__(self, builder, x, y, u, v, w, opacity, red, green, blue, depth):
         self.builder = builder
@@ -261,7 +246,7 @@ class _Splat:
         self.opacity = _Lanes(builder, _broadcast(builder, opacity))
 
     def falloff(self, row):
-        """dy of the row, and of its pixels alpha before it is capped, capped, and its mask."""
+        """Return dy of a row, and alpha before and after capping, and its mask."""
         builder = self.builder
         dy = builder.fsub(builder.sitofp(row, _FLOAT), self.y)
         s = self.u_dx + _Lanes(builder, _broadcast(builder, builder.fmul(self.v, dy)))
@@ -273,7 +258,7 @@ class _Splat:
 
 
 def _for_each_row(builder, rows, position, row_limit, body):
-    """Run `body(row)` for the rows in question for which `position` lies within `row_limit`."""
+    """Run `body(row)` for the rows whose limit is not below `position`."""
     begin, end = rows
     with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
         limit = builder.load(builder.gep(row_limit, [loop.index]))
@@ -282,10 +267,9 @@ def _for_each_row(builder, rows, position, row_limit, body):
 
 
 def _blend(splat, state, row):
-    """Composite a splat over a row: its weights, where it is visible, and what still lets pass.
+    """Composite a splat over a row; return its weights and where it is visible and passing.
 
-    state: `_Rows` of the transmittance and the sums of as many of red, green, blue and depth as
-        it holds.
+    state: `_Rows` of the transmittance and sums of red, green, blue and depth, or fewer.
     """
     builder = splat.builder
     _, _, alpha, visible = splat.falloff(row)
@@ -303,7 +287,7 @@ def _blend(splat, state, row):
 
 
 def _close_if_full(builder, passing, limits, row, filled):
-    """Set the limit of a row to -1 where nothing passes it any more, and count it."""
+    """Set the limit of a row to -1 and count it once it has no transmittance left."""
     any_passing = builder.bitcast(passing, ir.IntType(TILE))
     none = builder.icmp_unsigned("==", any_passing, ir.Constant(ir.IntType(TILE), 0))
     with builder.if_then(none, likely=False):
@@ -313,14 +297,12 @@ def _close_if_full(builder, passing, limits, row, filled):
 
 @intrinsic
 def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
-    """Composite a splat over the rows begin..end of a tile; returns how many of them it filled.
+    """Composite a splat over the rows begin..end of a tile; return how many it filled.
 
-    state: [16, 5, 16] float32, per row the transmittance and the sums of red, green, blue and
-        depth. A pixel that lets nothing more pass carries its transmittance with a minus.
-    last: [16, 16] int32, position of the last contribution.
-    row_limit: [16] int32, set to -1 where a row is full.
-    splat: x and y relative to the centre of the tile's first pixel, u, v, w, opacity, red, green,
-        blue and depth.
+    state: [16, 5, 16] float32, per row the transmittance, negative in full pixels, and the sums of
+    red, green, blue and depth. last: [16, 16] int32, position of the last contribution. row_limit:
+    [16] int32, -1 in full rows. splat: x and y relative to the first pixel centre, u, v, w,
+    opacity, red, green, blue and depth.
     """
     signature = types.int64(types.int64, types.int64, types.int32, state, last, row_limit, splat)
 
@@ -349,8 +331,7 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
 def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
     """Composite a splat over the rows begin..end of a tile, and keep its weights.
 
-    state: [16, 4, 16] float32, without the depth.
-    kept: [rows, 16] float32; the weights of row `begin` go to its row `place`, and so on.
+    state: [16, 4, 16] float32, without depth. kept: [rows, 16] float32, from row `place` on.
     """
     signature = types.int64(types.int64, types.int64, types.int64, state, row_limit, kept, splat)
 
@@ -379,12 +360,10 @@ def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
 
 @intrinsic
 def _spread_rows(typing, begin, end, place, state, kept, sums):
-    """Sum the weights that were kept of a splat, times what lies in the image, over its rows.
+    """Sum the weights that `_weigh_rows` kept of a splat times the image over its rows.
 
-    state: [16, 4, 16] float32, whose rows hold red, green and blue from the second vector on.
-    kept, place: as `_weigh_rows` left them.
-    sums: [16] float32, the first four of which receive the sums of weight times red, green and
-        blue, and of the weight.
+    state: [16, 4, 16] float32, with red, green and blue from the second vector on. sums: [16]
+    float32 receives the sums of weight times red, green and blue, and of the weight.
     """
     signature = types.void(types.int64, types.int64, types.int64, state, kept, sums)
 
@@ -414,11 +393,7 @@ def _spread_rows(typing, begin, end, place, state, kept, sums):
 
 @intrinsic
 def _fall_off(typing, row, falloffs, splat):
-    """Write the alphas of a splat in a row of its tile before they are capped, of pixels that it is
-    visible in, and of the others 0.
-
-    falloffs: [16] float32.
-    """
+    """Write the uncapped alphas of a splat in a row to `falloffs` [16]; 0 if invisible."""
     signature = types.void(types.int64, falloffs, splat)
 
     def generate(context, builder, signature, arguments):
@@ -433,22 +408,17 @@ def _fall_off(typing, row, falloffs, splat):
 
 
 def _undraw(wanted):
-    """An intrinsic that takes a splat off a tile again, back to front.
-
-    `wanted` names what it sums up for the gradients: "nothing", "opacity", "depth", "colour" or
-    "all".
-    """
+    """Make an intrinsic that reverts a splat, with sums for the `wanted` gradients."""
 
     @intrinsic
     def undraw_rows(typing, begin, end, position, state, last, row_limit, sums, splat):
-        """Walk back over the rows begin..end of a splat.
+        """Revert the rows begin..end of a splat, back to front.
 
-        state: [16, 7, 16] float32, per row the transmittance behind the splat, the sum behind it
-            of weight times gradient, and dL/d of red, green, blue, depth sum and alpha.
-        last, row_limit: as filled by the forward pass; a row's limit is the largest of its last.
-        sums: [16] float32, the first ten of which receive the sums over the pixels of q, q dx,
-            q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha) and of weight times dL/d depth, red,
-            green and blue.
+        state: [16, 7, 16] float32, per row the transmittance and the sum of weight times gradient
+        behind the splat, and dL/d of red, green, blue, depth sum and alpha. last, row_limit: as
+        left by the forward pass; a row's limit is the largest of its last. sums: [16] float32
+        receives the sums of q, q dx, q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha), and of
+        weight times dL/d depth, red, green and blue.
         """
         signature = types.void(
             types.int64, types.int64, types.int32, state, last, row_limit, sums, splat
@@ -561,7 +531,7 @@ def _applied(a, x, y, z):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _unit(quats, i):
-    """Quaternion i brought to length 1, and the factor that did it."""
+    """Normalise quaternion i; also return the factor."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     factor = np.float32(1) / math.sqrt(w * w + x * x + y * y + z * z)
     return w * factor, x * factor, y * factor, z * factor, factor
@@ -585,7 +555,7 @@ def _rotation(w, x, y, z):
 
 @njit(cache=True, fastmath={"contract"})
 def _rotation_backward(w, x, y, z, d):
-    """Gradient of the unit quaternion from that of its rotation matrix."""
+    """Compute the gradient of a unit quaternion from that of its rotation matrix."""
     two = np.float32(2)
     return (
         two * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
@@ -612,7 +582,7 @@ def _scaled_columns(a, x, y, z):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _tangent_limits(pinhole):
-    """Least and largest x/z, and the same of y/z, that the Jacobian is evaluated at."""
+    """Compute the range of x/z and of y/z at which the Jacobian is evaluated."""
     fx, fy, cx, cy = pinhole.intrinsics
     width, height = np.float32(pinhole.width), np.float32(pinhole.height)
     margin_x, margin_y = TANGENT_MARGIN * width, TANGENT_MARGIN * height
@@ -626,7 +596,7 @@ def _tangent_limits(pinhole):
 
 @njit(cache=True, fastmath={"contract"})
 def _flattened(axes, jacobian):
-    """The Gaussian's axes (columns, in the camera) seen in the image: a 2 × 3 matrix, by rows.
+    """Project the axes of a Gaussian (columns, in the camera) to a 2 × 3 matrix, by rows.
 
     jacobian: d pixel x / dx, d pixel x / dz, d pixel y / dy, d pixel y / dz.
     """
@@ -654,7 +624,7 @@ _C3XX = np.float32(1.445305721320277)
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _direction(center, means, i):
-    """Unit vector from the camera centre to the mean, and their inverse distance."""
+    """Compute the unit vector from the camera centre to the mean, and the inverse distance."""
     x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
     inverse = np.float32(1) / math.sqrt(x * x + y * y + z * z)
     return x * inverse, y * inverse, z * inverse, inverse
@@ -662,7 +632,7 @@ def _direction(center, means, i):
 
 @njit(cache=True, fastmath={"contract"})
 def _evaluate_basis(x, y, z, basis):
-    """Fill `basis`, of length 1, 4, 9 or 16, for a unit direction."""
+    """Evaluate 1, 4, 9 or 16 basis functions at a unit direction."""
     two, three, four = np.float32(2), np.float32(3), np.float32(4)
     xx, yy, zz = x * x, y * y, z * z
     basis[0] = _C0
@@ -686,7 +656,7 @@ def _evaluate_basis(x, y, z, basis):
 
 @njit(cache=True, fastmath={"contract"})
 def _basis_slope(x, y, z, g):
-    """Gradient with respect to the direction of the sum of g[k] times basis function k."""
+    """Compute the gradient in the direction of the sum of g[k] times basis function k."""
     two, three, four = np.float32(2), np.float32(3), np.float32(4)
     six, eight = np.float32(6), np.float32(8)
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
@@ -716,12 +686,10 @@ def _basis_slope(x, y, z, g):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def project(begin, end, gaussians, pinhole, splats, boxes, factors):
-    """Project the Gaussians begin..end; those that cannot be seen get an empty box.
+    """Project the Gaussians begin..end to `splats` and `boxes`, empty if invisible.
 
-    gaussians: GaussianArrays of n. splats [n, 9] float32 and boxes [n, 4] are written. The
-    box encloses the pixels where the alpha of a splat of this opacity reaches 1/255.
-    factors: [n] float32 for antialiased Gaussians, written: what their opacities are multiplied
-        by here. None for others, which are compiled on their own.
+    A box encloses the pixels in which alpha reaches 1/255 at the given opacity. factors [n]
+    receives the factors on the opacities of antialiased Gaussians, and is None for classic ones.
     """
     means, quats, scales, opacities, sh = gaussians
     view, center, near = pinhole.rotation, pinhole.center, pinhole.near
@@ -802,7 +770,7 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
 
 @njit(cache=True)
 def _depth_at(splats, entries, place, begin, end, beyond):
-    """Depth of an entry, or `beyond` where the place lies outside of begin..end."""
+    """Return the depth of an entry, or `beyond` for places outside begin..end."""
     if place < begin or place >= end:
         return beyond
     return splats[entries[place], DEPTH]
@@ -810,14 +778,11 @@ def _depth_at(splats, entries, place, begin, end, beyond):
 
 @njit(cache=True, nogil=True)
 def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth_limits):
-    """Merge the lists of the tiles begin..end of two layers, as far as they were walked.
+    """Merge the lists of the tiles begin..end of two layers, as far as they were composited.
 
-    What was not reached without anything in front of it is not reached with something in front.
-
-    context, new: Layer. used [tiles, 2] int32, full [tiles] bool: as `composite` left them.
-    tile_start [tiles + 1] int64: where the merged lists start.
-    entries [e] int32 is written; the splats of `new` are numbered after those of the context.
-    depth_limits [tiles] float32 is written: the z-depth behind which a tile shows nothing.
+    used [tiles, 2], full [tiles]: as left by `composite`. tile_start: starts of the merged lists.
+    entries [e] is written; splats of `new` are numbered after those of the context. depth_limits
+    [tiles] is written: the z-depth behind which a tile shows nothing.
     """
     c_splats, _, _, c_start, c_entries = context
     n_splats, _, _, n_start, n_entries = new
@@ -854,7 +819,7 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
 
 @njit(cache=True)
 def _aligned(size):
-    """An array of float32 that starts at a cache line, so that no vector straddles two."""
+    """Allocate float32 values from a cache line on, so that no vector straddles two."""
     buffer = np.empty(size + TILE, np.float32)
     start = (-buffer.ctypes.data % 64) // 4
     return buffer[start : start + size]
@@ -862,7 +827,7 @@ def _aligned(size):
 
 @njit(cache=True, fastmath={"contract"})
 def _placed(splats, opacities, boxes, i, left, top):
-    """Rows of the tile at (left, top) that splat i touches, and the splat relative to the tile."""
+    """Return the rows of the tile at (left, top) that splat i touches, and the relative splat."""
     half = np.float32(0.5)
     return (
         max(np.int64(boxes[i, 2]) - top, 0),
@@ -884,10 +849,7 @@ def _placed(splats, opacities, boxes, i, left, top):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def composite(begin, end, tiles, context, new, frame):
-    """Draw tiles[begin:end] of two layers merged by depth; of equals the context is in front.
-
-    context, new: Layer. frame: Frame, of which these tiles are written.
-    """
+    """Composite tiles[begin:end] of two layers into `frame`, the context first at equal depth."""
     # Taking an array out of a tuple counts references, which must not happen in the loops.
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -948,7 +910,7 @@ def composite(begin, end, tiles, context, new, frame):
 
 @njit(cache=True, nogil=True)
 def _with_room(kept, used):
-    """`kept`, or what is `used` of it with twice as many rows where a tile's more do not fit."""
+    """Double the rows of `kept` if another tile height does not fit."""
     if used + TILE <= len(kept):
         return kept
     wider = _aligned(2 * kept.size).reshape((2 * len(kept), TILE))
@@ -961,17 +923,10 @@ def _with_room(kept, used):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, written):
-    """Draw tiles[begin:end] and give what the image lacks back to the new layer's entries.
+    """Composite tiles[begin:end] and backproject the residual to the entries of `new`.
 
-    The weights of a splat in the pixels of a tile stay in the cache until the image of the tile is
-    finished: nothing is computed twice.
-
-    context, new: Layer.
-    photograph: [h, w, 3] float32, that the image should be.
-    slots [e] int32: slot of each entry of `new`.
-    sums [slots, 4] float32: over the pixels of the tile, of the entry's weight times what the
-        photograph has more than the image in red, green and blue, and of the weight.
-    written [slots] bool: set for the slots, and only those, that are drawn.
+    A splat's weights stay in the cache until the image of its tile is finished. slots: as below.
+    sums [slots, 4]: over the tile, weight times (photograph - image) per colour, and weight.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -1037,14 +992,12 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
 def composite_backward(
     begin, end, tiles, context, new, frame, slopes, slots, wanted, gradients, written
 ):
-    """Walk tiles[begin:end] back to front and sum up the gradients of the new layer's entries.
+    """Traverse tiles[begin:end] back to front and sum the gradients of the entries of `new`.
 
-    slopes: gradients of the frame's image [h, w, 3], depth [h, w] and alpha [h, w].
-    slots [e] int32: slot of each entry of `new`.
-    wanted: OF_ALL, OF_OPACITY, OF_DEPTH or OF_COLOUR.
-    gradients [slots, 10] float32, columns SUM to SUM_RED + 2; [slots, 1] or, of colours, [slots, 3]
-        where less is wanted.
-    written [slots] bool: set for the slots, and only those, that receive a gradient.
+    d_frame: gradients of image [h, w, 3], depth [h, w] and alpha [h, w]. slots [e] int32: slot of
+    each entry of `new`. wanted: WANT_ALL, WANT_OPACITY, WANT_DEPTH or WANT_COLOR, with 10, 1, 1 or
+    3 columns. gradients [slots, columns] is written, and written [slots] bool set, for visited
+    entries only.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -1131,8 +1084,10 @@ def composite_backward(
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _compensation_backward(flat, q):
-    """Gradient of the flattened axes (see `_flattened`) from that of the logarithm of the factor
-    `sqrt(P / D)`, P being the squared area that they span and D the determinant with the blur."""
+    """Compute the gradient of the flattened axes from that of log sqrt(P / D).
+
+    P is the squared area that they span, D the determinant with the blur.
+    """
     a0, a1, a2 = np.float64(flat[0]), np.float64(flat[1]), np.float64(flat[2])
     b0, b1, b2 = np.float64(flat[3]), np.float64(flat[4]), np.float64(flat[5])
     c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
@@ -1154,12 +1109,10 @@ def _compensation_backward(flat, q):
 def project_backward(
     begin, end, gaussians, pinhole, factors, splats, slot_start, gradients, written, slopes
 ):
-    """Gradients of the Gaussians begin..end from those of their entries in the tiles.
+    """Write gradients of the Gaussians begin..end to `d_gaussians` from those of entries.
 
-    gaussians, pinhole, factors, splats: as in `project`.
-    gradients [slots, 10] float32, where written [slots]: the slots from slot_start[i] to
-        slot_start[i + 1] belong to Gaussian i.
-    slopes: GaussianArrays of gradients, written where one arrives.
+    gaussians, pinhole, factors, splats: as in `project`. slot_start, gradients, written: as in
+    `sum_entries`.
     """
     means, quats, scales, opacities, sh = gaussians
     d_means, d_quats, d_scales, d_opacities, d_sh = slopes
@@ -1282,43 +1235,40 @@ def project_backward(
 
 
 class Fragments(NamedTuple):
-    """The pixels of new splats, tile by tile, pixel by pixel, and in each front to back.
+    """Fragments of new splats, ordered by tile, pixel and depth.
 
-    All that is frozen between two fragments of a pixel is folded into one transmittance and one
-    colour; mostly it is nothing. Frozen splats that are `SOLID` have fragments of their own where
-    anything new is before them, so that a pixel is closed at the very splat at which `composite`
-    closes it.
+    Frozen content between two fragments of a pixel is baked into one layer. `SOLID` frozen splats
+    behind anything new are fragments themselves, so that pixels end at the same splat as in
+    `composite`.
     """
 
     tiles: np.ndarray
-    """The tiles that have any, and maybe others [t] int64."""
+    """Tiles that may have fragments [t] int64."""
     entry_start: np.ndarray
-    """Where the entries of each of these start [t + 1] int64."""
+    """Start of the entries of each of them [t + 1] int64."""
     names: np.ndarray
-    """Which new splat each entry is, or the complement of which of `solid` [e] int32."""
+    """New splat of each entry, or the complement of an index into `solid` [e] int32."""
     slots: np.ndarray
-    """Where the gradient of each entry goes; -1 for a frozen one [e] int32."""
+    """Slot of the gradient of each entry; -1 if frozen [e] int32."""
     pixel_start: np.ndarray
-    """Where the fragments of each pixel start, row by row, and the end [t, TILE² + 1] int64."""
+    """Start of the fragments of each pixel, row by row [t, TILE² + 1] int64."""
     entries: np.ndarray
-    """Which entry of its tile each fragment is of; behind the entries of a tile its folds are
-    counted [f] int32."""
+    """Entry of each fragment in its tile; baked layers are numbered after them [f] int32."""
     falloffs: np.ndarray
-    """Its alpha at opacity 1, of a frozen one its alpha, of a fold nothing [f] float32."""
+    """Alpha at opacity 1, alpha of frozen ones, unused for baked layers [f] float32."""
     fold_start: np.ndarray
-    """Where the folds of each tile start [t + 1] int64."""
+    """Start of the baked layers of each tile [t + 1] int64."""
     folds: np.ndarray
-    """Transmittance, and colour, of what is folded [g, 4] float32."""
+    """Transmittance and colour of the baked layers [g, 4] float32."""
     solid: np.ndarray
-    """Colours of the frozen splats that have entries [s, 3] float32."""
+    """Colours of the frozen splats with entries [s, 3] float32."""
     behind: np.ndarray
-    """Colour of what is folded behind the last fragment of each pixel [h, w, 3] float32."""
+    """Colour baked behind the last fragment of each pixel [h, w, 3] float32."""
 
 
 @njit(cache=True, fastmath={"contract"})
 def _within(boxes, i, left, top):
-    """Columns and rows that splat i may touch of the tile at (left, top): x from, x to, y from,
-    y to (excluded)."""
+    """Clip the box of splat i to the tile at (left, top)."""
     return (
         max(np.int64(boxes[i, 0]) - left, 0),
         min(np.int64(boxes[i, 1]) - left, TILE),
@@ -1329,7 +1279,7 @@ def _within(boxes, i, left, top):
 
 @njit(cache=True)
 def _most_fragments(tile, left, top, context, new):
-    """The most entries and fragments that a tile can have."""
+    """Bound the number of entries and fragments of a tile."""
     _, c_opacities, c_boxes, c_start, c_entries = context
     _, _, n_boxes, n_start, n_entries = new
     entries = fragments = 0
@@ -1347,8 +1297,7 @@ def _most_fragments(tile, left, top, context, new):
 
 @njit(cache=True, fastmath={"contract"})
 def _covered(pixel, alpha, red, green, blue):
-    """A pixel (its transmittance, which gets a minus where nothing more passes, and its colour)
-    with a splat behind what it shows."""
+    """Composite a splat behind a pixel, whose transmittance becomes negative if it is full."""
     transmittance = pixel[0]
     after = transmittance * (np.float32(1) - alpha)
     if after <= MIN_TRANSMITTANCE:
@@ -1361,9 +1310,7 @@ def _covered(pixel, alpha, red, green, blue):
 def _by_pixel(
     pixels, entries, falloffs, count, first_fold, behind, begin, starts, to_entries, to_falloffs
 ):
-    """Write the `count` fragments of a tile from `begin` on, those of a pixel together and in their
-    order; starts [TILE² + 1] tells where. Folds, from `first_fold` on, are counted from `behind`.
-    """
+    """Sort the fragments of a tile by pixel, stably, and number baked layers from `behind`."""
     starts[:] = 0
     for k in range(count):
         starts[pixels[k]] += 1
@@ -1384,12 +1331,10 @@ def _by_pixel(
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
-    """The Fragments of tiles[begin:end] of two layers, where what is frozen is folded.
+    """Find the Fragments of tiles[begin:end] of two layers, and bake the context between them.
 
-    context, new: Layer; the opacities of `new` are those of opaque Gaussians.
-    new_slots [entries] int32: their slots.
-    where [h, w] bool: the pixels that are to have fragments. behind [h, w, 3] float32 is written
-        in these tiles.
+    new has the opacities of opaque Gaussians; new_slots [entries] int32 are its slots. where [h, w]
+    bool: pixels that get fragments. behind [h, w, 3] float32 is written.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -1548,8 +1493,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
 
 @njit(cache=True)
 def _looks(fragments, index, opacities, colours):
-    """Opacity and colour of each entry of a tile, of a frozen one 1 and its colour, and behind them
-    the folds [entries + folds, 4]; and the number of entries."""
+    """Gather opacity and colour of each entry of a tile and its baked layers, and count entries."""
     first, first_fold = fragments.entry_start[index], fragments.fold_start[index]
     count = fragments.entry_start[index + 1] - first
     folds = fragments.fold_start[index + 1] - first_fold
@@ -1572,11 +1516,10 @@ def _looks(fragments, index, opacities, colours):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def draw_fragments(fragments, opacities, colours, image):
-    """Draw the pixels that have fragments.
+    """Render the pixels that have fragments into `image` [h, w, 3].
 
-    Whether one is a fold is no branch: processors cannot foretell it.
-
-    opacities [n], colours [n, 3] float32: of the new splats. image [h, w, 3] float32 is written.
+    opacities [n], colors [n, 3]: of the new splats. Baked layers take no branch: it would
+    mispredict.
     """
     tiles, _, _, _, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
@@ -1610,11 +1553,10 @@ def draw_fragments(fragments, opacities, colours, image):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def compare_fragments(fragments, image, wanted, weights, slopes, errors):
-    """Compare the pixels that have fragments with what is wanted there.
+    """Compute squared errors and gradients of the pixels that have fragments.
 
-    image, wanted [h, w, 3], weights [h, w] float32. slopes [h, w, 3] float32, those of the error in
-        the image, are written. errors [h * w / TILE²] float64: for each tile the sum of weights
-        times squared differences of all channels is written.
+    image, wanted [h, w, 3], weights [h, w] float32. d_image [h, w, 3] float32 is written, and
+    errors [tiles] float64: weighted squared differences of all channels.
     """
     tiles, starts = fragments.tiles, fragments.pixel_start
     tiles_x = (image.shape[1] + TILE - 1) // TILE
@@ -1636,13 +1578,10 @@ def compare_fragments(fragments, image, wanted, weights, slopes, errors):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradients, written):
-    """Gradients of the new entries from those of the image [h, w, 3].
+    """Compute the gradients of the entries from those of the image, front to back.
 
-    It walks front to back like `draw_fragments`, whose arguments and image it takes: what is behind
-    a fragment is the image less what is before.
-
-    gradients [slots, 4] float32: of opacity, red, green and blue. written [slots] bool: set for the
-        slots, and only those, that receive a gradient.
+    Content behind a fragment is the image less what precedes it. gradients [slots, 4]: opacity,
+    colour.
     """
     tiles, entry_start, _, slots, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
@@ -1691,10 +1630,7 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def shade(begin, end, rows, center, means, sh, colours):
-    """Colours of the Gaussians rows[begin:end] as seen from `center`, from 0 up.
-
-    means [n, 3], sh [n, k, 3]. colours [n, 3] float32 is written.
-    """
+    """Compute the colours of the Gaussians rows[begin:end] as seen from `center`, from 0 up."""
     basis = np.empty(sh.shape[1], np.float32)
     half, zero = np.float32(0.5), np.float32(0)
     for index in range(begin, end):
@@ -1710,11 +1646,7 @@ def shade(begin, end, rows, center, means, sh, colours):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def shade_backward(begin, end, rows, center, means, colours, d_colours, d_sh):
-    """Gradients of spherical harmonics from those of colours, of the Gaussians rows[begin:end].
-
-    colours [n, 3]: as `shade` left them; what is cut off at 0 has no gradient. d_sh [n, k, 3]
-    float32 is written.
-    """
+    """Compute gradients of the harmonics rows[begin:end]; colours cut off at 0 have none."""
     basis = np.empty(d_sh.shape[1], np.float32)
     for index in range(begin, end):
         i = rows[index]

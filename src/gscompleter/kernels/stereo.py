@@ -320,9 +320,9 @@ def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
     Args:
         costs: Costs 0..254, in the order of `bands`.
         bands: Planes of each tile; planes missing in the previous tile are reached by a jump.
-        large_x, large_y, large_d, large_u: Penalties of a jump between a pixel and its right [h, w
-            - 1], lower [h - 1, w] and lower right neighbour [h - 1, w - 1], and between (y, x + 1)
-            and (y + 1, x) [h - 1, w - 1]; int16, at most 3000, so that the sum does not overflow.
+        large_x, large_y, large_d, large_u: Penalties of a jump between a pixel and its right
+            [h, w - 1], lower [h - 1, w] and lower right neighbour, and along the other diagonal
+            [h - 1, w - 1]; int16, at most 3000, so that sums do not overflow.
         small: Penalty of a step by one plane.
     """
     # Each half has its own sum, so that two threads can work and order does not matter.
@@ -387,9 +387,8 @@ def reproject(depth, other, b_from_a, a_from_b):
         b_from_a, a_from_b: Pixel transforms [3, 4].
 
     Returns:
-        The distance between each pixel and its image, in pixels, or -1 if it falls outside b [h,
-        w];
-        and its z-depth in b relative to b's own depth [h, w].
+        The distance between each pixel and its image, in pixels, or -1 if it falls outside b
+        [h, w]; and its z-depth in b relative to b's own depth [h, w].
     """
     error = np.full(depth.shape, np.float32(-1), np.float32)
     ratio = np.ones(depth.shape, np.float32)

@@ -24,7 +24,7 @@ def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations
     the bit.
 
     Args:
-        heights, slopes: Initial values [h, w] and [2, h, w] (x, y); updated in place.
+        heights, gradients: Initial values [h, w] and [2, h, w] (x, y); updated in place.
         data, weight: Measured heights and their weights [h, w]; 0 without measurement.
         across, down: Cost of a step to the right and to the pixel below [h, w].
         bend: Cost of a change of gradient.
