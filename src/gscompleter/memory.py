@@ -32,12 +32,7 @@ _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_b
 
 
 def check_memory(pixels: int, images: int) -> None:
-    """Raise InputError if a completion needs more memory than there is.
-
-    Args:
-        pixels: Pixels of the largest image, at working resolution.
-        images: Number of context views and targets together.
-    """
+    """Raise InputError if `images` of up to `pixels` pixels need more memory than there is."""
     number = f"{quoted(f'{images:,}')} images of up to {quoted(f'{pixels:,}')} pixels"
     remedy = "choose a smaller resolution, or fewer views"
     _refuse_beyond_memory(needed_bytes(pixels, images), number, remedy, "resolution")
@@ -49,13 +44,7 @@ def needed_bytes(pixels: int, images: int) -> int:
 
 
 def check_scene_memory(count: int, photographs: int, needed: int) -> None:
-    """Raise InputError if `needed` bytes, for an input splat, exceed the memory.
-
-    Args:
-        count: Number of Gaussians.
-        photographs: Number of photographs.
-        needed: Estimated peak memory, in bytes.
-    """
+    """Raise InputError if `needed` bytes, for `count` Gaussians, exceed the memory."""
     number = f"The {quoted(f'{count:,}')} Gaussians of the scene and {photographs} photographs"
     remedy = "bring a part of the scene, or a folder with fewer photographs"
     _refuse_beyond_memory(needed, number, remedy)

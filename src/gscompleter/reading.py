@@ -71,16 +71,10 @@ def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
 def read_lines(
     path: Path, longest: int = MAX_LINE, most: int = MAX_TEXT, errors: str = "replace"
 ) -> Iterator[str]:
-    """Read the lines of a UTF-8 text file one by one, with their line ends.
+    """Read the lines of a UTF-8 text file one by one; raise InputError if it is too long.
 
-    Args:
-        path: The file.
-        max_length: Characters of a line.
-        max_bytes: Bytes of the file.
-        errors: Treatment of invalid bytes, as in `bytes.decode`.
-
-    Raises:
-        InputError: The file cannot be read, or the file or a line is longer.
+    Lines have at most `max_length` characters, the file `max_bytes` bytes. `errors` as in
+    `bytes.decode`.
     """
     try:
         with open_file(path) as file:

@@ -44,7 +44,6 @@ def _float_of(typing, bits):
 
 @njit(cache=True, fastmath={"contract"})
 def _acos(x):
-    """Compute the arccosine to 1e-7 radians, with |x| capped at 1."""
     one = np.float32(1)
     away = min(abs(x), one)
     series = _A3 + away * (_A4 + away * (_A5 + away * (_A6 + away * _A7)))
@@ -106,10 +105,10 @@ def _listen(x, y, z, rays, center, turn, areas, agreement, heard):
 def support(begin, end, centers, areas, agreement, means, sums, place, max_turn, enough, values):
     """Compute the trust of the Gaussians begin..end as seen from a camera; 1 if it sees nothing.
 
-    centers [k, 3], areas [k, n], agreement [k, n] float32: see `gscompleter.types.Evidence`. sums
-    [n] float32: compositing weights at the camera. place: its `CameraPose`. max_turn: angle at
-    which the weight of a photograph has fallen to 1/e, in radians. enough: share of the area seen
-    by the camera that a photograph has to see for full trust.
+    centers [k, 3], areas [k, n], agreement [k, n] float32: see `gscompleter.types.Evidence`.
+    sums [n] float32: compositing weights at the camera. place: its `CameraPose`.
+    max_turn: angle at which the weight of a photograph has fallen to 1/e, in radians.
+    enough: share of the area seen by the camera that a photograph has to see for full trust.
     """
     one, turn = np.float32(1), np.float32(1) / max_turn
     known = np.empty((6, BLOCK), np.float32)

@@ -56,8 +56,8 @@ def places_of(counts):
 def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entries, keys):
     """Enter the splats begin..end into the lists of the tiles they touch; see `count_entries`.
 
-    places [tiles] int32: next free entry of each tile; counted up. entries, keys [e]: receive the
-    index of the splat, int32, and the bits of its depth, uint32.
+    places [tiles] int32: next free entry of each tile; counted up.
+    entries, keys [e]: receive the index of the splat, int32, and the bits of its depth, uint32.
     """
     for i in range(begin, end):
         for tile_y in range(boxes[i, 2] >> TILE_SHIFT, (boxes[i, 3] + TILE - 1) >> TILE_SHIFT):
@@ -108,7 +108,7 @@ def sort_lists(begin, end, tile_start, entries, keys):
 
 @njit(cache=True, nogil=True)
 def number_slots(entries, count):
-    """Number the entries [e] so that the gradients of a splat are adjacent.
+    """Assign slots to the entries [e] so that the gradients of a splat are adjacent.
 
     Returns the slot of each entry [e] int32, and the first slot of each splat [count + 1] int64.
     """
@@ -129,10 +129,7 @@ def number_slots(entries, count):
 
 @njit(cache=True, nogil=True)
 def number_by_use(entries, count):
-    """Number the splats 0..count in the order in which `entries` [e] first use them.
-
-    Returns the used splats in this order [m] int32, and the renumbered entries [e] int32.
-    """
+    """Renumber `entries` by the first use of splats; return the used splats in order, and them."""
     numbers = np.full(count, -1, np.int32)
     order, renamed = np.empty(count, np.int32), np.empty_like(entries)
     used = 0

@@ -133,16 +133,9 @@ def _prior(costs, nearer, dy, dx):
 def search(matched, costs, field, rounds, max_reach, seed):
     """Improve the nearest source patch of every query, by propagation and random search.
 
-    Args:
-        problem: Queries and sources.
-        costs: Costs of a match.
-        field: Matches (source, y, x) [q, 3], all of them usable; updated in place.
-        rounds: Passes of propagation and random search.
-        max_reach: Radius of the random search at its start, in pixels.
-        seed: Seed of the random search.
-
-    Returns:
-        The cost of every match [q] and its shift of colour [q, 3].
+    field: matches (source, y, x) [q, 3], all of them usable; updated in place.
+    max_reach: radius of the random search at its start, in pixels.
+    Returns the cost of every match [q] and its shift of colour [q, 3].
     """
     count = len(matched.queries)
     cost, shift = np.full(count, np.inf, np.float32), np.zeros((count, 3), np.float32)
@@ -225,11 +218,8 @@ def _improve(begin, end, matched, costs, number, max_reach, seed, before, field,
 def vote(query_at, vote_weight, sources, field, shift):
     """Compute the weighted mean colour of all patches over each pixel, and the total weight.
 
-    Args:
-        query_at: Index of the query of each pixel, or -1 [h, w].
-        vote_weight: float32 [q]: weight of the patch of each query.
-        sources: float32 [s, H, W + 1, 3], as in `PatchProblem`.
-        field, shift: Match of each query, and the shift added to its colours.
+    query_at [h, w]: query of each pixel, or -1. vote_weight [q]: weight of its patch.
+    field, shift: match of each query, and the shift added to its colours.
     """
     h, w = query_at.shape
     # Wider than the image, so that patches over its sides need not be cut.

@@ -44,9 +44,8 @@ X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
 NUM_SPLAT_COLUMNS = 9
 
 SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
-"""Columns of an entry's gradients: sums of q = alpha dL/dalpha times 1, s, t, s², s t and t².
-
-Depth, red, green and blue follow."""
+"""Columns of an entry's gradients: sums of q = alpha dL/dalpha times 1, s, t, s², s t, t², and
+more."""
 NUM_GRADIENT_COLUMNS = 10
 
 OF_ALL, OF_OPACITY, OF_DEPTH, OF_COLOUR = range(4)
@@ -267,10 +266,7 @@ def _for_each_row(builder, rows, position, row_limit, body):
 
 
 def _blend(splat, state, row):
-    """Composite a splat over a row; return its weights and where it is visible and passing.
-
-    state: `_Rows` of the transmittance and sums of red, green, blue and depth, or fewer.
-    """
+    """Composite a splat over a row; return its weights, and masks of visible and passing lanes."""
     builder = splat.builder
     _, _, alpha, visible = splat.falloff(row)
     alpha = alpha.where(visible, 0.0)
@@ -299,10 +295,10 @@ def _close_if_full(builder, passing, limits, row, filled):
 def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
     """Composite a splat over the rows begin..end of a tile; return how many it filled.
 
-    state: [16, 5, 16] float32, per row the transmittance, negative in full pixels, and the sums of
-    red, green, blue and depth. last: [16, 16] int32, position of the last contribution. row_limit:
-    [16] int32, -1 in full rows. splat: x and y relative to the first pixel centre, u, v, w,
-    opacity, red, green, blue and depth.
+    state [16, 5, 16]: per row the transmittance, negative in full pixels, and sums of colour and
+    depth.
+    last [16, 16] int32: position of the last contribution. row_limit [16] int32: -1 in full rows.
+    splat: x and y relative to the first pixel centre, u, v, w, opacity, red, green, blue and depth.
     """
     signature = types.int64(types.int64, types.int64, types.int32, state, last, row_limit, splat)
 
@@ -329,10 +325,7 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
 
 @intrinsic
 def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
-    """Composite a splat over the rows begin..end of a tile, and keep its weights.
-
-    state: [16, 4, 16] float32, without depth. kept: [rows, 16] float32, from row `place` on.
-    """
+    """Composite a splat, without depth, over rows and store its weights in `kept` at `place`."""
     signature = types.int64(types.int64, types.int64, types.int64, state, row_limit, kept, splat)
 
     def generate(context, builder, signature, arguments):
@@ -360,11 +353,7 @@ def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
 
 @intrinsic
 def _spread_rows(typing, begin, end, place, state, kept, sums):
-    """Sum the weights that `_weigh_rows` kept of a splat times the image over its rows.
-
-    state: [16, 4, 16] float32, with red, green and blue from the second vector on. sums: [16]
-    float32 receives the sums of weight times red, green and blue, and of the weight.
-    """
+    """Sum kept weights times the colours in `state` [16, 4, 16], and kept weights, to `sums`."""
     signature = types.void(types.int64, types.int64, types.int64, state, kept, sums)
 
     def generate(context, builder, signature, arguments):
@@ -414,11 +403,10 @@ def _undraw(wanted):
     def undraw_rows(typing, begin, end, position, state, last, row_limit, sums, splat):
         """Revert the rows begin..end of a splat, back to front.
 
-        state: [16, 7, 16] float32, per row the transmittance and the sum of weight times gradient
-        behind the splat, and dL/d of red, green, blue, depth sum and alpha. last, row_limit: as
-        left by the forward pass; a row's limit is the largest of its last. sums: [16] float32
-        receives the sums of q, q dx, q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha), and of
-        weight times dL/d depth, red, green and blue.
+        state [16, 7, 16]: per row the transmittance and the sum of weight times gradient behind the
+        splat, and dL/d of red, green, blue, depth sum and alpha. sums [16] receives the sums of q,
+        q dx, q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha), and of weight times dL/d depth,
+        red, green and blue.
         """
         signature = types.void(
             types.int64, types.int64, types.int32, state, last, row_limit, sums, splat
@@ -531,7 +519,6 @@ def _applied(a, x, y, z):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _unit(quats, i):
-    """Normalise quaternion i; also return the factor."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     factor = np.float32(1) / math.sqrt(w * w + x * x + y * y + z * z)
     return w * factor, x * factor, y * factor, z * factor, factor
@@ -780,9 +767,8 @@ def _depth_at(splats, entries, place, begin, end, beyond):
 def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth_limits):
     """Merge the lists of the tiles begin..end of two layers, as far as they were composited.
 
-    used [tiles, 2], full [tiles]: as left by `composite`. tile_start: starts of the merged lists.
-    entries [e] is written; splats of `new` are numbered after those of the context. depth_limits
-    [tiles] is written: the z-depth behind which a tile shows nothing.
+    Splats of `new` are numbered after those of the context. depth_limits [tiles] receives the
+    z-depth behind which a tile shows nothing.
     """
     c_splats, _, _, c_start, c_entries = context
     n_splats, _, _, n_start, n_entries = new
@@ -910,7 +896,6 @@ def composite(begin, end, tiles, context, new, frame):
 
 @njit(cache=True, nogil=True)
 def _with_room(kept, used):
-    """Double the rows of `kept` if another tile height does not fit."""
     if used + TILE <= len(kept):
         return kept
     wider = _aligned(2 * kept.size).reshape((2 * len(kept), TILE))
@@ -925,7 +910,7 @@ def _with_room(kept, used):
 def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, written):
     """Composite tiles[begin:end] and backproject the residual to the entries of `new`.
 
-    A splat's weights stay in the cache until the image of its tile is finished. slots: as below.
+    A splat's weights stay in the cache until the image of its tile is finished.
     sums [slots, 4]: over the tile, weight times (photograph - image) per colour, and weight.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
@@ -994,10 +979,8 @@ def composite_backward(
 ):
     """Traverse tiles[begin:end] back to front and sum the gradients of the entries of `new`.
 
-    d_frame: gradients of image [h, w, 3], depth [h, w] and alpha [h, w]. slots [e] int32: slot of
-    each entry of `new`. wanted: WANT_ALL, WANT_OPACITY, WANT_DEPTH or WANT_COLOR, with 10, 1, 1 or
-    3 columns. gradients [slots, columns] is written, and written [slots] bool set, for visited
-    entries only.
+    d_frame: gradients of image, depth and alpha. slots [e] int32: slot of each entry of `new`.
+    gradients [slots, columns] and written [slots] are set for visited entries only.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -1109,11 +1092,7 @@ def _compensation_backward(flat, q):
 def project_backward(
     begin, end, gaussians, pinhole, factors, splats, slot_start, gradients, written, slopes
 ):
-    """Write gradients of the Gaussians begin..end to `d_gaussians` from those of entries.
-
-    gaussians, pinhole, factors, splats: as in `project`. slot_start, gradients, written: as in
-    `sum_entries`.
-    """
+    """Write gradients of the Gaussians begin..end to `d_gaussians` from those of entries."""
     means, quats, scales, opacities, sh = gaussians
     d_means, d_quats, d_scales, d_opacities, d_sh = slopes
     view, center = pinhole.rotation, pinhole.center
@@ -1268,7 +1247,6 @@ class Fragments(NamedTuple):
 
 @njit(cache=True, fastmath={"contract"})
 def _within(boxes, i, left, top):
-    """Clip the box of splat i to the tile at (left, top)."""
     return (
         max(np.int64(boxes[i, 0]) - left, 0),
         min(np.int64(boxes[i, 1]) - left, TILE),
@@ -1333,8 +1311,8 @@ def _by_pixel(
 def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
     """Find the Fragments of tiles[begin:end] of two layers, and bake the context between them.
 
-    new has the opacities of opaque Gaussians; new_slots [entries] int32 are its slots. where [h, w]
-    bool: pixels that get fragments. behind [h, w, 3] float32 is written.
+    new has the opacities of opaque Gaussians; new_slots [entries] int32 are its slots.
+    where [h, w] bool: pixels that get fragments. behind [h, w, 3] float32 is written.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -1516,11 +1494,7 @@ def _looks(fragments, index, opacities, colours):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def draw_fragments(fragments, opacities, colours, image):
-    """Render the pixels that have fragments into `image` [h, w, 3].
-
-    opacities [n], colors [n, 3]: of the new splats. Baked layers take no branch: it would
-    mispredict.
-    """
+    """Render the pixels that have fragments into `image`, without branching on baked layers."""
     tiles, _, _, _, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
     zero, one = np.float32(0), np.float32(1)
@@ -1555,8 +1529,7 @@ def draw_fragments(fragments, opacities, colours, image):
 def compare_fragments(fragments, image, wanted, weights, slopes, errors):
     """Compute squared errors and gradients of the pixels that have fragments.
 
-    image, wanted [h, w, 3], weights [h, w] float32. d_image [h, w, 3] float32 is written, and
-    errors [tiles] float64: weighted squared differences of all channels.
+    d_image [h, w, 3] float32 is written, and errors [tiles] float64: summed over all channels.
     """
     tiles, starts = fragments.tiles, fragments.pixel_start
     tiles_x = (image.shape[1] + TILE - 1) // TILE

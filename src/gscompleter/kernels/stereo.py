@@ -74,22 +74,15 @@ def _box_sums(values, sums, column, rows, width, radius):
 
 
 def matching_costs(reference, source, transform, inverse_depths, bands, radius, noise, detail):
-    """Compute matching costs of the reference pixels at the planes of their tiles.
+    """Compute matching costs 0..254 of the reference pixels at the planes of their tiles.
 
     Normalised cross-correlation of windows over all colours, which ignores exposure, is mixed with
-    the difference of the two pixels from their windows' means, which is sharper at edges.
+    the difference of the two pixels from their windows' means, which is sharper at edges. Planes
+    outside the source cost UNSEEN.
 
-    Args:
-        reference, source: Images [h, w, 3] and [H, W, 3].
-        transform: From reference to source [3, 4].
-        inverse_depths: Inverse depths of the planes [d].
-        bands: Planes of each tile.
-        radius: Radius of the windows, in pixels.
-        noise: Standard deviation of image noise; weaker texture does not correlate.
-        detail: Share of the second term.
-
-    Returns:
-        Costs 0..254, UNSEEN for planes outside the source, in the order of `bands`.
+    transform [3, 4]: from reference to source. radius: of the windows, in pixels.
+    noise: standard deviation of image noise; weaker texture does not correlate.
+    detail: share of the second term.
     """
     costs = np.empty(bands.start[-1], np.uint8)
     settings = (radius, noise, detail)
@@ -317,13 +310,11 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
 def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
     """Aggregate costs along eight paths (Hirschmüller 2008), in the order of `bands`.
 
-    Args:
-        costs: Costs 0..254, in the order of `bands`.
-        bands: Planes of each tile; planes missing in the previous tile are reached by a jump.
-        large_x, large_y, large_d, large_u: Penalties of a jump between a pixel and its right
-            [h, w - 1], lower [h - 1, w] and lower right neighbour, and along the other diagonal
-            [h - 1, w - 1]; int16, at most 3000, so that sums do not overflow.
-        small: Penalty of a step by one plane.
+    Planes missing in the previous tile are reached by a jump.
+    small: penalty of a step by one plane.
+    large_x [h, w - 1], large_y [h - 1, w], large_d and large_u [h - 1, w - 1]: penalties of a jump
+    between a pixel and its right, lower and lower right neighbour, and along the other diagonal;
+    int16, at most 3000, so that sums do not overflow.
     """
     # Each half has its own sum, so that two threads can work and order does not matter.
     totals = np.zeros((2, len(costs)), np.int16)
@@ -338,11 +329,6 @@ def winners(totals, bands, h, w):
     """Select the best plane of every pixel, with fraction, and its margin over the second best.
 
     The second best is not adjacent to the best. Margins are in units of a cost, per path.
-
-    Args:
-        totals: Aggregated costs, in the order of `bands`.
-        bands: Planes of each tile.
-        h, w: Size of the image.
     """
     index = np.empty((h, w), np.float32)
     margin = np.empty((h, w), np.float32)
@@ -382,13 +368,8 @@ def _choose(begin, end, totals, bands, index, margin):
 def reproject(depth, other, b_from_a, a_from_b):
     """Project every pixel of view a to view b and back, by their inverse depths.
 
-    Args:
-        depth, other: Inverse depths of a [h, w] and b [H, W].
-        b_from_a, a_from_b: Pixel transforms [3, 4].
-
-    Returns:
-        The distance between each pixel and its image, in pixels, or -1 if it falls outside b
-        [h, w]; and its z-depth in b relative to b's own depth [h, w].
+    Returns the distance between each pixel and its image, in pixels, or -1 if it falls outside b,
+    and its z-depth in b relative to b's own.
     """
     error = np.full(depth.shape, np.float32(-1), np.float32)
     ratio = np.ones(depth.shape, np.float32)
@@ -437,8 +418,7 @@ def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
 def background(values, known):
     """Fill unknown pixels with the second lowest known value in eight directions.
 
-    Low inverse depths are far away, and one ray may miss a thin object in front. Pixels with fewer
-    than two known values stay.
+    Low inverse depths are far away, and one ray may miss a thin object in front.
     """
     filled = values.copy()
     share(_fill, len(values), values, known, filled)

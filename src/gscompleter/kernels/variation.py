@@ -23,14 +23,10 @@ def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations
     covers fewer rows of the band than the one before; the seams follow. The result is the same to
     the bit.
 
-    Args:
-        heights, gradients: Initial values [h, w] and [2, h, w] (x, y); updated in place.
-        data, weight: Measured heights and their weights [h, w]; 0 without measurement.
-        across, down: Cost of a step to the right and to the pixel below [h, w].
-        bend: Cost of a change of gradient.
-        tolerance: Deviation from `data` under which the loss is quadratic.
-        iterations: Number of iterations.
-        threads: Number of threads, as in `share`.
+    heights [h, w], gradients [2, h, w] (x, y): initial values, updated in place.
+    data, weight [h, w]: measured heights and their weights; 0 without measurement.
+    across, down [h, w]: cost of a step to the right and to the pixel below.
+    bend: cost of a change of gradient. tolerance: deviation from `data` of quadratic loss.
     """
     h, w = heights.shape
     forces = np.zeros((2, h, w), np.float32), np.zeros((4, h, w), np.float32)

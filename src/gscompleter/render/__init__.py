@@ -118,9 +118,11 @@ class FrozenView(Protocol):
 class Renderer(Protocol):
     """Renders Gaussians; differentiable in means, quats, scales, opacities and sh."""
 
-    def render(self, gaussians: Gaussians, camera: Camera) -> Render: ...
+    def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render `gaussians` from `camera`."""
 
-    def freeze(self, context: Gaussians, camera: Camera) -> FrozenView: ...
+    def freeze(self, context: Gaussians, camera: Camera) -> FrozenView:
+        """Prepare `context` for many renders from `camera`."""
 
 
 def load_renderer(name: str) -> Renderer:

@@ -44,9 +44,11 @@ class CpuRenderer:
     """Number of threads, or None for NUMBA_NUM_THREADS; does not affect the result."""
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render `gaussians` from `camera`."""
         return self._empty(camera).composite(gaussians)
 
     def freeze(self, context: Gaussians, camera: Camera) -> CpuView:
+        """Prepare `context` for many renders from `camera`."""
         return self._empty(camera).extended(context)
 
     def _empty(self, camera: Camera) -> CpuView:
@@ -153,7 +155,7 @@ class CpuView:
         return errors
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Project `new` once, as far as it touches a tile that is asked for."""
+        """Project `new` once, as far as it touches tiles of the mask."""
         splats = self.viewpoint.project(arrays_of(new), new.is_antialiased)
         anywhere = self.viewpoint.limits_within(where)
         asked = np.zeros(len(splats.boxes), np.bool_)
@@ -215,10 +217,12 @@ class Viewpoint:
 
     @property
     def tiles_x(self) -> int:
+        """Number of tiles in a row."""
         return -(-self.pinhole.width // TILE)
 
     @property
     def tiles(self) -> int:
+        """Number of tiles of the image."""
         return self.tiles_x * -(-self.pinhole.height // TILE)
 
     @property

@@ -60,6 +60,7 @@ class CudaRenderer:
             ) from error
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render `gaussians` from `camera`."""
         if len(gaussians) == 0:
             empty = torch.zeros(camera.height, camera.width, device=gaussians.means.device)
             return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
@@ -67,6 +68,7 @@ class CudaRenderer:
         return Render(colour_and_depth[0, ..., :3], colour_and_depth[0, ..., 3], alpha[0, ..., 0])
 
     def freeze(self, context: Gaussians, camera: Camera) -> CudaView:
+        """Prepare `context` for many renders from `camera`."""
         return frozen_by(self, context, camera)
 
     @torch.no_grad()

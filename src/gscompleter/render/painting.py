@@ -39,9 +39,12 @@ class DrawnAnew:
     def __call__(
         self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
     ) -> Float[Tensor, "h w 3"]:
+        """Render the image; differentiable."""
         return self.draw(opacities, sh)
 
     def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
+        """Make the sum of `weights` (>= 0) times squared differences from `wanted`."""
+
         def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:
             return (weights * (self.draw(opacities, sh) - wanted).square().sum(dim=-1)).sum()
 
@@ -53,9 +56,9 @@ def sums_by_slopes(
     gaussians: Gaussians,
     layers: Float[Tensor, "h w 3"],
 ) -> Float[Tensor, "n 3"]:
-    """Sum `image` over the compositing weights of each of the n `gaussians`, by autograd.
+    """Sum `image` over the compositing weights of `gaussians`, by autograd through `render`.
 
-    A compositing weight is the gradient of a pixel of `draw(colors)` in the colour of the Gaussian.
+    A compositing weight is the gradient of a pixel in the colour of the Gaussian.
     """
     with torch.enable_grad():
         colours = gaussians.means.new_full((len(gaussians), 3), 0.5).requires_grad_()

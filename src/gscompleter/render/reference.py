@@ -40,6 +40,7 @@ class ReferenceRenderer:
     """Gaussians times pixels that are held in memory at once."""
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render `gaussians` from `camera`."""
         splats = project(gaussians, camera)
         camera = camera.to(gaussians.means.device)
         x = torch.arange(camera.width, device=camera.K.device) + 0.5
@@ -59,6 +60,7 @@ class ReferenceRenderer:
         return Render(colour.view(*size, 3), depth.view(size), alpha.view(size))
 
     def freeze(self, context: Gaussians, camera: Camera) -> ReferenceView:
+        """Prepare `context` for many renders from `camera`."""
         return ReferenceView(self, context, camera)
 
 
@@ -72,24 +74,30 @@ class ReferenceView:
 
     @cached_property
     def context(self) -> Render:
+        """The render of the scene alone."""
         return self.renderer.render(self.scene, self.camera)
 
     def extended(self, new: Gaussians) -> ReferenceView:
+        """Add `new` to the scene."""
         return replace(self, scene=merge([self.scene, new]))
 
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        """Backproject `image` by autograd."""
         return sums_by_slopes(self._painted, self.scene, layers)
 
     def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+        """Render the scene with the values as grey."""
         return self._painted(grey(values))[..., 0]
 
     def _painted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
         return self.renderer.render(painted(self.scene, colours), self.camera).image
 
     def composite(self, new: Gaussians) -> Render:
+        """Render scene and `new`."""
         return self.renderer.render(merge([self.scene, new]), self.camera)
 
     def plan(self, new: Gaussians) -> OpacityRender:
+        """Fix all of `new` but the opacities."""
         fixed = replace(
             new,
             means=new.means.detach(),
@@ -100,9 +108,11 @@ class ReferenceView:
         return lambda opacities: self.composite(replace(fixed, opacities=opacities))
 
     def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
+        """Fix all of `new` but its appearance."""
         return DrawnAnew(lambda *looks: self.composite(looking(new, *looks)).image)
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
+        """Fix all of `new` but its colours."""
 
         def draw(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
             return self.composite(painted(new, colours)).image
@@ -110,6 +120,7 @@ class ReferenceView:
         return lambda colours, photograph: errors_by_slopes(draw, new, colours, photograph)
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        """Fix all of `new` but its depths."""
         return lambda depths: self.composite(at_depths(new, self.camera, depths))
 
 
