@@ -31,14 +31,14 @@ class Adam:
     def step(self, loss: Tensor, factor: float = 1.0) -> None:
         """Descend one step along the gradient of `loss`, with step sizes multiplied by `factor`."""
         variables = [variable for variable, _ in self._rates]
-        slopes = torch.autograd.grad(loss, variables)
-        states = zip(self._rates, slopes, self._means, self._squares, self._counts, strict=True)
+        gradients = torch.autograd.grad(loss, variables)
+        states = zip(self._rates, gradients, self._means, self._squares, self._counts, strict=True)
         beta1, beta2 = self._betas
         with torch.no_grad():
-            for (variable, rate), slope, mean, square, count in states:
+            for (variable, rate), gradient, mean, square, count in states:
                 adam(
                     [variable],
-                    [slope],
+                    [gradient],
                     [mean],
                     [square],
                     [],

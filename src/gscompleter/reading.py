@@ -83,8 +83,8 @@ def read_lines(
             while line := text.readline(longest + 1):
                 if len(line) > longest:
                     raise InputError(
-                        f"{quoted(path)} has a line of more than {longest:,} characters, which is "
-                        "none of its format; copy it again."
+                        f"{quoted(path)} has a line of more than {longest:,} characters, which "
+                        "its format does not allow; copy the file again."
                     )
                 yield line
     except OSError as error:

@@ -13,18 +13,18 @@ from numba.np import linalg
 @contextmanager
 def _without_blas():
     """Skip numba's search for BLAS, which imports SciPy: a third of its load time."""
-    asked = getattr(linalg, "ensure_blas", None)
+    ensure_blas = getattr(linalg, "ensure_blas", None)
 
     def refuse():
-        raise ImportError("there is nothing to be found out")
+        raise ImportError("BLAS is not needed")
 
-    if asked is not None:
+    if ensure_blas is not None:
         linalg.ensure_blas = refuse
     try:
         yield
     finally:
-        if asked is not None:
-            linalg.ensure_blas = asked
+        if ensure_blas is not None:
+            linalg.ensure_blas = ensure_blas
 
 
 with _without_blas():

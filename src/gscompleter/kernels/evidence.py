@@ -113,10 +113,10 @@ def support(begin, end, centers, areas, agreement, means, sums, place, max_turn,
     one, turn = np.float32(1), np.float32(1) / max_turn
     known = np.empty((6, BLOCK), np.float32)
     x, y, z, ray_x, ray_y, ray_z = known
-    agreeing, weights, largest = heard = np.empty((3, BLOCK), np.float32)
+    agreeing, weights, largest = totals = np.empty((3, BLOCK), np.float32)
     for start in range(begin, end, BLOCK):
         count = min(BLOCK, end - start)
-        heard[:] = 0
+        totals[:] = 0
         for j in range(count):
             x[j], y[j], z[j] = means[start + j, 0], means[start + j, 1], means[start + j, 2]
             dx, dy, dz = x[j] - place.center[0], y[j] - place.center[1], z[j] - place.center[2]
@@ -124,9 +124,16 @@ def support(begin, end, centers, areas, agreement, means, sums, place, max_turn,
             ray_x[j], ray_y[j], ray_z[j] = dx * inverse, dy * inverse, dz * inverse
         for k in range(len(centers)):
             center = centers[k, 0], centers[k, 1], centers[k, 2]
-            said = areas[k, start : start + count], agreement[k, start : start + count]
+            observed = areas[k, start : start + count], agreement[k, start : start + count]
             _listen(
-                x, y, z, (ray_x, ray_y, ray_z), center, turn, *said, (agreeing, weights, largest)
+                x,
+                y,
+                z,
+                (ray_x, ray_y, ray_z),
+                center,
+                turn,
+                *observed,
+                (agreeing, weights, largest),
             )
         for j in range(count):
             i = start + j

@@ -90,7 +90,7 @@ def _patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, bias):
     max_bias, bias_penalty = costs.max_bias, costs.bias_penalty
     numbers = sources.reshape(-1)
     H, W = sources.shape[1:3]
-    # Unsigned, so that no index is looked at for whether it counts from the end.
+    # Unsigned, so that no index is checked for negative values.
     stride = np.uintp(3 * W)
     start = np.uintp(3 * ((s * H + sy - RADIUS) * W + sx - RADIUS))
     for lane in range(LANES):
@@ -166,7 +166,7 @@ def _improve(begin, end, matched, costs, number, max_reach, seed, before, field,
         reach = max_reach
         for trial in range(-1 if number == 0 else 0, 24):
             if trial < 0:
-                # Nothing has told yet what the match costs that it begins with.
+                # The cost of the initial match is not known yet.
                 s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
             elif trial < 8:
                 # Neighbours one and four pixels away propose their own offset.
@@ -223,11 +223,11 @@ def vote(query_at, vote_weight, sources, field, shift):
     """
     h, w = query_at.shape
     # Wider than the image, so that patches over its sides need not be cut.
-    colours = np.zeros((h, w + 2 * RADIUS, 3), np.float32)
+    colors = np.zeros((h, w + 2 * RADIUS, 3), np.float32)
     totals = np.zeros((h, w + 2 * RADIUS), np.float32)
-    share(_vote, h, query_at, vote_weight, sources, field, shift, colours, totals)
+    share(_vote, h, query_at, vote_weight, sources, field, shift, colors, totals)
     inner = np.s_[:, RADIUS:-RADIUS]
-    return colours[inner] / np.maximum(totals[inner], 1e-12)[..., None], totals[inner]
+    return colors[inner] / np.maximum(totals[inner], 1e-12)[..., None], totals[inner]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -241,9 +241,9 @@ def _vote(begin, end, query_at, vote_weight, sources, field, shift, colours, tot
             a = vote_weight[q]
             s, sy, sx = field[q, 0], field[q, 1], field[q, 2]
             for dy in range(max(-RADIUS, begin - y), min(RADIUS, end - 1 - y) + 1):
-                said, sums = sources[s, sy + dy], colours[y + dy]
+                source_row, sums = sources[s, sy + dy], colours[y + dy]
                 for column in range(SIDE):
                     for c in range(3):
-                        colour = said[sx - RADIUS + column, c] + shift[q, c]
-                        sums[x + column, c] += a * colour
+                        color = source_row[sx - RADIUS + column, c] + shift[q, c]
+                        sums[x + column, c] += a * color
                     totals[y + dy, x + column] += a

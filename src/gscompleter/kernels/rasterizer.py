@@ -311,13 +311,13 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
         positions = _broadcast(builder, position, _INTS)
         filled = cgutils.alloca_once_value(builder, ir.Constant(_LONG, 0))
 
-        def draw(row):
+        def composite_row(row):
             _, visible, passing = _blend(splat, state, row)
             contributes = builder.and_(visible, passing)
             last.store(row, 0, builder.select(contributes, positions, last.load(row, 0)))
             _close_if_full(builder, passing, limits, row, filled)
 
-        _for_each_row(builder, (begin, end), position, limits, draw)
+        _for_each_row(builder, (begin, end), position, limits, composite_row)
         return builder.load(filled)
 
     return signature, generate
@@ -339,12 +339,12 @@ def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
             row, at = loop.index, builder.add(place, builder.sub(loop.index, begin))
             limit = builder.load(builder.gep(limits, [row]))
             is_open = builder.icmp_signed(">=", limit, ir.Constant(_INT, 0))
-            with builder.if_else(is_open) as (drawn, left_out):
-                with drawn:
+            with builder.if_else(is_open) as (open_row, full_row):
+                with open_row:
                     weight, _, passing = _blend(splat, state, row)
                     kept.store(at, 0, weight.value)
                     _close_if_full(builder, passing, limits, row, filled)
-                with left_out:
+                with full_row:
                     kept.store(at, 0, _constant(0.0))
         return builder.load(filled)
 
@@ -425,43 +425,43 @@ def _undraw(wanted):
                 for _ in range(count)
             ]
 
-            def undraw(row):
+            def revert(row):
                 dy, raw, alpha, visible = splat.falloff(row)
                 reached = builder.icmp_signed("<=", positions, last.load(row, 0))
                 contributes = builder.and_(visible, reached)
                 alpha = alpha.where(contributes, 0.0)
-                slopes = [_Lanes(builder, state.load(row, index)) for index in range(2, 7)]
+                gradients = [_Lanes(builder, state.load(row, index)) for index in range(2, 7)]
                 behind = _Lanes(builder, state.load(row, 1))
 
                 opening = 1.0 / (1.0 - alpha)
                 before = _Lanes(builder, state.load(row, 0)) * opening
                 weight = alpha * before
-                value = slopes[4]
-                for channel, slope in zip(splat.channels, slopes[:4], strict=True):
-                    value = channel.times(slope, plus=value)
+                value = gradients[4]
+                for channel, gradient in zip(splat.channels, gradients[:4], strict=True):
+                    value = channel.times(gradient, plus=value)
                 state.store(row, 0, before.value)
                 state.store(row, 1, weight.times(value, plus=behind).value)
                 if wanted == "nothing":
                     return
 
                 if wanted == "colour":
-                    for total, slope in zip(totals, slopes[:3], strict=True):
-                        value = weight.times(slope, plus=_Lanes(builder, builder.load(total)))
+                    for total, gradient in zip(totals, gradients[:3], strict=True):
+                        value = weight.times(gradient, plus=_Lanes(builder, builder.load(total)))
                         builder.store(value.value, total)
                     return
 
                 q = (before * value - behind * opening) * alpha
                 q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
-                terms = [weight * slopes[3]] if wanted == "depth" else [q]
+                terms = [weight * gradients[3]] if wanted == "depth" else [q]
                 if wanted == "all":
                     dys = _Lanes(builder, _broadcast(builder, dy))
                     terms += [q * dys, q * dys * dys]
-                    terms += [weight * slopes[index] for index in (3, 0, 1, 2)]
+                    terms += [weight * gradients[index] for index in (3, 0, 1, 2)]
                 for total, term in zip(totals, terms, strict=True):
                     value = _Lanes(builder, builder.load(total)) + term
                     builder.store(value.value, total)
 
-            _for_each_row(builder, (begin, end), position, limits, undraw)
+            _for_each_row(builder, (begin, end), position, limits, revert)
 
             columns = [_Lanes(builder, builder.load(total)) for total in totals]
             if wanted == "all":
@@ -696,14 +696,16 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
             continue
         inverse_z = one / z
         tan_x, tan_y = x * inverse_z, y * inverse_z
-        slope_x, slope_y = fx * inverse_z, fy * inverse_z
+        jacobian_x, jacobian_y = fx * inverse_z, fy * inverse_z
         clamped_x = min(max(tan_x, least_x), largest_x)
         clamped_y = min(max(tan_y, least_y), largest_y)
         qw, qx, qy, qz, _ = _unit(quats, i)
         axes = _scaled_columns(
             _product(view, _rotation(qw, qx, qy, qz)), scales[i, 0], scales[i, 1], scales[i, 2]
         )
-        flat = _flattened(axes, (slope_x, -slope_x * clamped_x, slope_y, -slope_y * clamped_y))
+        flat = _flattened(
+            axes, (jacobian_x, -jacobian_x * clamped_x, jacobian_y, -jacobian_y * clamped_y)
+        )
 
         # The determinant of F Fᵀ + blur is summed from squares: nothing cancels, however thin
         # the splat is. In double precision nothing overflows either.
@@ -746,10 +748,10 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
         direction_x, direction_y, direction_z, _ = _direction(center, means, i)
         _evaluate_basis(direction_x, direction_y, direction_z, basis)
         for channel in range(3):
-            colour = half
+            color = half
             for k in range(len(basis)):
-                colour += basis[k] * sh[i, k, channel]
-            splats[i, RED + channel] = max(colour, zero)
+                color += basis[k] * sh[i, k, channel]
+            splats[i, RED + channel] = max(color, zero)
 
 
 # ---- Two lists, merged by depth ------------------------------------------------------------------
@@ -937,7 +939,7 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
         n, n_begin, n_end = n_start[tile], n_start[tile], n_start[tile + 1]
         c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
         n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
-        place = np.int64(0)  # with a plain 0, what takes it is compiled once more
+        place = np.int64(0)  # with a plain 0, its callees are compiled twice
         while open_rows > 0 and (c < c_end or n < n_end):
             kept = _with_room(kept, place)
             if c_depth <= n_depth:
@@ -946,7 +948,7 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
                 )
                 c += 1
                 c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
-                # The next one overwrites what is kept of it.
+                # The next splat overwrites its weights.
                 open_rows -= _weigh_rows(first, stop, place, state, row_limit, kept, splat)
                 continue
             first, stop, splat = _placed(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
@@ -1121,10 +1123,10 @@ def project_backward(
         d_basis[:] = 0
         for channel in range(3):
             if splats[i, RED + channel] > 0:
-                d_colour = sums[SUM_RED + channel]
+                d_color = sums[SUM_RED + channel]
                 for k in range(len(basis)):
-                    d_sh[i, k, channel] = d_colour * basis[k]
-                    d_basis[k] += d_colour * sh[i, k, channel]
+                    d_sh[i, k, channel] = d_color * basis[k]
+                    d_basis[k] += d_color * sh[i, k, channel]
         d_dx, d_dy, d_dz = _basis_slope(direction_x, direction_y, direction_z, d_basis)
         radial = direction_x * d_dx + direction_y * d_dy + direction_z * d_dz
 
@@ -1133,13 +1135,13 @@ def project_backward(
         )
         inverse_z = one / z
         tan_x, tan_y = x * inverse_z, y * inverse_z
-        slope_x, slope_y = fx * inverse_z, fy * inverse_z
+        jacobian_x, jacobian_y = fx * inverse_z, fy * inverse_z
         clamped_x = min(max(tan_x, least_x), largest_x)
         clamped_y = min(max(tan_y, least_y), largest_y)
         qw, qx, qy, qz, unit_factor = _unit(quats, i)
         rotation = _product(view, _rotation(qw, qx, qy, qz))
         axes = _scaled_columns(rotation, scales[i, 0], scales[i, 1], scales[i, 2])
-        jacobian = (slope_x, -slope_x * clamped_x, slope_y, -slope_y * clamped_y)
+        jacobian = (jacobian_x, -jacobian_x * clamped_x, jacobian_y, -jacobian_y * clamped_y)
         flat = _flattened(axes, jacobian)
 
         # dL/dΣ = 2 Uᵀ Q U with Q = [[ss, st], [st, tt]], and Σ = F Fᵀ: dL/dF = 4 Uᵀ Q (U F).
@@ -1199,9 +1201,9 @@ def project_backward(
         d_tan_x = two * fx * u * sums[SUM_S]
         d_tan_y = two * fy * (v * sums[SUM_S] + w * sums[SUM_T])
         if clamped_x == tan_x:
-            d_tan_x -= d_xz * slope_x
+            d_tan_x -= d_xz * jacobian_x
         if clamped_y == tan_y:
-            d_tan_y -= d_yz * slope_y
+            d_tan_y -= d_yz * jacobian_y
         d_z = sums[SUM_DEPTH] - (d_xx * xx + d_xz * xz + d_yy * yy + d_yz * yz) * inverse_z
         d_z -= (d_tan_x * tan_x + d_tan_y * tan_y) * inverse_z
         d_x, d_y, d_z = _applied(from_view, d_tan_x * inverse_z, d_tan_y * inverse_z, d_z)
@@ -1302,7 +1304,7 @@ def _by_pixel(
             entry, falloffs[k] = behind + ~entry - first_fold, 0
         to_entries[place], to_falloffs[place] = entry, falloffs[k]
         starts[pixels[k]] = place + 1
-    for pixel in range(TILE * TILE, 0, -1):  # Each has come to where the next one starts.
+    for pixel in range(TILE * TILE, 0, -1):  # Each is at the start of the next one.
         starts[pixel] = starts[pixel - 1]
     starts[0] = begin
 
@@ -1319,8 +1321,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
     height, width, _ = behind.shape
     tiles_x = (width + TILE - 1) // TILE
     state = _aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
-    # What `state` was at the last fragment of each pixel, and in bits of a row whether anything new
-    # was before
+    # `state` at the last fragment of each pixel, and one bit per pixel with a new fragment before
     known = np.empty((TILE, 4, TILE), np.float32)
     veiled, falloffs_of_row = np.empty(TILE, np.uint32), np.empty(TILE, np.float32)
     last = np.empty((TILE, TILE), np.int32)
@@ -1335,7 +1336,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
         bounds = _most_fragments(tile, left, top, context, new)
         most_entries, most = most_entries + bounds[0], most + bounds[1]
         most_at_once = max(most_at_once, bounds[1])
-    # Only what is written of them takes memory.
+    # Pages that are never written take no memory.
     pixels = np.empty(2 * most_at_once, np.uint8)
     at_entries = np.empty(2 * most_at_once, np.int32)
     at_falloffs = np.empty(2 * most_at_once, np.float32)
@@ -1352,7 +1353,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         rows, columns = min(TILE, height - top), min(TILE, width - left)
         state[:] = 0
-        # Pixels that nobody asks for are full from the start.
+        # Pixels outside the mask are full from the start.
         state[:, 0] = -1
         row_limit[:] = -1
         open_rows = 0
@@ -1411,7 +1412,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
                     if own:
                         veiled[row] |= 1 << column
                         pixel = np.uint8(row * TILE + column)
-                        # Whatever is frozen lets less pass.
+                        # Frozen splats have lowered the transmittance.
                         if state[row, 0, column] != known[row, 0, column]:
                             inverse = one / known[row, 0, column]
                             folds[fold, 0] = state[row, 0, column] * inverse
@@ -1475,21 +1476,21 @@ def _looks(fragments, index, opacities, colours):
     first, first_fold = fragments.entry_start[index], fragments.fold_start[index]
     count = fragments.entry_start[index + 1] - first
     folds = fragments.fold_start[index + 1] - first_fold
-    looks = np.empty((count + folds, 4), np.float32)
+    appearance = np.empty((count + folds, 4), np.float32)
     for k in range(count):
         name = fragments.names[first + k]
         if name >= 0:
-            looks[k, 0] = opacities[name]
+            appearance[k, 0] = opacities[name]
             for channel in range(3):
-                looks[k, 1 + channel] = colours[name, channel]
+                appearance[k, 1 + channel] = colours[name, channel]
         else:
-            looks[k, 0] = np.float32(1)
+            appearance[k, 0] = np.float32(1)
             for channel in range(3):
-                looks[k, 1 + channel] = fragments.solid[~name, channel]
+                appearance[k, 1 + channel] = fragments.solid[~name, channel]
     for k in range(folds):
         for column in range(4):
-            looks[count + k, column] = fragments.folds[first_fold + k, column]
-    return looks, count
+            appearance[count + k, column] = fragments.folds[first_fold + k, column]
+    return appearance, count
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -1500,7 +1501,7 @@ def draw_fragments(fragments, opacities, colours, image):
     zero, one = np.float32(0), np.float32(1)
     for index in range(len(tiles)):
         left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
-        looks, count = _looks(fragments, index, opacities, colours)
+        appearance, count = _looks(fragments, index, opacities, colours)
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
             if begin == end:
@@ -1509,17 +1510,17 @@ def draw_fragments(fragments, opacities, colours, image):
             transmittance, red, green, blue = one, zero, zero, zero
             for place in range(begin, end):
                 entry = entries[place]
-                own, look = entry < count, looks[entry, 0]
-                raw = look * falloffs[place]
+                own, factor = entry < count, appearance[entry, 0]
+                raw = factor * falloffs[place]
                 alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
-                after = transmittance * (one - alpha if own else look)
+                after = transmittance * (one - alpha if own else factor)
                 if own and after <= MIN_TRANSMITTANCE:
                     transmittance = zero
                     break
                 weight, transmittance = transmittance * (alpha if own else one), after
-                red += weight * looks[entry, 1]
-                green += weight * looks[entry, 2]
-                blue += weight * looks[entry, 3]
+                red += weight * appearance[entry, 1]
+                green += weight * appearance[entry, 2]
+                blue += weight * appearance[entry, 3]
             image[y, x, 0] = red + transmittance * behind[y, x, 0]
             image[y, x, 1] = green + transmittance * behind[y, x, 1]
             image[y, x, 2] = blue + transmittance * behind[y, x, 2]
@@ -1561,8 +1562,8 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
     zero, one = np.float32(0), np.float32(1)
     for index in range(len(tiles)):
         left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
-        looks, count = _looks(fragments, index, opacities, colours)
-        slopes = np.zeros(looks.shape, np.float32)  # Those of folds are not asked for.
+        appearance, count = _looks(fragments, index, opacities, colours)
+        d_appearance = np.zeros(appearance.shape, np.float32)  # Those of baked layers are not used.
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
             if begin == end:
@@ -1571,26 +1572,26 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
             d_red, d_green, d_blue = d_image[y, x, 0], d_image[y, x, 1], d_image[y, x, 2]
             if d_red == zero and d_green == zero and d_blue == zero:
                 continue
-            # Colour times slope of what is behind
+            # Colour times gradient of the content behind
             rest = d_red * image[y, x, 0] + d_green * image[y, x, 1] + d_blue * image[y, x, 2]
             transmittance = one
             for place in range(begin, end):
                 entry = entries[place]
-                own, look = entry < count, looks[entry, 0]
-                raw = look * falloffs[place]
+                own, factor = entry < count, appearance[entry, 0]
+                raw = factor * falloffs[place]
                 alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
-                after = transmittance * (one - alpha if own else look)
+                after = transmittance * (one - alpha if own else factor)
                 if own and after <= MIN_TRANSMITTANCE:
                     break
                 weight = transmittance * (alpha if own else one)
-                value = looks[entry, 1] * d_red + looks[entry, 2] * d_green
-                value += looks[entry, 3] * d_blue
+                value = appearance[entry, 1] * d_red + appearance[entry, 2] * d_green
+                value += appearance[entry, 3] * d_blue
                 rest -= weight * value
-                slopes[entry, 1] += weight * d_red
-                slopes[entry, 2] += weight * d_green
-                slopes[entry, 3] += weight * d_blue
+                d_appearance[entry, 1] += weight * d_red
+                d_appearance[entry, 2] += weight * d_green
+                d_appearance[entry, 3] += weight * d_blue
                 more = falloffs[place] * (transmittance * value - rest / (one - alpha))
-                slopes[entry, 0] += more if alpha == raw else zero
+                d_appearance[entry, 0] += more if alpha == raw else zero
                 transmittance = after
         first = entry_start[index]
         for k in range(count):
@@ -1598,7 +1599,7 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
             if slot >= 0:
                 written[slot] = True
                 for column in range(4):
-                    gradients[slot, column] = slopes[k, column]
+                    gradients[slot, column] = d_appearance[k, column]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -1611,10 +1612,10 @@ def shade(begin, end, rows, center, means, sh, colours):
         x, y, z, _ = _direction(center, means, i)
         _evaluate_basis(x, y, z, basis)
         for channel in range(3):
-            colour = half
+            color = half
             for k in range(len(basis)):
-                colour += basis[k] * sh[i, k, channel]
-            colours[i, channel] = max(colour, zero)
+                color += basis[k] * sh[i, k, channel]
+            colours[i, channel] = max(color, zero)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -1626,6 +1627,6 @@ def shade_backward(begin, end, rows, center, means, colours, d_colours, d_sh):
         x, y, z, _ = _direction(center, means, i)
         _evaluate_basis(x, y, z, basis)
         for channel in range(3):
-            slope = d_colours[i, channel] if colours[i, channel] > 0 else np.float32(0)
+            gradient = d_colours[i, channel] if colours[i, channel] > 0 else np.float32(0)
             for k in range(len(basis)):
-                d_sh[i, k, channel] = slope * basis[k]
+                d_sh[i, k, channel] = gradient * basis[k]

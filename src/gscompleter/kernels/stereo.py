@@ -63,7 +63,7 @@ def _box_sums(values, sums, column, rows, width, radius):
     for y in range(rows):
         for x in range(width + 2 * radius):
             column[x] += values[y + 2 * radius, x]
-        # One pass over the row for each column of the window: a pass becomes vectors.
+        # One pass over the row per column of the window, since a pass is vectorised.
         for x in range(width):
             sums[y, x] = column[x]
         for dx in range(1, 2 * radius + 1):
@@ -180,7 +180,7 @@ def _match_tiles(
                     line[1, x] = _clip(sy, np.float32(0), np.float32(H - 1))
                 for x in range(wide):
                     sx, sy = line[0, x], line[1, x]
-                    # `_clip` has made numbers from 0 to W - 1 and H - 1 of them, whatever came in.
+                    # `_clip` ensures 0..W - 1 and 0..H - 1 for any input.
                     ix = np.uint32(min(np.int32(sx), W - 2))
                     iy = np.uint32(min(np.int32(sy), H - 2))
                     ax, ay = sx - np.float32(ix), sy - np.float32(iy)
@@ -356,7 +356,7 @@ def _choose(begin, end, totals, bands, index, margin):
             margin[y, x] = np.float32(second - total[best]) / np.float32(PATHS)
             at = np.float32(bands.low[row, column] + best)
             if 0 < best < planes - 1:
-                # Two lines of equal and opposite slope: less drawn to whole planes than a parabola.
+                # Two lines of opposite gradient: less biased towards whole planes than a parabola.
                 before = total[best - 1] - total[best]
                 after = total[best + 1] - total[best]
                 steeper = max(before, after)
@@ -393,7 +393,7 @@ def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
             sy /= q2
             if not (sx >= 0 and sx < W and sy >= 0 and sy < H):
                 continue
-            # The corners around may lie on two surfaces: the one that agrees best counts.
+            # The corners may lie on two surfaces; the one that agrees best counts.
             best = np.float32(1e9)
             expected = own / q2
             value = other[int(sy), int(sx)]

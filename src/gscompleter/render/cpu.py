@@ -105,12 +105,12 @@ class CpuView:
         """Backproject `image` by the backward pass on the frozen frame."""
         nothing, itself = self.viewpoint.empty().layer, by_itself(self.layer)
         frame = self.frame._replace(used=np.ascontiguousarray(self.frame.used[:, ::-1]))
-        slopes = (layers, torch.zeros_like(layers[..., 0]), torch.zeros_like(layers[..., 0]))
-        drawn = (nothing, itself, frame, slopes, rasterizer.OF_COLOUR)
-        gradients = self.viewpoint.composite_backward(*drawn)
+        d_frame = (layers, torch.zeros_like(layers[..., 0]), torch.zeros_like(layers[..., 0]))
+        composited = (nothing, itself, frame, d_frame, rasterizer.OF_COLOUR)
+        gradients = self.viewpoint.composite_backward(*composited)
         totals = np.zeros((self.count, 3), np.float32)
         named = (self.layer.entries, self.rows, *gradients, totals)
-        pieces = ranges(len(self.rows), self.viewpoint.threads)  # Each looks at all entries.
+        pieces = ranges(len(self.rows), self.viewpoint.threads)  # Each reads all entries.
         calls = [(*piece, *named) for piece in pieces]
         run(lists.sum_by_name, calls, self.viewpoint.threads)
         return torch.from_numpy(totals)
@@ -147,8 +147,8 @@ class CpuView:
         """Project, sort and bin `new` once."""
         binned = self.viewpoint.bin(arrays_of(new), new.is_antialiased, self.depth_limits)
 
-        def errors(colours: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColourSums:
-            binned.layer.splats[:, rasterizer.RED :] = np.maximum(float32(colours), 0)
+        def errors(colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColourSums:
+            binned.layer.splats[:, rasterizer.RED :] = np.maximum(float32(colors), 0)
             sums = self.viewpoint.missed_colours(self.layer, binned, float32(photograph))
             return torch.from_numpy(sums[:, :3]), torch.from_numpy(sums[:, 3])
 
@@ -158,9 +158,9 @@ class CpuView:
         """Project `new` once, as far as it touches tiles of the mask."""
         splats = self.viewpoint.project(arrays_of(new), new.is_antialiased)
         anywhere = self.viewpoint.limits_within(where)
-        asked = np.zeros(len(splats.boxes), np.bool_)
-        asked[self.viewpoint.enter(splats, anywhere).entries] = True
-        splats = splats.only(asked)
+        touched_splats = np.zeros(len(splats.boxes), np.bool_)
+        touched_splats[self.viewpoint.enter(splats, anywhere).entries] = True
+        splats = splats.only(touched_splats)
         limits = np.minimum(anywhere, self.depth_limits)
 
         def render(depths: Float[Tensor, "n"]) -> Render:
@@ -283,7 +283,7 @@ class Viewpoint:
         if total > MAX_ENTRIES:
             raise InputError(
                 f"The {len(splats.columns):,} Gaussians cover {total:,} tiles of the image, and at "
-                f"most {MAX_ENTRIES:,} can be drawn; take fewer or smaller ones, or a smaller "
+                f"most {MAX_ENTRIES:,} can be rendered; use fewer or smaller Gaussians, or a smaller "
                 "image."
             )
         tile_start = lists.places_of(counts)
@@ -316,9 +316,9 @@ class Viewpoint:
         values = np.empty((len(new.slots), columns.get(wanted, 1)), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
         tiles = touched(new.layer)
-        drawn = (tiles, context, new.layer, frame, tuple(map(float32, slopes)))
+        composited = (tiles, context, new.layer, frame, tuple(map(float32, slopes)))
         received = (new.slots, wanted, values, written)
-        self.share(rasterizer.composite_backward, len(tiles), *drawn, *received)
+        self.share(rasterizer.composite_backward, len(tiles), *composited, *received)
         return values, written
 
     def missed_colours(
@@ -328,8 +328,8 @@ class Viewpoint:
         values = np.empty((len(new.slots), 4), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
         tiles = touched(new.layer)
-        drawn = (tiles, context, new.layer, photograph, new.slots, values, written)
-        self.share(rasterizer.missed_colours, len(tiles), *drawn)
+        composited = (tiles, context, new.layer, photograph, new.slots, values, written)
+        self.share(rasterizer.missed_colours, len(tiles), *composited)
         return self.sums(new, (values, written))
 
     def sums(self, new: Binned, gradients: EntryGradients) -> Float32[ndarray, "n columns"]:
@@ -361,21 +361,21 @@ class _Composite(torch.autograd.Function):
         frame = view.viewpoint.composite(view, binned.layer)
         render = render_of(frame)
         ctx.scene = (view, splats.factors, binned, frame)
-        # Saving tensors makes torch notice if one of them is written to before the backward pass.
+        # Torch raises an error if a saved tensor is written to before the backward pass.
         ctx.save_for_backward(*tensors, render.depth, render.alpha)
         return render.image, render.depth, render.alpha
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, factors, binned, frame = ctx.scene
         gaussians = GaussianArrays(*map(float32, ctx.saved_tensors[:5]))
-        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, slopes)
+        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
         result = GaussianArrays(*map(np.zeros_like, gaussians))
         seen = (gaussians, view.viewpoint.pinhole, factors)
-        drawn = (*seen, binned.layer.splats, binned.slot_start)
+        composited = (*seen, binned.layer.splats, binned.slot_start)
         n = len(gaussians.means)
-        view.viewpoint.share(rasterizer.project_backward, n, *drawn, *gradients, result)
+        view.viewpoint.share(rasterizer.project_backward, n, *composited, *gradients, result)
         return None, None, *map(torch.from_numpy, result)
 
 
@@ -384,7 +384,9 @@ class _Planned(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, view: CpuView, binned: Binned, opacities: Tensor) -> tuple[Tensor, ...]:
-        seen = float32(opacities) * binned.layer.opacities  # those of opaque ones, here
+        seen = (
+            float32(opacities) * binned.layer.opacities
+        )  # of opaque Gaussians, antialiased if needed
         layer = binned.layer._replace(opacities=seen)
         frame = view.viewpoint.composite(view, layer)
         render = render_of(frame)
@@ -394,11 +396,11 @@ class _Planned(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
         opacities = float32(ctx.saved_tensors[0])
-        drawn = (view.layer, binned, frame, slopes)
-        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_OPACITY)
+        composited = (view.layer, binned, frame, d_frame)
+        gradients = view.viewpoint.composite_backward(*composited, rasterizer.OF_OPACITY)
         sums = view.viewpoint.sums(binned, gradients)[:, 0]
         result = np.divide(sums, opacities, out=np.zeros_like(sums), where=sums != 0)
         return None, None, torch.from_numpy(result)
@@ -422,10 +424,10 @@ class _Slid(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
-        drawn = (view.layer, binned, frame, slopes)
-        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_DEPTH)
+        composited = (view.layer, binned, frame, d_frame)
+        gradients = view.viewpoint.composite_backward(*composited, rasterizer.OF_DEPTH)
         return None, None, None, torch.from_numpy(view.viewpoint.sums(binned, gradients)[:, 0])
 
 
@@ -437,8 +439,8 @@ def pinhole_of(camera: Camera) -> Pinhole:
     """
     if not 0 < min(camera.width, camera.height) <= max(camera.width, camera.height) <= MAX_SIDE:
         raise InputError(
-            f"An image of {camera.width} x {camera.height} pixels cannot be drawn; its sides must "
-            f"have 1 to {MAX_SIDE:,} pixels."
+            f"An image of {camera.width} x {camera.height} pixels cannot be rendered; its sides "
+            f"must have 1 to {MAX_SIDE:,} pixels."
         )
     K = camera.K.detach().to("cpu", torch.float64)
     c2w = camera.c2w.detach().to("cpu", torch.float64)

@@ -55,7 +55,7 @@ class CudaRenderer:
             import gsplat  # noqa: F401
         except ImportError as error:
             raise InputError(
-                "The cuda renderer draws through gsplat, which is not installed; "
+                "The cuda renderer renders through gsplat, which is not installed; "
                 "run `pip install gscompleter[cuda]`."
             ) from error
 
@@ -64,8 +64,8 @@ class CudaRenderer:
         if len(gaussians) == 0:
             empty = torch.zeros(camera.height, camera.width, device=gaussians.means.device)
             return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
-        colour_and_depth, alpha, _ = self.rasterized(gaussians, camera)
-        return Render(colour_and_depth[0, ..., :3], colour_and_depth[0, ..., 3], alpha[0, ..., 0])
+        color_and_depth, alpha, _ = self.rasterized(gaussians, camera)
+        return Render(color_and_depth[0, ..., :3], color_and_depth[0, ..., 3], alpha[0, ..., 0])
 
     def freeze(self, context: Gaussians, camera: Camera) -> CudaView:
         """Prepare `context` for many renders from `camera`."""
@@ -88,11 +88,13 @@ class CudaRenderer:
 
         with torch.no_grad():
             _, _, seen = self.rasterized(gaussians, camera)
-            given, drawn = gaussians.opacities, seen["opacities"].reshape(-1)
-            factors = torch.where(given > 0, drawn / given, 0.0)  # 1 for all but antialiased ones
+            given, rendered = gaussians.opacities, seen["opacities"].reshape(-1)
+            factors = torch.where(
+                given > 0, rendered / given, 0.0
+            )  # 1 for all but antialiased ones
             center = camera.center.to(gaussians.means.device)
-            colours = colours_from(gaussians.sh, gaussians.means, center)
-            values = torch.cat([colours[None], seen["depths"][..., None]], dim=-1)
+            colors = colours_from(gaussians.sh, gaussians.means, center)
+            values = torch.cat([colors[None], seen["depths"][..., None]], dim=-1)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
             sums, alphas = rasterize_to_pixels(
@@ -118,7 +120,7 @@ class CudaRenderer:
         from gsplat import rasterization
 
         camera = camera.to(gaussians.means.device)
-        colour_and_depth, alpha, found = rasterization(
+        color_and_depth, alpha, found = rasterization(
             means=gaussians.means,
             quats=gaussians.quats,
             scales=gaussians.scales,
@@ -135,7 +137,7 @@ class CudaRenderer:
             render_mode="RGB+ED",  # the depth is already divided by alpha
             rasterize_mode="antialiased" if gaussians.is_antialiased else "classic",
         )
-        return colour_and_depth, alpha, found
+        return color_and_depth, alpha, found
 
 
 @dataclass(frozen=True)
@@ -169,8 +171,8 @@ class CudaView:
         """The visible Gaussians, with their colours as this camera sees them."""
         kept = self.scene[self.reaching]
         center = self.camera.center.to(kept.means.device)
-        colours = colours_from(kept.sh, kept.means, center)
-        return painted(kept, colours)
+        colors = colours_from(kept.sh, kept.means, center)
+        return painted(kept, colors)
 
     def extended(self, new: Gaussians) -> CudaView:
         """Add `new` to the visible Gaussians."""
@@ -210,10 +212,10 @@ class CudaView:
     def plan_colours(self, new: Gaussians) -> ColourErrors:
         """Fix all of `new` but its colours; each render is a full redraw."""
 
-        def draw(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-            return self.composite(painted(new, colours)).image
+        def render(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+            return self.composite(painted(new, colors)).image
 
-        return lambda colours, photograph: errors_by_slopes(draw, new, colours, photograph)
+        return lambda colors, photograph: errors_by_slopes(render, new, colors, photograph)
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Fix all of `new` but its depths; each render is a full redraw."""

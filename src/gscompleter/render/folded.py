@@ -66,10 +66,10 @@ class Folded:
 
     def colours(self, sh: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n 3"]:
         """Compute the colours seen by the camera; those of invisible Gaussians are undefined."""
-        colours = np.empty((len(sh), 3), np.float32)
+        colors = np.empty((len(sh), 3), np.float32)
         seen = (self.shown, self.viewpoint.pinhole.center, self.means)
-        self.viewpoint.share(kernels.shade, len(self.shown), *seen, sh, colours)
-        return colours
+        self.viewpoint.share(kernels.shade, len(self.shown), *seen, sh, colors)
+        return colors
 
     def draw(
         self, opacities: Float32[ndarray, "n"], colours: Float32[ndarray, "n 3"]
@@ -86,8 +86,8 @@ class Folded:
         image: Float32[ndarray, "h w 3"],
     ) -> None:
         """Write the pixels that have fragments."""
-        drawn = [(piece, opacities, colours, image) for piece in self.fragments]
-        run(kernels.draw_fragments, drawn, self.viewpoint.threads)
+        calls = [(piece, opacities, colours, image) for piece in self.fragments]
+        run(kernels.draw_fragments, calls, self.viewpoint.threads)
 
     def slopes(
         self,
@@ -99,8 +99,8 @@ class Folded:
         """Compute gradients of opacities and colours from those of the image."""
         values = np.empty((len(self.binned.slots), 4), np.float32)
         written = np.zeros(len(values), np.bool_)
-        drawn = (opacities, colours, image, d_image, values, written)
-        pieces = [(piece, *drawn) for piece in self.fragments]
+        arguments = (opacities, colours, image, d_image, values, written)
+        pieces = [(piece, *arguments) for piece in self.fragments]
         run(kernels.draw_fragments_backward, pieces, self.viewpoint.threads)
         return self.viewpoint.sums(self.binned, (values, written))
 
@@ -125,12 +125,12 @@ class Held:
 
     def missed(self, image: Float32[ndarray, "h w 3"]) -> tuple[float, Float32[ndarray, "h w 3"]]:
         """Compute the error of the pixels that have fragments, and its gradients in them."""
-        slopes = np.empty_like(image)
+        d_image = np.empty_like(image)
         errors = np.zeros(self.folded.viewpoint.tiles)  # summed in one order on any threads
-        seen = (image, self.wanted, self.weights, slopes, errors)
+        seen = (image, self.wanted, self.weights, d_image, errors)
         pieces = [(piece, *seen) for piece in self.folded.fragments]
         run(kernels.compare_fragments, pieces, self.folded.viewpoint.threads)
-        return float(errors.sum()), slopes
+        return float(errors.sum()), d_image
 
     @cached_property
     def elsewhere(self) -> float:
@@ -146,19 +146,19 @@ class _Missed(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, held: Held, opacities: Tensor, sh: Tensor) -> Tensor:
         folded = held.folded
-        colours, opaque = folded.colours(float32(sh)), float32(opacities)
+        colors, opaque = folded.colours(float32(sh)), float32(opacities)
         image = np.empty_like(folded.image)
-        folded.draw_fragments(opaque, colours, image)
-        error, slopes = held.missed(image)
-        ctx.scene = (folded, opaque, colours, image, slopes, sh.shape[1])
+        folded.draw_fragments(opaque, colors, image)
+        error, d_image = held.missed(image)
+        ctx.scene = (folded, opaque, colors, image, d_image, sh.shape[1])
         return torch.tensor(held.elsewhere + error, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        folded, opacities, colours, image, slopes, bands = ctx.scene
-        found = slope.item() * folded.slopes(opacities, colours, image, slopes)
-        return None, *slopes_of_looks(folded, colours, found, bands, ctx.needs_input_grad[2])
+    def backward(ctx: Any, d_error: Tensor) -> tuple[Tensor | None, ...]:
+        folded, opacities, colors, image, d_image, bands = ctx.scene
+        found = d_error.item() * folded.slopes(opacities, colors, image, d_image)
+        return None, *slopes_of_looks(folded, colors, found, bands, ctx.needs_input_grad[2])
 
 
 class _Drawn(torch.autograd.Function):
@@ -166,17 +166,17 @@ class _Drawn(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, folded: Folded, opacities: Tensor, sh: Tensor) -> Tensor:
-        colours, opaque = folded.colours(float32(sh)), float32(opacities)
-        image = folded.draw(opaque, colours)
-        ctx.scene = (folded, opaque, colours, image, sh.shape[1])
+        colors, opaque = folded.colours(float32(sh)), float32(opacities)
+        image = folded.draw(opaque, colors)
+        ctx.scene = (folded, opaque, colors, image, sh.shape[1])
         return torch.from_numpy(image)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        folded, opacities, colours, image, bands = ctx.scene
-        found = folded.slopes(opacities, colours, image, float32(slope))
-        return None, *slopes_of_looks(folded, colours, found, bands, ctx.needs_input_grad[2])
+    def backward(ctx: Any, d_image: Tensor) -> tuple[Tensor | None, ...]:
+        folded, opacities, colors, image, bands = ctx.scene
+        found = folded.slopes(opacities, colors, image, float32(d_image))
+        return None, *slopes_of_looks(folded, colors, found, bands, ctx.needs_input_grad[2])
 
 
 def slopes_of_looks(

@@ -61,9 +61,9 @@ def sums_by_slopes(
     A compositing weight is the gradient of a pixel in the colour of the Gaussian.
     """
     with torch.enable_grad():
-        colours = gaussians.means.new_full((len(gaussians), 3), 0.5).requires_grad_()
-        (slope,) = torch.autograd.grad((layers * draw(colours)).sum(), colours)
-    return slope
+        colors = gaussians.means.new_full((len(gaussians), 3), 0.5).requires_grad_()
+        (gradient,) = torch.autograd.grad((layers * draw(colors)).sum(), colors)
+    return gradient
 
 
 def errors_by_slopes(

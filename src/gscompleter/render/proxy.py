@@ -52,9 +52,9 @@ def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
     means, quats, scales, opacities, sh = map(torch.from_numpy, found)
     first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
-    looks = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
-    drawn = Gaussians(means, quats, scales, *looks, is_antialiased=scene.is_antialiased)
-    return Proxy(drawn, run)
+    appearance = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
+    merged = Gaussians(means, quats, scales, *appearance, is_antialiased=scene.is_antialiased)
+    return Proxy(merged, run)
 
 
 def starts_of_runs(

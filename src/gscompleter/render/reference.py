@@ -54,10 +54,10 @@ class ReferenceRenderer:
             for chunk in pixels.split(per_chunk)
         ]
         size = (camera.height, camera.width)
-        colour, weighted_depth, alpha = (torch.cat(parts) for parts in zip(*chunks, strict=True))
+        color, weighted_depth, alpha = (torch.cat(parts) for parts in zip(*chunks, strict=True))
         seen = alpha > 0
         depth = torch.where(seen, weighted_depth / torch.where(seen, alpha, 1), 0)
-        return Render(colour.view(*size, 3), depth.view(size), alpha.view(size))
+        return Render(color.view(*size, 3), depth.view(size), alpha.view(size))
 
     def freeze(self, context: Gaussians, camera: Camera) -> ReferenceView:
         """Prepare `context` for many renders from `camera`."""
@@ -114,10 +114,10 @@ class ReferenceView:
     def plan_colours(self, new: Gaussians) -> ColourErrors:
         """Fix all of `new` but its colours."""
 
-        def draw(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-            return self.composite(painted(new, colours)).image
+        def render(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+            return self.composite(painted(new, colors)).image
 
-        return lambda colours, photograph: errors_by_slopes(draw, new, colours, photograph)
+        return lambda colors, photograph: errors_by_slopes(render, new, colors, photograph)
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Fix all of `new` but its depths."""
