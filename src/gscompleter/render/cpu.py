@@ -283,8 +283,8 @@ class Viewpoint:
         if total > MAX_ENTRIES:
             raise InputError(
                 f"The {len(splats.columns):,} Gaussians cover {total:,} tiles of the image, and at "
-                f"most {MAX_ENTRIES:,} can be rendered; use fewer or smaller Gaussians, or a smaller "
-                "image."
+                f"most {MAX_ENTRIES:,} can be rendered; use fewer or smaller Gaussians, or a "
+                "smaller image."
             )
         tile_start = lists.places_of(counts)
         entries, keys = np.empty(total, np.int32), np.empty(total, np.uint32)
