@@ -1,6 +1,6 @@
-"""No number, however odd, makes a compiled loop read or write where it must not.
+"""No number, however odd, makes a compiled loop read or write out of bounds.
 
-What would crash the process is tried in another one.
+Cases that could crash the process run in another one.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ print(ran)
 
 
 def lines_of(code: str, *words: object) -> list[str]:
-    """What a process of its own says; a signal that kills it fails the test."""
+    """Run a process and return its lines; a signal that kills it fails the test."""
     command = [sys.executable, "-c", code, *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -1,4 +1,4 @@
-"""What cannot fit is refused in a sentence, before any of it is made."""
+"""Completions that do not fit into memory are refused in a sentence, before any work."""
 
 import pytest
 

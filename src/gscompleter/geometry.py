@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from gscompleter.types import Camera, Gaussians, Window
 
 FOOTPRINT = 3.4
-"""Rendered radius of a Gaussian in standard deviations: beyond sqrt(2 log 255) alpha is < 1/255."""
+"""Rendered radius of a Gaussian in standard deviations: beyond sqrt(2 log 255), alpha < 1/255."""
 
 
 def unproject(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w 3"]:
@@ -135,7 +135,7 @@ def bordered(camera: Camera, left: int, top: int) -> Window:
 
 
 def between(camera: Camera, wide: Camera) -> Window:
-    """Pad the image of `camera` to the size of `wide`, centred."""
+    """Pad the image of `camera` to the size of `padded`, centred."""
     return bordered(camera, (wide.width - camera.width) // 2, (wide.height - camera.height) // 2)
 
 

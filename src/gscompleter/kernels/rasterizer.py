@@ -44,8 +44,7 @@ X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
 NUM_SPLAT_COLUMNS = 9
 
 SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
-"""Columns of an entry's gradients: sums of q = alpha dL/dalpha times 1, s, t, s², s t, t², and
-more."""
+"""Gradient columns: sums of q = alpha dL/dalpha times 1, s, t, s², s t, t²; depth; colours."""
 NUM_GRADIENT_COLUMNS = 10
 
 OF_ALL, OF_OPACITY, OF_DEPTH, OF_COLOUR = range(4)

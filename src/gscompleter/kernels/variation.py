@@ -7,7 +7,7 @@ from gscompleter.kernels.sharing import ranges, run, sharing
 
 PRIMAL_STEP, SLOPE_STEP = np.float32(0.25), np.float32(0.2)
 DUAL_STEP, SLOPE_DUAL_STEP = np.float32(1 / 3), np.float32(0.5)
-"""Steps of the four variables: inverse row sums of the operator, as in Pock and Chambolle 2011."""
+"""Steps of the four variables: inverse row sums of the operator (Pock and Chambolle 2011)."""
 AT_ONCE = 10
 """Iterations per pass over the image, each one row behind the last, with rows in the cache."""
 LEAST_ROWS = 4 * AT_ONCE

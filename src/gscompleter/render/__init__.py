@@ -100,8 +100,7 @@ class FrozenView(Protocol):
     def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
         """Fix all of `new` but opacities and harmonics, and render it at least in the mask `where`.
 
-        The result is differentiable in both. It takes longer to make than `plan`, but renders
-        faster.
+        Differentiable in both. Takes longer to make than `vary_opacities`, but renders faster.
         """
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
