@@ -124,16 +124,9 @@ def support(begin, end, centers, areas, agreement, means, sums, place, max_turn,
             ray_x[j], ray_y[j], ray_z[j] = dx * inverse, dy * inverse, dz * inverse
         for k in range(len(centers)):
             center = centers[k, 0], centers[k, 1], centers[k, 2]
-            observed = areas[k, start : start + count], agreement[k, start : start + count]
+            shown = areas[k, start : start + count], agreement[k, start : start + count]
             _listen(
-                x,
-                y,
-                z,
-                (ray_x, ray_y, ray_z),
-                center,
-                turn,
-                *observed,
-                (agreeing, weights, largest),
+                x, y, z, (ray_x, ray_y, ray_z), center, turn, *shown, (agreeing, weights, largest)
             )
         for j in range(count):
             i = start + j

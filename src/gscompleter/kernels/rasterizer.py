@@ -12,7 +12,7 @@ release the interpreter lock. Results do not depend on how ranges are split amon
 
 A splat's falloff is `alpha = opacity * exp(-(s² + t²))` with whitened coordinates
 `s = u dx + v dy`, `t = w dy` of the offset (dx, dy) from its centre, and `U = [[u, v], [0, w]]`,
-`UᵀU = ½ Σ⁻¹` for the 2D covariance Σ. It does not cancel for thin oblique splats, as Σ⁻¹ would.
+`UᵀU = ½ Σ⁻¹` for the 2D covariance Σ. Unlike Σ⁻¹ it does not cancel for thin oblique splats.
 """
 
 import math

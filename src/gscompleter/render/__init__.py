@@ -50,7 +50,7 @@ class AppearanceRender(Protocol):
         """Render the image; differentiable."""
 
     def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
-        """Make the sum of `weights` (>= 0) times squared differences from `wanted`."""
+        """Make an error function: sum of `weights` (>= 0) times squared errors of all channels."""
 
 
 def in_colours(plan: AppearanceRender, sh: Float[Tensor, "n k 3"]) -> OpacityImage:
@@ -63,7 +63,7 @@ ColourSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 
 
 ColourErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColourSums]
-"""Backprojects what a photograph [h, w, 3] exceeds the render by, for given colours [n, 3]."""
+"""Backprojects the residual of a photograph [h, w, 3], at given colours [n, 3]."""
 
 
 def each_view(drawn: Gaussians) -> Callable[..., Iterable[Any]]:

@@ -380,13 +380,11 @@ class _Composite(torch.autograd.Function):
 
 
 class _Planned(torch.autograd.Function):
-    """The same for varying opacities: nothing is projected, sorted or binned."""
+    """Image, depth and alpha for varying opacities: nothing is projected, sorted or binned."""
 
     @staticmethod
     def forward(ctx: Any, view: CpuView, binned: Binned, opacities: Tensor) -> tuple[Tensor, ...]:
-        seen = (
-            float32(opacities) * binned.layer.opacities
-        )  # of opaque Gaussians, antialiased if needed
+        seen = float32(opacities) * binned.layer.opacities  # those of opaque Gaussians
         layer = binned.layer._replace(opacities=seen)
         frame = view.viewpoint.composite(view, layer)
         render = render_of(frame)
@@ -407,7 +405,7 @@ class _Planned(torch.autograd.Function):
 
 
 class _Slid(torch.autograd.Function):
-    """The same for varying depths: nothing is projected."""
+    """Image, depth and alpha for varying depths: nothing is projected."""
 
     @staticmethod
     def forward(

@@ -55,7 +55,7 @@ class CudaRenderer:
             import gsplat  # noqa: F401
         except ImportError as error:
             raise InputError(
-                "The cuda renderer renders through gsplat, which is not installed; "
+                "The cuda renderer needs gsplat, which is not installed; "
                 "run `pip install gscompleter[cuda]`."
             ) from error
 
@@ -89,9 +89,7 @@ class CudaRenderer:
         with torch.no_grad():
             _, _, seen = self.rasterized(gaussians, camera)
             given, rendered = gaussians.opacities, seen["opacities"].reshape(-1)
-            factors = torch.where(
-                given > 0, rendered / given, 0.0
-            )  # 1 for all but antialiased ones
+            factors = torch.where(given > 0, rendered / given, 0.0)  # 1 unless antialiased
             center = camera.center.to(gaussians.means.device)
             colors = colours_from(gaussians.sh, gaussians.means, center)
             values = torch.cat([colors[None], seen["depths"][..., None]], dim=-1)

@@ -47,7 +47,7 @@ class Folded:
         return image
 
     def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
-        """Make the squared error, computed from the pixels that have fragments."""
+        """Make the error function, which evaluates only pixels that have fragments."""
         held = Held(self, float32(wanted), float32(weights))
 
         def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:

@@ -43,7 +43,7 @@ class DrawnAnew:
         return self.draw(opacities, sh)
 
     def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
-        """Make the sum of `weights` (>= 0) times squared differences from `wanted`."""
+        """Make an error function: sum of `weights` (>= 0) times squared errors of all channels."""
 
         def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:
             return (weights * (self.draw(opacities, sh) - wanted).square().sum(dim=-1)).sum()
