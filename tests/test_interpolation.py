@@ -1,4 +1,4 @@
-"""Values known in part of an image are continued smoothly."""
+"""Values known in a part of an image are interpolated smoothly."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Ψ without weights, of many views: who is matched with whom, each surface once, one joint fit."""
+"""Ψ without weights on many views: matched pairs, each surface once, one joint fit."""
 
 from dataclasses import replace
 
@@ -22,13 +22,13 @@ SIZE = 64
 
 
 def row_of_views(count: int, size: int = SIZE) -> list[View]:
-    """Photographs taken side by side, 0.2 apart."""
+    """Render photographs side by side, 0.2 apart."""
     offsets = (torch.arange(count) - (count - 1) / 2) * 0.2
     return [view_of(Room(), camera_at(x, size=size)) for x in offsets.tolist()]
 
 
 def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[Layer], dict]:
-    """What perfect stereo says of them."""
+    """Make the layers of perfect stereo."""
     rig = rig_of(views)
     layers = []
     for view, image in zip(views, rig.images, strict=True):
@@ -39,7 +39,7 @@ def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[Layer], 
 
 @pytest.fixture(scope="module")
 def found():
-    """Five views, and what is made of four of them; the one in the middle is held back."""
+    """Reconstruct four of five views; the one in the middle is held back."""
     views = row_of_views(5)
     given = [*views[:2], *views[3:]]
     return given, views[2], PlaneSweep()(given)
