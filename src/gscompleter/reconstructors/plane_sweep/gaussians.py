@@ -1,4 +1,4 @@
-"""One disc per pixel, sized and turned like the surface it lies on."""
+"""One disc-shaped Gaussian per pixel, oriented like the surface."""
 
 from __future__ import annotations
 
@@ -10,23 +10,20 @@ from gscompleter.geometry import quats_from
 from gscompleter.types import Gaussians, View, observed, sh_from_rgb
 
 THICKNESS = 0.15
-"""Standard deviation along the surface's normal, relative to that across the line of sight."""
+"""Standard deviation along the normal, relative to that across the viewing ray."""
 MAX_STRETCH = 3.0
-"""Longest a disc on a slanted surface may get, relative to a frontal one."""
+"""Largest elongation of a disc on a slanted surface, relative to a frontal one."""
 OPACITY = 0.98
-"""Of every disc, before the photographs have their say."""
+"""Initial opacity of every disc."""
 
 
 def discs(
     view: View, depth: Float[Tensor, "h w"], normals: Float[Tensor, "h w 3"], sigma: float
 ) -> Gaussians:
-    """A Gaussian for every pixel of `view`, row by row, at its z-depth.
+    """Create one Gaussian per pixel of `view`, row by row, at z-depth `depth`.
 
-    Args:
-        view: Colours and camera.
-        depth: z-depth in scene units.
-        normals: Of the surface, in camera axes and towards the camera.
-        sigma: Standard deviation across the line of sight, in pixels.
+    `normals` are in camera axes, towards the camera; `sigma` is the standard deviation across the
+    viewing ray, in pixels.
     """
     camera = view.camera
     rays = camera.z_rays()
@@ -57,7 +54,7 @@ def discs(
 
 
 def normals_of(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w 3"]:
-    """Surface normals in camera axes, towards the camera, from the nearer of two differences."""
+    """Compute normals in camera axes, towards the camera, by one-sided differences."""
     camera = view.camera
     rays = camera.z_rays() @ camera.c2w[:3, :3]
     # A power of two scales without rounding, and squares neither overflow nor vanish.
