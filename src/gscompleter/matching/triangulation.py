@@ -29,10 +29,10 @@ def triangulate(
     transform = source_from_reference(reference, source).astype(np.float64)
     at_infinity = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ transform[:, :3].T
     b = transform[:, 3]
-    # Least squares of matched * (A p + b w)_2 = (A p + b w)_xy in w.
-    slope = b[:2] - matched * b[2]
+    # Solve matched * (A p + b w)_2 = (A p + b w)_xy for w by least squares.
+    factor = b[:2] - matched * b[2]
     offset = matched * at_infinity[:, 2:] - at_infinity[:, :2]
-    inverse = (slope * offset).sum(1) / np.maximum((slope * slope).sum(1), 1e-12)
+    inverse = (factor * offset).sum(1) / np.maximum((factor * factor).sum(1), 1e-12)
     at_depth = at_infinity + inverse[:, None] * b
     ahead = (at_depth[:, 2] > 1e-6) & (at_infinity[:, 2] > 1e-6)
     scale = np.where(ahead, at_depth[:, 2], 1.0)[:, None]

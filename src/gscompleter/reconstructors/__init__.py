@@ -54,7 +54,7 @@ def reconstructed(
     for name, tensor in tensors_in(found, "the reconstruction"):
         if tensor.device != device:
             raise ValueError(
-                f"the reconstructor returned {name} on {tensor.device}, and its views lie on "
+                f"the reconstructor returned {name} on {tensor.device}, and its views are on "
                 f"{device}; it must return all tensors on the device of the views' images"
             )
     return found
@@ -76,7 +76,7 @@ def _plane_sweep(weights: Path | None, device: str) -> Reconstructor:
     from gscompleter.reconstructors.plane_sweep import PlaneSweep
 
     if weights is not None:
-        raise InputError(f"plane-sweep learned nothing and takes no weights; leave out {weights}.")
+        raise InputError(f"plane-sweep takes no weights; leave out {weights}.")
     return PlaneSweep()
 
 

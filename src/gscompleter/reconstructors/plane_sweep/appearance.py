@@ -55,7 +55,7 @@ def fit_colours(gaussians: Gaussians, views: Sequence[View], renderer: Renderer)
     plans = [(renderer.freeze(nothing, v.camera).plan_colours(gaussians), v.image) for v in views]
     for _ in range(COLOUR_STEPS):
         sums, weights = zip(*(errors(colours, image) for errors, image in plans), strict=True)
-        # What is hardly drawn is hardly known.
-        drawn = torch.stack(weights).sum(0).clamp_min(0.05)
-        colours = colours + RELAXATION * torch.stack(sums).sum(0) / drawn[:, None]
+        # The lower bound damps Gaussians that hardly contribute to any image.
+        total = torch.stack(weights).sum(0).clamp_min(0.05)
+        colours = colours + RELAXATION * torch.stack(sums).sum(0) / total[:, None]
     return replace(gaussians, sh=sh_from_rgb(colours))

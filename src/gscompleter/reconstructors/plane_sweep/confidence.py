@@ -44,7 +44,7 @@ def consistent(
 
 def without_speckles(index: Map, mask: Mask) -> Mask:
     """Remove patches of similar depth smaller than `MIN_AREA` pixels from `mask`."""
-    # OpenCV takes 16-bit fixed-point disparities; 0 marks what does not count.
+    # OpenCV takes 16-bit fixed-point disparities; 0 marks masked pixels.
     scale = min(16.0, 30000.0 / max(float(index.max()), 1.0))
     levels = np.where(mask, index.clip(0) * scale + scale, 0).astype(np.int16)
     cv2.filterSpeckles(levels, 0, MIN_AREA, MAX_STEP * scale)

@@ -68,5 +68,5 @@ def motion_by_rotation(view: StereoImage, pixels: Pixels) -> Float[np.ndarray, "
     """Compute the pixel motion per radian of rotation about each camera axis."""
     rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(view.K).T
     turned = np.cross(np.eye(3)[None], rays[:, None])
-    slopes = turned[..., :2] - rays[:, None, :2] * turned[..., 2:]
-    return (slopes @ view.K[:2, :2].T).transpose(0, 2, 1)
+    motion = turned[..., :2] - rays[:, None, :2] * turned[..., 2:]
+    return (motion @ view.K[:2, :2].T).transpose(0, 2, 1)

@@ -90,8 +90,8 @@ def ratio_between(
     log, weight = np.zeros(3), np.zeros(3)
     exposed = (np.minimum(own, other) > DARKEST) & (np.maximum(own, other) < BRIGHTEST)
     for channel in np.flatnonzero(exposed.sum(axis=0) > MIN_SHARED * compared):
-        told = exposed[:, channel]
-        logs = np.log(own[told, channel] / other[told, channel])
+        valid = exposed[:, channel]
+        logs = np.log(own[valid, channel] / other[valid, channel])
         log[channel] = np.median(logs)
         spread = 1.4826 * np.median(np.abs(logs - log[channel]))
         weight[channel] = 1 / (PAIR_NOISE**2 + spread**2 * SAME_PATCH * compared / len(logs))

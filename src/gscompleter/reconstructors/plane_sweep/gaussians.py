@@ -33,7 +33,7 @@ def discs(
     normal = normals.reshape(-1, 3) @ camera.c2w[:3, :3].T
     towards = -torch.nn.functional.normalize(rays, dim=-1).reshape(-1, 3)
     cosine = (normal * towards).sum(-1, keepdim=True).clamp_min(1 / MAX_STRETCH)
-    # Along the slope the disc spans as much of the ray's width as across it.
+    # On a slanted surface the disc is elongated, so that its projection stays round.
     across = torch.linalg.cross(normal, towards)
     flat = across.norm(dim=-1, keepdim=True) < 1e-3
     across = torch.where(flat, camera.c2w[:3, 0].expand_as(across), across)
@@ -57,19 +57,19 @@ def normals_of(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w 3"
     """Compute normals in camera axes, towards the camera, by one-sided differences."""
     camera = view.camera
     rays = camera.z_rays() @ camera.c2w[:3, :3]
-    # A power of two scales without rounding, and squares neither overflow nor vanish.
+    # Scale by a power of two, which is exact, so that squares neither overflow nor vanish.
     unit = 2.0 ** depth.median().log2().round().item()
     points = rays * (depth / unit)[..., None]
 
-    def slope(p: Float[Tensor, "a b 3"]) -> Float[Tensor, "a b 3"]:
+    def difference(p: Float[Tensor, "a b 3"]) -> Float[Tensor, "a b 3"]:
         step = p[:, 1:] - p[:, :-1]
         after = torch.cat([step, step[:, -1:]], 1)
         before = torch.cat([step[:, :1], step], 1)
         nearer = before[..., 2:].abs() < after[..., 2:].abs()
         return torch.where(nearer, before, after)
 
-    dx = slope(points)
-    dy = slope(points.transpose(0, 1)).transpose(0, 1)
+    dx = difference(points)
+    dy = difference(points.transpose(0, 1)).transpose(0, 1)
     normal = torch.nn.functional.normalize(torch.linalg.cross(dy, dx), dim=-1)
     facing = (normal * rays).sum(-1, keepdim=True) < 0
     return torch.where(facing, normal, -normal)

@@ -53,12 +53,12 @@ class Splatter:
         """
         gains = gains_among(layers, transforms)
         device = views[0].image.device
-        even = list(map(View.evened, views, gains.to(device)))
-        parts = [self.splat(view, depth) for view, depth in zip(even, depths, strict=True)]
+        normalized = list(map(View.evened, views, gains.to(device)))
+        parts = [self.splat(view, depth) for view, depth in zip(normalized, depths, strict=True)]
         every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
         counted = as_rows([view.counted for view in on_cpu])
         chosen = self.chosen(every, on_cpu, layers, transforms) & counted
-        behind = self.skies_behind(even, depths)
+        behind = self.skies_behind(normalized, depths)
         made = merge([every[chosen], *(gaussians.to("cpu") for _, gaussians, _ in behind)])
         known = [self.without_ignored(made, *pair) for pair in zip(on_cpu, gains, strict=True)]
         fitted = with_sky_of(made, self.fitted(made, known, gains), on_cpu[0].camera)
@@ -108,8 +108,8 @@ class Splatter:
         """Replace ignored pixels by the render, so that nothing is fitted to them."""
         if view.ignored is None:
             return view
-        drawn = self.renderer.render(made, view.camera).image * gain
-        return replace(view, image=torch.where(view.ignored[..., None], drawn, view.image))
+        image = self.renderer.render(made, view.camera).image * gain
+        return replace(view, image=torch.where(view.ignored[..., None], image, view.image))
 
     def fitted(
         self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]

@@ -20,7 +20,7 @@ Map = Float32[np.ndarray, "h w"]
 AnyMap = Float32[np.ndarray, "_ _"]
 Level = tuple[AnyMap, AnyMap, Float32[np.ndarray, "_ _ 3"]]
 
-# Heights are inverse depths, in steps between the planes of the sweep.
+# Heights are inverse depths, in planes of the sweep.
 STEP_PENALTY = 3.0
 """Cost of a one-plane step in a uniform area; a measurement costs 1 per missed plane."""
 BEND_PENALTY = 12.0
@@ -45,17 +45,17 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
     while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
         levels.append(halved(*levels[-1]))
     heights = beginning(*levels[-1][:2])
-    slopes = np.zeros((2, *heights.shape), np.float32)
+    gradients = np.zeros((2, *heights.shape), np.float32)
     for number, (data, weight, colours) in reversed(list(enumerate(levels))):
         if heights.shape != data.shape:
             heights = doubled(heights, data.shape)
-            slopes = np.stack([doubled(slope, data.shape) / 2 for slope in slopes])
-        # A coarse pixel holds 4 ** number fine ones; its steps are 2 ** number times as high.
+            gradients = np.stack([doubled(part, data.shape) / 2 for part in gradients])
+        # A coarse pixel covers 4 ** number fine ones, and its steps are 2 ** number times higher.
         scale = 2.0**number
         across, down = (cost / np.float32(scale) for cost in step_costs(colours))
         bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
         steps = ITERATIONS * 2**number
-        variation.fit(heights, slopes, data, weight, across, down, bend, tolerance, steps)
+        variation.fit(heights, gradients, data, weight, across, down, bend, tolerance, steps)
     return heights
 
 
