@@ -26,7 +26,7 @@ def observed() -> Warped:
 
 
 def paint_checked(*arguments) -> tuple[torch.Tensor, tuple[str, ...]]:
-    """Return the image and the notes of `check_image`."""
+    """Return the image and the notes of `paint_consistently`."""
     found = checked(*arguments)
     return found.image, found.notes
 

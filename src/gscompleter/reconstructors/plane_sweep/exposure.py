@@ -47,7 +47,7 @@ class Ratio:
 def gains_of(layers: Sequence[Layer], transforms: Transforms) -> Gains:
     """Estimate how much brighter each photograph is than their mean, per channel.
 
-    The log-gains have mean 0. All gains are exactly 1 if they differ by less than `HALF_A_STOP`.
+    The log-gains have mean 0. All gains are exactly 1 if they differ by less than `MIN_LOG_SPREAD`.
     """
     logs = log_gains(ratios_among(layers, transforms), len(layers))
     return np.exp(logs) if np.ptp(logs, axis=0).max() > HALF_A_STOP else np.ones_like(logs)
@@ -86,7 +86,7 @@ def ratio_between(
     other: Float[np.ndarray, "n 3"],
     compared: int,
 ) -> Ratio:
-    """Compute the median log-ratio of two photographs over `compared` sampled pixels."""
+    """Compute the median log-ratio of two photographs over `num_sampled` pixels."""
     log, weight = np.zeros(3), np.zeros(3)
     exposed = (np.minimum(own, other) > DARKEST) & (np.maximum(own, other) < BRIGHTEST)
     for channel in np.flatnonzero(exposed.sum(axis=0) > MIN_SHARED * compared):
@@ -112,7 +112,7 @@ def carried(
 
 
 def colours_at(layer: Layer, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Look up the colours of a photograph at the nearest pixels."""
+    """Sample the colours of a photograph at the nearest pixels."""
     h, w = layer.image.size
     columns, rows = pixels.astype(int).clip(0, [w - 1, h - 1]).T
     return layer.image.image[rows, columns]

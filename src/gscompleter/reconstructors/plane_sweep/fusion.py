@@ -88,7 +88,7 @@ def meetings(
 
 
 def in_free_space(layer: Layer, met: Iterator[Meeting]) -> Mask:
-    """Mark pixels to keep: none sees through them, or more views confirm than refute them."""
+    """Mark pixels that no view sees through, or that more views confirm than refute."""
     balance = np.zeros(layer.inverse.shape, np.int32)
     seen_through = np.zeros(layer.inverse.shape, bool)
     for meeting in met:

@@ -25,7 +25,7 @@ LAST = 0.2
 BETAS = 0.9, 0.99
 """Adam decay rates, short because there are few steps."""
 FAINTEST = 0.02
-"""Smallest and largest opacity margin (from 0 and 1) at the start."""
+"""Margin from 0 and 1 to which the initial opacities are clamped."""
 
 
 def fit_jointly(
@@ -72,7 +72,7 @@ def moved_by(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussians:
 
 
 def order_of(count: int) -> list[int]:
-    """Draw a random order in which each of `count` views occurs `PASSES` times."""
+    """Create a random order in which each of `count` views occurs `STEPS_PER_VIEW` times."""
     generator = torch.Generator().manual_seed(0)
     rounds = [torch.randperm(count, generator=generator) for _ in range(PASSES)]
     return torch.cat(rounds).tolist()

@@ -58,7 +58,7 @@ def inverse_depth_planes(
 def quantiles(
     values: Float[np.ndarray, "r c"], counted: Bool[np.ndarray, "r c"], share: float
 ) -> Float[np.ndarray, "r"]:
-    """Compute a quantile of the `counted` values of each row; 0 for rows without any."""
+    """Compute a quantile of the `valid` values of each row; 0 for rows without any."""
     ordered = np.sort(np.where(counted, values, np.inf), axis=1)
     ordered[~counted.any(axis=1)] = 0
     last = (counted.sum(axis=1) - 1).clip(0)

@@ -47,7 +47,7 @@ END_SHARE = 0.05
 END_PLANES = 3.0
 """Largest distance from infinity of that part, in planes of half a pixel of parallax."""
 FAR_PLANE_MARGIN, MAX_FAR_PLANE = 2.0, 10.0
-"""Alternative: planes from the far plane, and the farthest far plane this works for."""
+"""Alternative limit in planes beyond the far plane, and the largest sum that is far."""
 FAR_SHARE = 0.2
 """Fraction of the outline, the farthest, that must be far away."""
 FAR_RATIO = 2.5
@@ -55,13 +55,13 @@ FAR_RATIO = 2.5
 MAX_ON_PLANE = 0.8
 """Fraction of the outline on one plane from which the region is a ceiling or wall."""
 NEAR_PLANES, MAX_NEAR_ON_PLANE = 5.0, 0.9
-"""The same limit for the outline more planes than this, and twice its far end, away."""
+"""Planes from infinity of near outline pixels, and the same limit for these alone."""
 PLANE_TOLERANCE = 2.0
 """Largest distance of a pixel from a plane it lies on, in sweep planes."""
 ROUNDS = 20
 """Iterations of reweighted least squares."""
 AGREEMENT = 0.5
-"""Fraction of a sky that must be sky in the other views that look there."""
+"""Fraction of a sky that must also be sky in the other views."""
 
 
 def skies(rig: Rig, found: Sequence[Measured]) -> list[Mask]:
@@ -174,7 +174,7 @@ def on_one_plane(outline: Mask, heights: Map) -> float:
 
 
 def confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig) -> bool:
-    """Test if most of `sky` is sky in the other views that look there."""
+    """Test if most of `sky` is sky in the other views that show its direction."""
     shown = [
         at_infinity(sky.shape, other, rig, number, i)[sky]
         for i, other in enumerate(others)
@@ -188,7 +188,7 @@ def confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig) ->
 def at_infinity(
     size: tuple[int, ...], mask: OtherMask, rig: Rig, this: int, other: int
 ) -> Float32[np.ndarray, "h w"]:
-    """Look up the mask of another view along each pixel's direction; -1 if outside."""
+    """Sample the mask of another view in each pixel's direction; -1 if outside."""
     x, y = np.arange(size[1]) + 0.5, np.arange(size[0])[:, None] + 0.5
     turn = rig.transforms[this, other][:, :3]
     u, v, w = (a * x + b * y + c for a, b, c in turn)
