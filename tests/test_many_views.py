@@ -1,4 +1,4 @@
-"""Ψ without weights on many views: matched pairs, each surface once, one joint fit."""
+"""Plane-sweep Ψ on many views: neighbours, fusion to single surfaces, joint fit."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def row_of_views(count: int, size: int = SIZE) -> list[View]:
 
 
 def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[Layer], dict]:
-    """Make the layers of perfect stereo."""
+    """Layers of perfect stereo."""
     rig = rig_of(views)
     layers = []
     for view, image in zip(views, rig.images, strict=True):
@@ -39,7 +39,7 @@ def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[Layer], 
 
 @pytest.fixture(scope="module")
 def found():
-    """Reconstruct four of five views; the one in the middle is held back."""
+    """Five views, and the reconstruction of four of them; the middle one is held out."""
     views = row_of_views(5)
     given = [*views[:2], *views[3:]]
     return given, views[2], PlaneSweep()(given)
@@ -141,9 +141,9 @@ def test_many_views_show_a_place_between_them(found):
     renderer = load_renderer("cpu")
     for view in given:
         assert psnr(renderer.render(made.gaussians, view.camera).image, view.image) > 26
-    drawn = renderer.render(made.gaussians, between.camera)
-    assert psnr(drawn.image, between.image) > 24
-    assert (drawn.alpha > 0.5).float().mean() > 0.98
+    render = renderer.render(made.gaussians, between.camera)
+    assert psnr(render.image, between.image) > 24
+    assert (render.alpha > 0.5).float().mean() > 0.98
 
 
 def test_the_indices_tell_where_each_gaussian_came_from(found):
