@@ -42,7 +42,7 @@ def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = 
         return found
     if weights.repository is None:
         raise WeightsNotAvailable(
-            f"The weights {weights.name} are not here and no program can fetch them: "
+            f"The weights {weights.name} are not on this machine and have no automatic download; "
             f"{_by_hand(weights)}."
         )
     return _download(weights, offline)
@@ -75,8 +75,8 @@ def _given(weights: PublishedWeights, local: Path) -> Path:
     path = local / weights.file if os.path.isdir(local) else local
     if not os.path.isfile(path):
         raise InputError(
-            f"There are no weights at {path}; name the file {weights.file} or a folder that holds "
-            f"it, which {weights.source} gives out."
+            f"There are no weights at {path}; name the file {weights.file} or its folder, from "
+            f"{weights.source}."
         )
     return path
 
@@ -129,7 +129,7 @@ def _download(weights: PublishedWeights, offline: bool) -> Path:
     except LocalEntryNotFoundError as error:
         reason = "downloads are off" if offline else "the hub cannot be reached"
         raise WeightsNotAvailable(
-            f"The weights {weights.name} are not here and {reason}; {_by_hand(weights)}."
+            f"The weights {weights.name} are not on this machine and {reason}; {_by_hand(weights)}."
         ) from error
     except Exception as error:
         # The error type depends on the version of huggingface_hub; the advice does not.

@@ -70,7 +70,7 @@ def differences(needed: Shapes, given: Shapes) -> str:
         parts.append(f"it lacks {len(missing)} of {len(needed)} tensors (such as {example})")
     if extra:
         example = quoted(extra[0])
-        parts.append(f"it has {len(extra)} that the network does not know (such as {example})")
+        parts.append(f"it has {len(extra)} unknown to the network (such as {example})")
     if other:
         name = other[0]
         shapes = f"{quoted(list(given[name]))} instead of {list(needed[name])}"

@@ -44,7 +44,7 @@ def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
 def check_kind(path: Path, name: str) -> None:
     """Raise InputError if a file is missing, empty, a Git LFS pointer, a web page, or truncated."""
     if not os.path.isfile(path):
-        raise InputError(f"There is no file {path}; {name} is needed there.")
+        raise InputError(f"There is no file {path}; put {name} there.")
     with open_file(path) as file:
         head = file.read(64)
     refuse_pointer(path)
@@ -113,8 +113,8 @@ def read_tensors(path: Path, name: str) -> Any:
         found = re.search(r"GLOBAL (\S+)", str(error))
         if found is None:
             raise _broken(path, "holds no plain weights", name) from error
-        objects = f"Python objects too ({quoted(found[1])}), and to load those may run any code"
-        raise _broken(path, f"holds no plain weights but {objects}", name) from error
+        objects = f"Python objects too ({quoted(found[1])}), which may run any code"
+        raise _broken(path, f"holds {objects}", name) from error
     except Exception as error:  # damaged pickles raise many types
         raise _broken(path, "cannot be read by torch", name) from error
 

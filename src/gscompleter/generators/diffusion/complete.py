@@ -36,10 +36,10 @@ def loaded(kind: Any, source: Source, part: str, unused: str = "^$", **arguments
     Raises:
         IncompleteWeightsError: A tensor is missing.
     """
-    model, told = kind.from_pretrained(
+    model, info = kind.from_pretrained(
         source.place, output_loading_info=True, **{**source.arguments, **arguments}
     )
-    missing = sorted(name for name in told["missing_keys"] if not re.search(unused, name))
+    missing = sorted(name for name in info["missing_keys"] if not re.search(unused, name))
     if missing:
         raise IncompleteWeightsError(part, missing)
     return model

@@ -83,8 +83,8 @@ class Kontext:
             dtype=self.dtype,
         )
         latents = in_tokens(noise.to(self.device)).expand(count, -1, -1)
-        of_target = target_positions.expand(count, -1, -1)
-        positions = torch.cat([of_target, source_positions], dim=1).to(self.device)
+        repeated_target = target_positions.expand(count, -1, -1)
+        positions = torch.cat([repeated_target, source_positions], dim=1).to(self.device)
         for time in self.times(steps, len(target_positions)):
             velocity = self.velocity(latents, source, positions, time, guidance)
             latents = pipeline.scheduler.step(velocity, time, latents, return_dict=False)[0]

@@ -147,7 +147,7 @@ def render_at(view: View, context: SceneContext) -> Render:
     for known, render in zip(context.views, context.at_views, strict=True):
         if known is view or same_camera(known.camera, view.camera):
             return render
-    raise InputError("The photograph to start from is none of the scene's; give one of its views.")
+    raise InputError("The nearest view is not a view of the scene; give one of its views.")
 
 
 def load_pe_field(

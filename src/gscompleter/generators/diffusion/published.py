@@ -67,7 +67,7 @@ PE_FIELD = Source(
     revision="main",
     subfolder="FLUX.1-Kontext-dev/transformer",
     terms=(
-        "no licence of its own that is known; it is fine-tuned from FLUX.1-Kontext-dev, whose "
+        "no known licence of its own; it is fine-tuned from FLUX.1-Kontext-dev, whose "
         "non-commercial licence covers derivatives"
     ),
 )
@@ -124,7 +124,7 @@ def announce(sources: list[Source]) -> None:
     once = {(source.place, source.revision): source for source in sources if not source.is_local}
     for source in once.values():
         page = f"https://huggingface.co/{source.place}"
-        pinned = f"at {source.revision!r}, which pins nothing: what is fetched may change"
+        pinned = f"at {source.revision!r}, which is not pinned, so the files may change"
         if source.is_pinned:
             pinned = f"at commit {source.revision}"
         print(f"Weights of {page} {pinned}. Terms: {source.terms}.", file=sys.stderr)
@@ -155,10 +155,10 @@ def reading(source: Source, setting: str = "path") -> Iterator[None]:
 @contextmanager
 def silent(local: bool) -> Iterator[None]:
     """Limit diffusers and transformers to errors, and to progress bars of downloads."""
-    from diffusers.utils import logging as of_diffusers
-    from transformers.utils import logging as of_transformers
+    from diffusers.utils import logging as diffusers_logging
+    from transformers.utils import logging as transformers_logging
 
-    logs = (of_diffusers, of_transformers)
+    logs = (diffusers_logging, transformers_logging)
     levels = [log.get_verbosity() for log in logs]
     bars = [log for log in logs if local and log.is_progress_bar_enabled()]
     for log in logs:

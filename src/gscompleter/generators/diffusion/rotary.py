@@ -70,10 +70,10 @@ class PerHeadAttention:
         if encoder_hidden_states is not None:
             layers = (attn.add_q_proj, attn.add_k_proj, attn.add_v_proj)
             norms = (attn.norm_added_q, attn.norm_added_k)
-            of_text = projected(encoder_hidden_states, layers, norms)
+            text_states = projected(encoder_hidden_states, layers, norms)
             query, key, value = (
                 torch.cat([text, image], dim=1)
-                for text, image in zip(of_text, (query, key, value), strict=True)
+                for text, image in zip(text_states, (query, key, value), strict=True)
             )
         if image_rotary_emb is not None:
             query, key = turned(query, *image_rotary_emb), turned(key, *image_rotary_emb)
@@ -102,8 +102,8 @@ def turned(
 ) -> Float[Tensor, "b n heads d"]:
     """Rotate each pair of channels, in float32."""
     real, imaginary = states.unflatten(-1, (-1, 2)).unbind(-1)
-    quarter_turned = torch.stack([-imaginary, real], dim=-1).flatten(-2)
-    return (states.float() * cosines + quarter_turned.float() * sines).to(states.dtype)
+    quarter_rotated = torch.stack([-imaginary, real], dim=-1).flatten(-2)
+    return (states.float() * cosines + quarter_rotated.float() * sines).to(states.dtype)
 
 
 def with_per_head_positions(transformer: Any) -> Any:

@@ -59,7 +59,7 @@ def seen(render: Render) -> Bool[Tensor, "h w"]:
     if not valid.any():
         raise InputError(
             "The camera nearest to the target sees nothing of the scene, and PE-Field needs its "
-            "depth there; bring a scene that the photographs show, or choose 'warp-inpaint'."
+            "depth there; give a scene that the photographs show, or choose 'warp-inpaint'."
         )
     return valid
 
@@ -81,8 +81,10 @@ class MonocularDepth:
             answer = self.network(**inputs)
         found = self.processor.post_process_depth_estimation(answer, target_sizes=[size])
         guess = found[0]["predicted_depth"].float().clone().to(render.depth.device)
-        told = getattr(self.network.config, "depth_estimation_type", None)
-        metric = METRIC[self.network.config.model_type] if told is None else told == "metric"
+        declared = getattr(self.network.config, "depth_estimation_type", None)
+        metric = (
+            METRIC[self.network.config.model_type] if declared is None else declared == "metric"
+        )
         return rescaled(guess, render) if metric else from_disparity(guess, render)
 
 
@@ -131,7 +133,7 @@ def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth
     kind = network.config.model_type
     if kind not in METRIC:
         raise InputError(
-            f"The depth network of {path} is a {kind}, of which it is not known whether it gives "
-            f"depth or its inverse; choose one of {', '.join(METRIC)}."
+            f"The depth network of {path} is of the unsupported kind {kind}; choose one of "
+            f"{', '.join(METRIC)}."
         )
     return MonocularDepth(network.eval().to(device), processor, device)

@@ -40,7 +40,7 @@ def similarity_between(given: Points, found: Points) -> Similarity:
     spread = (x**2).sum(1).mean()
     if not spread > 0:
         raise InputError(
-            f"All {len(x)} cameras stand in one place, which tells no scale; give photographs "
+            f"All {len(x)} cameras stand in one place, so the scale is unknown; give photographs "
             "taken from different positions."
         )
     u, values, v = np.linalg.svd(y.T @ x / len(x))

@@ -111,6 +111,6 @@ def turned_quats(
     As in training, quaternions are reordered to wxyz but rotated as if they were xyzw.
     """
     x, y, z, w = F.normalize(raw, dim=-1, eps=1e-8).unbind(-1)
-    taken = torch.stack([z, w, x, y], dim=-1)  # (w, x, y, z) taken as xyzw, in our order
-    turned = quats_product(quats_from(turns)[:, :, None, None], taken)
-    return torch.where(turned[..., :1] < 0, -turned, turned).roll(-1, -1)
+    misread = torch.stack([z, w, x, y], dim=-1)  # (w, x, y, z) misread as xyzw, in our order
+    rotated = quats_product(quats_from(turns)[:, :, None, None], misread)
+    return torch.where(rotated[..., :1] < 0, -rotated, rotated).roll(-1, -1)

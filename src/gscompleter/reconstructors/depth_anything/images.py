@@ -26,8 +26,8 @@ Fit = Literal["resized", "cropped"]
 def normalised_images(images: UInt8[Tensor, "*n h w 3"]) -> Float[Tensor, "*n 3 h w"]:
     """Normalise colours and move channels first."""
     colours = images.float() / 255
-    normed = (colours - colours.new_tensor(MEAN)) / colours.new_tensor(DEVIATION)
-    return normed.movedim(-1, -3)
+    normalized = (colours - colours.new_tensor(MEAN)) / colours.new_tensor(DEVIATION)
+    return normalized.movedim(-1, -3)
 
 
 def scaled_to(image: Image, resolution: int, side: Side) -> Image:

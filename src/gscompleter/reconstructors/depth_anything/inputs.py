@@ -124,8 +124,8 @@ def seen_of(image: Image, sizing: Sizing) -> tuple[Image, Window]:
     scaled = scaled_to(image, sizing.resolution, sizing.side)
     if min(scaled.shape[:2]) < PATCH:
         raise InputError(
-            f"An image of {w} x {h} pixels is {scaled.shape[1]} x {scaled.shape[0]} where this "
-            f"model looks at it, and it needs at least {PATCH} x {PATCH}; use a less narrow one."
+            f"An image of {w} x {h} pixels is resized to {scaled.shape[1]} x {scaled.shape[0]} for "
+            f"this model, which needs at least {PATCH} x {PATCH}; use a less narrow one."
         )
     height, width = (whole_patches(side, sizing.fit) for side in scaled.shape[:2])
     if sizing.fit == "resized":

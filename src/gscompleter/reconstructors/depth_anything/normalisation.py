@@ -33,7 +33,7 @@ def scene_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
     """
     apart = distances_from_first(centers)
     if not apart.isfinite().all():
-        raise InputError("The place of a camera is not finite; correct its pose.")
+        raise InputError("The position of a camera is not finite; correct its pose.")
     least = apart.where(apart > 0, torch.inf).amin(dim=1)
     if least.isinf().any():
         raise InputError(

@@ -132,10 +132,10 @@ def predict(
 ) -> Prediction | NestedPrediction:
     """Run a network on a batch, with poses in normalised units."""
     device = device_of(network)
-    told = seen_from_first(batch.poses, inference.unit_of(batch.poses.centers))
+    poses = seen_from_first(batch.poses, inference.unit_of(batch.poses.centers))
     # Not torch.inference_mode: later stages optimise these tensors.
     with torch.no_grad(), lower_precision(device, inference.dtype):
-        return network(batch.images.to(device), Poses(told.c2w.to(device), told.K.to(device)))
+        return network(batch.images.to(device), Poses(poses.c2w.to(device), poses.K.to(device)))
 
 
 def centers_of(poses: Poses) -> Float[np.ndarray, "b v 3"]:

@@ -24,8 +24,8 @@ class Turns:
     def __call__(self, x: Float[Tensor, "n heads t c"]) -> Float[Tensor, "n heads t c"]:
         """Rotate channel pairs k and k + 16 of each half."""
         u, v = x.unflatten(-1, (2, 2, PAIRS)).unbind(-2)
-        turned = (u * self.cos - v * self.sin, v * self.cos + u * self.sin)
-        return torch.stack(turned, dim=-2).flatten(-3)
+        rotated = (u * self.cos - v * self.sin, v * self.cos + u * self.sin)
+        return torch.stack(rotated, dim=-2).flatten(-3)
 
 
 def turns_at(places: Int[Tensor, "t 2"]) -> Turns:
@@ -43,6 +43,6 @@ def places_in_view(rows: int, columns: int, device: torch.device) -> Int[Tensor,
 
 def places_among_views(views: int, patches: int, device: torch.device) -> Int[Tensor, "t 2"]:
     """List positions that only distinguish patches (1) from other tokens (0)."""
-    of_view = torch.ones(1 + patches, 2, dtype=torch.long, device=device)
-    of_view[0] = 0
-    return of_view.repeat(views, 1)
+    view_tokens = torch.ones(1 + patches, 2, dtype=torch.long, device=device)
+    view_tokens[0] = 0
+    return view_tokens.repeat(views, 1)

@@ -37,9 +37,8 @@ def units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) -> float:
     found = np.concatenate(ratios)
     if len(found) < MIN_MATCHES:
         raise InputError(
-            f"The photographs share {len(found)} features whose depth is known, and the length of "
-            f"a metre in this scene takes {MIN_MATCHES}; choose another reconstructor, or frames "
-            "that show more of the same."
+            f"The photographs share {len(found)} features of known depth, and the scale of the "
+            f"scene needs {MIN_MATCHES}; choose another reconstructor, or frames with more overlap."
         )
     return float(np.median(found))
 

@@ -132,7 +132,7 @@ class AnyViewVit(nn.Module):
         among = turns_at(places_among_views(views, size[0] * size[1], images.device))
         order = torch.arange(views, device=images.device).expand(scenes, -1)
         start = self.config.alternates_from
-        handed_on, local = [], x
+        outputs, local = [], x
         for number, block in enumerate(self.blocks):
             if start is not None and number == start - 1 and cameras is None and views > 2:
                 order = order_from(balanced_view(x[:, :, 0].float()), views)
@@ -147,8 +147,8 @@ class AnyViewVit(nn.Module):
                 local = x = block(x.flatten(0, 1), within).unflatten(0, (scenes, views))
             if number in self.config.outputs:
                 back = order.argsort(dim=1)
-                handed_on.append(self.handed_on(reordered(local, back), reordered(x, back)))
-        return handed_on
+                outputs.append(self.handed_on(reordered(local, back), reordered(x, back)))
+        return outputs
 
     def embedded(self, images: Float[Tensor, "b v 3 h w"]) -> Float[Tensor, "b v t c"]:
         """Embed class token and patches of each view, with positions."""

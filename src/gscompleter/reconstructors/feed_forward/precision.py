@@ -11,8 +11,7 @@ def check_precision(device: torch.device, dtype: torch.dtype) -> None:
     """Raise InputError if a network on `device` cannot run in `dtype`."""
     if dtype != torch.float32 and device.type != "cuda":
         raise InputError(
-            f"The network lies on the {device.type} and {dtype} was asked for, which needs a GPU; "
-            "use float32."
+            f"The network runs on the {device.type} and {dtype} needs a GPU; use float32."
         )
 
 

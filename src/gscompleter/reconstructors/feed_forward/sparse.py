@@ -30,7 +30,7 @@ class Packing:
     def around(cells: Int64[Tensor, "n 4"]) -> Packing:
         """Enclose `cells` in a box with a border of one cell for their neighbours."""
         if len(cells) == 0:
-            raise InputError("A sparse grid was given no cells; it needs at least one.")
+            raise InputError("A sparse grid has no cells; it needs at least one.")
         low, high = cells.amin(0).tolist(), cells.amax(0).tolist()
         if low[0] < 0:
             raise InputError(f"Batch numbers of a sparse grid start at 0; one is {low[0]}.")

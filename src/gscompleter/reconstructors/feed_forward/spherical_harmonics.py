@@ -24,20 +24,20 @@ def rotate_sh(
     sh: Float[Tensor, "b v h w k 3"], rotations: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w k 3"]:
     """Rotate k = (degree + 1)² SH coefficients in the basis of e3nn."""
-    turned = [sh[..., :1, :]]
+    rotated = [sh[..., :1, :]]
     with full_precision(sh):
         for degree in range(1, isqrt(sh.shape[-2])):
             part = sh[..., degree**2 : (degree + 1) ** 2, :]
             matrices = rotation_of_degree(degree, rotations)
-            turned.append(torch.einsum("bvij,bvhwjc->bvhwic", matrices, part))
-    return torch.cat(turned, dim=-2)
+            rotated.append(torch.einsum("bvij,bvhwjc->bvhwic", matrices, part))
+    return torch.cat(rotated, dim=-2)
 
 
 def rotation_of_degree(degree: int, rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n m m"]:
     """Compute Wigner matrices D with `Y(R d) = D Y(d)` for all directions d, by least squares."""
     directions, inverse = sampled_harmonics(degree)
-    turned = directions.to(rotations.device) @ rotations.double().transpose(-1, -2)
-    matrices = inverse.to(rotations.device) @ harmonics(degree, turned)
+    rotated = directions.to(rotations.device) @ rotations.double().transpose(-1, -2)
+    matrices = inverse.to(rotations.device) @ harmonics(degree, rotated)
     return matrices.transpose(-1, -2).to(rotations.dtype)
 
 

@@ -85,10 +85,10 @@ class TransformerLayer(nn.Module):
         mask: Float[Tensor, "windows p p"] | None,
     ) -> Float[Tensor, "b v h w c"]:
         """Apply self-attention, then cross-attention."""
-        seen = select(x, sources).flatten(0, 1)
+        source_maps = select(x, sources).flatten(0, 1)
         own = x.flatten(0, 1)
         own = own + self.self_attn(own, own[:, None], mask)
-        return (own + self.cross_attn_ffn(own, seen, mask)).view_as(x)
+        return (own + self.cross_attn_ffn(own, source_maps, mask)).view_as(x)
 
 
 class MultiViewTransformer(nn.Module):
