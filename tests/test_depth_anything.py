@@ -459,7 +459,7 @@ def test_metres_are_brought_to_the_unit_that_shared_features_tell():
 def test_photographs_without_features_tell_no_metre():
     views = [replace(view, image=torch.full_like(view.image, 0.5)) for view in photographs()]
     network = KnowingMetric(torch.stack([view.depth for view in views]), 50.0)
-    with pytest.raises(InputError, match="share 0 features .* takes 12"):
+    with pytest.raises(InputError, match="share 0 features .* needs 12"):
         MetricViewDepth(network, QUICK)(views)
 
 
