@@ -154,7 +154,7 @@ def test_other_networks_of_transformers_are_read_as_what_they_give(tiny, tmp_pat
 def test_a_network_of_which_it_is_not_known_what_it_gives_is_refused(tmp_path, monkeypatch):
     folder = str(tiny_model(tmp_path))
     monkeypatch.setattr(source_depth, "METRIC", {"dpt": False})
-    with pytest.raises(InputError, match=r"is a depth_anything, of which .* choose one of dpt"):
+    with pytest.raises(InputError, match=r"unsupported kind depth_anything; choose one of dpt"):
         source_depth_named(folder)
 
 
