@@ -368,7 +368,7 @@ def test_a_sog_opens_no_files_but_its_own(tmp_path):
         meta["quats"]["files"] = [name]
         folder = tmp_path / f"scene{len(os.listdir(tmp_path))}"
         write_sog(folder, files | {"meta.json": json.dumps(meta).encode()})
-        refused(folder, "none of its own")
+        refused(folder, "not beside it")
 
 
 @pytest.mark.parametrize("name", ["scene.splat", "scene.glb"])

@@ -54,13 +54,16 @@ class SplatFrame:
 
     def sentence(self) -> str:
         """Describe the alignment in a sentence."""
-        found = f"the photographs at {self.fit.psnr:.1f} dB ({self.given.psnr:.1f} dB as given)"
+        found = (
+            f"it fits the photographs at {self.fit.psnr:.1f} dB "
+            f"({self.given.psnr:.1f} dB as given)"
+        )
         where = {
             "given": f"The splat fits the photographs as it is, at {self.fit.psnr:.1f} dB",
-            "cameras": f"The splat fits in the frame of its trainer's camera list: {found}",
-            "dataparser": f"The splat fits in the frame of dataparser_transforms.json: {found}",
-            "normalised": f"The splat fits in the frame that its trainer normalised to: {found}",
-            "similarity": f"The splat fits in a frame found by matching image features: {found}",
+            "cameras": f"The splat is in the frame of its trainer's camera list: {found}",
+            "dataparser": f"The splat is in the frame of dataparser_transforms.json: {found}",
+            "normalised": f"The splat is in the frame that its trainer normalised to: {found}",
+            "similarity": f"The splat is in a frame found by matching image features: {found}",
         }[self.method]
         if not FAR_OFF < self.fit.drift < math.inf:
             return f"{where}."
