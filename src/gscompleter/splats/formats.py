@@ -169,7 +169,7 @@ def writable_format(path: Path) -> Format:
     name = _by_name(path)
     if name is None or FORMATS[name].write is None:
         raise InputError(
-            f"{quoted(path)} has no extension of a format that can be written; name it "
+            f"{quoted(path)} cannot be written in the format of its extension; end it in "
             f"{', '.join(f.extensions[0] for f in FORMATS.values() if f.write)}."
         )
     return FORMATS[name]
