@@ -55,8 +55,7 @@ class SplatFrame:
     def sentence(self) -> str:
         """Describe the alignment in a sentence."""
         found = (
-            f"it fits the photographs at {self.fit.psnr:.1f} dB "
-            f"({self.given.psnr:.1f} dB as given)"
+            f"it fits the photographs at {self.fit.psnr:.1f} dB ({self.given.psnr:.1f} dB as given)"
         )
         where = {
             "given": f"The splat fits the photographs as it is, at {self.fit.psnr:.1f} dB",
