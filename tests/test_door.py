@@ -248,7 +248,7 @@ def test_a_splat_with_infinite_logits_keeps_its_bytes(scene, chosen, tmp_path, m
     aloud = [word for word in SMALL if word != "--quiet"]
     assert run(monkeypatch, *complete(scene, out, *aloud, "--scene", given)) == 0
     said = capsys.readouterr().err
-    assert said.count("1 have a logit of opacity of +infinity and 1 of -infinity") == 1
+    assert said.count("Gaussians have an opacity logit of +infinity and 1 of -infinity") == 1
     rows = plyfile.PlyData.read(str(out / "completed.ply"))["vertex"].data
     assert rows["opacity"][rows["generated"] == 0].tobytes() == data["vertex"]["opacity"].tobytes()
     assert load_ply(out / "context.ply").opacities[[3, 8]].tolist() == pytest.approx([1, 0])
