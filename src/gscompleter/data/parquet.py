@@ -15,13 +15,9 @@ ADVICE = "download it again"
 def read_columns(
     path: Path, columns: Sequence[str], where: Mapping[str, object] | None = None
 ) -> dict[str, list[Any]]:
-    """Columns of a table, with the rows in which those of `where` have these values.
+    """Read columns of a table, only rows where the columns of `where` have these values.
 
-    Lists of numbers come as arrays; what is null is None. Nothing else of the file is read.
-
-    Raises:
-        InputError: where pyarrow is not installed, or the file is missing, damaged or lacks a
-            column.
+    Lists of numbers become arrays; null becomes None.
     """
     try:
         import pyarrow
@@ -53,7 +49,7 @@ def _check_columns(path: Path, needed: Sequence[str], there: Sequence[str]) -> N
 
 
 def _plain(scalar: Any) -> Any:
-    """A value as Python has it, and a list of numbers as an array."""
+    """Convert to a Python value, and a list of numbers to an array."""
     if not scalar.is_valid:
         return None
     values = getattr(scalar, "values", None)
