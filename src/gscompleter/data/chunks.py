@@ -86,7 +86,7 @@ def _checked(path: Path, content: Mapping[str, str], index: Path) -> list[Photog
     listed = {name for name, chunk in content.items() if index.parent / chunk == path}
     for name in sorted(listed - names):
         raise InputError(
-            f"{index} says that the scene {quoted(name)} is in {path}, which does not hold it; "
+            f"{index} lists the scene {quoted(name)} in {path}, which does not hold it; "
             "write the index again, or download the chunk again."
         )
     for name in sorted(names - listed):
@@ -114,12 +114,12 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
     refuse_pointer(path)
     try:
         with warnings.catch_warnings():
-            # About pickle protocols, in the moment before the file is refused.
+            # Torch warns about pickle protocols just before the file is refused.
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True)
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
-    # On damaged bytes the unpickler raises whatever the next instruction leads to.
+    # Damaged bytes can raise any exception.
     except Exception as error:
         raise InputError(_cannot_load(path, error)) from error
     if not isinstance(content, list) or not content:
@@ -137,7 +137,7 @@ def _cannot_load(path: Path, error: Exception) -> str:
             "run any code; save it again with tensors, strings, lists and dicts only."
         )
     if isinstance(error, MemoryError) or "allocate memory" in str(error):
-        return f"{path} asks for more memory than there is; divide it, or download it again."
+        return f"{path} needs more memory than is available; split it, or download it again."
     return f"{path} is truncated or no file of torch.save; download it again."
 
 
@@ -157,8 +157,8 @@ def _photographs(example: Any, path: Path, position: int) -> Photographs:
         raise InputError(f"The `images` of the {called} are no list with images in it.")
     if len(images) != len(cameras):
         raise InputError(
-            f"The {called} has {len(images)} images and {len(cameras)} cameras; one camera for "
-            "each image is needed, so download the chunk again."
+            f"The {called} has {len(images)} images and {len(cameras)} cameras; each image "
+            "needs one camera, so download the chunk again."
         )
     for number, image in enumerate(images):
         if not _is_dense(image, ndim=1) or image.dtype != torch.uint8:

@@ -107,7 +107,7 @@ def _points(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.
         finite = points[np.isfinite(points).all(axis=1)]
     except InputError:
         raise
-    except Exception as error:  # a damaged archive or array fails in any way
+    except Exception as error:  # damaged archives and arrays raise anything
         raise InputError(f"{quoted(path)} is no point cloud of DGP; {ADVICE}.") from error
     return finite @ world_from_laser[:3, :3].T + world_from_laser[:3, 3]
 
@@ -139,7 +139,7 @@ def _calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     file = _calibration_file(scene, content)
     calibration = read_json(file, ADVICE)
     names, entries = _list(calibration, "names"), _list(calibration, "intrinsics")
-    # Those of other sensors than cameras are zeros.
+    # Entries of other sensors are zeros.
     pairs = [(n, e) for n, e in zip(names, entries, strict=False) if _is_camera(n, e)]
     return {
         name: _intrinsics(entry, f"camera {quoted(name)} of {quoted(file)}")

@@ -236,8 +236,8 @@ def trace_outline(
     rows = np.arange(height)[:, None]
     reward = edges.staying * (0.5 + 0.5 * edges.across) - cost
     reward = np.where((rows >= first) & (rows < limit), reward, -1.0)
-    reward = np.concatenate([reward, np.zeros((1, width))])  # the lower edge: no vehicle there
-    bends = np.array([0, *range(-STEEPEST, 0), *range(1, STEEPEST + 1)])  # of equals the first one
+    reward = np.concatenate([reward, np.zeros((1, width))])  # lower border: no vehicle
+    bends = np.array([0, *range(-STEEPEST, 0), *range(1, STEEPEST + 1)])  # argmax takes the first
     total, came = reward[:, 0], np.zeros((height + 1, width), np.int64)
     for column in range(1, width):
         padded = np.pad(total, STEEPEST, constant_values=-np.inf)

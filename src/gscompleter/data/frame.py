@@ -75,9 +75,9 @@ class Frame:
 
         A photograph inside a container file is not opened if the camera file gives its size.
         """
-        told = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
+        stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
         within = self.image is not None and not isinstance(self.image, Path)
-        size = told if within and told is not None else self.stored_size() or told
+        size = stated if within and stated is not None else self.stored_size() or stated
         if size is None:
             raise InputError(
                 f"The size of {self.title} is not known, because it has no image and no `w` and "
@@ -107,12 +107,12 @@ class Frame:
         return read_brightness(self.needed(), side, capital(self.title))
 
     def defect(self, width: int, height: int) -> str | None:
-        """Describe why the camera is impossible for a photograph of this size; None if it is valid."""
+        """Describe why the camera is impossible at this photograph size; None if it is valid."""
         if max(width, height) > MAX_SIDE:
             return f"its {width} × {height} pixels have a side above {MAX_SIDE}"
         if self.intrinsics.transposed(width, height):
             w, h = self.intrinsics.size or (width, height)
-            return f"its image is {width} × {height} pixels and its `w` and `h` say {w} × {h}"
+            return f"its image has {width} × {height} pixels, but its `w` and `h` are {w} × {h}"
         pinhole = self.intrinsics.at(width, height)
         defect = pose_defect(self.c2w) or pinhole_defect(pinhole)
         if defect is None and undistorted(pinhole, self.intrinsics.distortion) is None:

@@ -35,7 +35,7 @@ class Intrinsics:
         fl_y = _focal(self.focal[1], self.angle[1], h)
         cx = w / 2 if self.center[0] is None else self.center[0]
         cy = h / 2 if self.center[1] is None else self.center[1]
-        # Where only one of the two is known, pixels are square.
+        # With only one focal length, pixels are square.
         known = fl_y if fl_x is None else fl_x
         assert known is not None
         fl_x, fl_y = known if fl_x is None else fl_x, known if fl_y is None else fl_y

@@ -90,7 +90,7 @@ def rectified(
     K, aside = projection[:3, :3], projection[:3, 3]
     if not _is_upright(K):
         raise InputError(
-            f"The projection of camera {camera} in {title} is none of a rectified "
+            f"The projection of camera {camera} in {title} is not that of a rectified "
             "camera; name the calib.txt of KITTI odometry."
         )
     transform = np.eye(4)

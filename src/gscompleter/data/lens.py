@@ -93,7 +93,7 @@ class Distortion:
 
 def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np.ndarray, "*n 2"]:
     """Distort points of the image plane at z = 1; NaN outside the field of the lens."""
-    # Far outside the photograph polynomials overflow, and a division has no solution.
+    # Far outside the photograph, polynomials overflow and the division has no solution.
     with np.errstate(all="ignore"):
         return _bent(_projected(points, distortion), distortion)
 
@@ -159,8 +159,8 @@ def undistorted(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
     zoom, radius = None, np.zeros(())
     for candidate in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400):
         bent = distort(_border(pinhole.zoomed(float(candidate))), distortion)
-        # Zooming out has to move every border point outwards: beyond the fold of a
-        # polynomial, points come back into the photograph and show something else.
+        # Zooming out must move every border point outwards: beyond the fold of a polynomial,
+        # points return into the photograph and show something else.
         if not _within(pinhole, bent) or (np.linalg.norm(bent, axis=-1) < radius).any():
             break
         zoom, radius = float(candidate), np.linalg.norm(bent, axis=-1)
@@ -174,7 +174,7 @@ def undistortion_map(
     """Compute the photograph position of each undistorted pixel, for `remap`."""
     x, y = np.meshgrid(np.arange(new.width) + 0.5, np.arange(new.height) + 0.5)
     pixels = _pixels(pinhole, distort(_plane_points(new, x, y), distortion))
-    # Where the lens shows nothing, the nearest border stands in.
+    # The nearest border fills pixels outside the field of the lens.
     finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
     with np.errstate(over="ignore"):
         return finite.astype(np.float32)

@@ -111,9 +111,8 @@ def _photographs_beside(file: Path, count: int) -> list[Path]:
     if fitting is None:
         numbers = ", ".join(f"{len(i)} in {f.name}" for f, i in zip(folders, found, strict=True))
         raise InputError(
-            f"{quoted(file)} has {count} rows, which belong to as many photographs in order of "
-            f"their names, and there are {numbers}; put exactly these into a folder "
-            "`images` beside it."
+            f"{quoted(file)} has {count} rows, one per photograph in order of their names, but "
+            f"there are {numbers}; put exactly these photographs into a folder `images` beside it."
         )
     return fitting
 

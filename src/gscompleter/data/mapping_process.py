@@ -108,7 +108,7 @@ class Teller:
 def main() -> None:
     """Run the job in the file that the command line names."""
     teller = Teller(os.fdopen(os.dup(1), "w"))
-    os.dup2(2, 1)  # nothing that COLMAP prints is taken for ours
+    os.dup2(2, 1)  # keeps output of COLMAP apart from ours
     task = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     photographs = [Upright(**one) for one in task["photographs"]]
     images, work, model = (Path(task[name]) for name in ("images", "work", "model"))

@@ -64,8 +64,8 @@ def open_infos(path: Path) -> Iterator[Photographs]:
     if not isinstance(samples, list) or not samples:
         raise InputError(f"{quoted(path)} holds no infos with a `data_list`; {ADVICE}.")
     kinds = _kinds(content.get("metainfo"))
-    told = sorted((_Sample(path, kinds, *_told(s, path)) for s in samples), key=_Sample.order)
-    return (_scene(path, scene) for scene in _scenes(told))
+    ordered = sorted((_Sample(path, kinds, *_told(s, path)) for s in samples), key=_Sample.order)
+    return (_scene(path, scene) for scene in _scenes(ordered))
 
 
 class _Sample:
@@ -149,9 +149,9 @@ def _frame(sample: _Sample, camera: str) -> Frame:
     file = text_of(image, "img_path", title)
     assert file is not None
     laser_from_camera = _inverse(_numbers(image, "lidar2cam", (4, 4), title))
-    with np.errstate(over="ignore", invalid="ignore"):  # which leaves a defect of the pose
-        # By way of the laser: between its time and the camera's the vehicle has moved, and
-        # lidar2cam knows of it.
+    with np.errstate(over="ignore", invalid="ignore"):  # leaves a defect of the pose
+        # Through the laser frame: lidar2cam includes the vehicle's motion between the
+        # times of laser and camera.
         c2w = sample.vehicle @ sample.vehicle_from_laser @ laser_from_camera
     return Frame(
         f"{camera}/{os.path.basename(file)}",

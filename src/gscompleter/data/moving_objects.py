@@ -77,7 +77,7 @@ def _outline(corners: Float[np.ndarray, "8 3"], camera: Camera) -> np.ndarray | 
         return None
     shown = _before(local)
     pixels = (shown @ K.T)[:, :2] / shown[:, 2:]
-    # The centre of the first pixel is (0, 0) here.
+    # OpenCV puts the centre of the first pixel at (0, 0).
     pixels = np.clip(pixels - 0.5, -MAX_PIXELS, MAX_PIXELS)
     return cv2.convexHull(np.rint(pixels).astype(np.int32))
 

@@ -33,7 +33,7 @@ def refuse_other_exports(path: Path) -> None:
             found, path = _program_of(file), file
     if found is not None:
         raise InputError(
-            f"{quoted(path)} holds cameras as {found} keeps them, which are not read; "
+            f"{quoted(path)} holds cameras of {found}, which cannot be read; "
             f"{INSTEAD[found]}, or name a folder of the photographs alone."
         )
 

@@ -28,8 +28,8 @@ FRONT = "front_camera"
 INTRINSICS, POSES = "intrinsics.json", "poses.json"
 ADVICE = "copy the sequence again"
 NO_DEPTH = (
-    "The point clouds and boxes of PandaSet are pickles of pandas, which can run programs; they "
-    "are not read."
+    "The point clouds and boxes of PandaSet are not read, because they are pandas pickles, which "
+    "can run any code."
 )
 
 

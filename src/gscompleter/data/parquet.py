@@ -37,8 +37,10 @@ def read_columns(
             keep = same if keep is None else keep & same
         found = table.to_table(list(columns), filter=keep, use_threads=False)
     except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
-        said = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"{quoted(path)} cannot be read ({quoted(said[0])}); {ADVICE}.") from error
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(
+            f"{quoted(path)} cannot be read ({quoted(lines[0])}); {ADVICE}."
+        ) from error
     return {column: [_plain(value) for value in found.column(column)] for column in columns}
 
 

@@ -185,7 +185,7 @@ class Photographs:
         _, pinhole = frame.pinholes(*size)
         final = framing(*size, resolution).camera(pinhole)
         c2w = frame.c2w.copy()
-        c2w[:3, 3] -= self.origin  # in float64 still
+        c2w[:3, 3] -= self.origin  # before rounding to float32
         pose = torch.from_numpy(c2w).float()
         return Camera(pose, final.K, final.width, final.height, self.near, self.far)
 

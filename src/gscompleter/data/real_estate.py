@@ -43,7 +43,7 @@ def read_camera_file(path: Path) -> Photographs:
         raise InputError(f"{path} is not a text file; name a camera file.") from error
     if not lines:
         raise InputError(
-            f"{path} lists no frames; below the line with the address, one line a frame is needed."
+            f"{path} lists no frames; below the line with the address, each frame needs a line."
         )
     frames = [_frame(line, number, path) for number, line in enumerate(lines)]
     return photographs_of(path.stem, str(path), frames)

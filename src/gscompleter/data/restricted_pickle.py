@@ -34,15 +34,14 @@ def load_plain(path: Path) -> Any:
         return value
     except InputError:
         raise
-    except Exception as error:  # a damaged pickle fails in any way that its opcodes can
+    except Exception as error:  # damaged pickles raise anything
         raise InputError(
             f"{quoted(path)} is no pickle of plain values ({type(error).__name__}: "
             f"{quoted(str(error))}); write it again with lists and numbers only."
         ) from error
 
 
-# The unpickler in C reserves as much memory as a file of a few bytes asks for; that in Python grows
-# with what is there.
+# The unpickler in C allocates any size that a few bytes claim; the one in Python does not.
 class _Plain(pickle._Unpickler):
     """Unpickler that knows three names, and dictionaries with plain keys only.
 
@@ -52,11 +51,11 @@ class _Plain(pickle._Unpickler):
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
         found = KNOWN.get((module.replace("numpy._core", "numpy.core"), name))
         if found is None:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}")
+            raise pickle.UnpicklingError(f"it names {module}.{name}")
         return found
 
     def persistent_load(self, pid: Any) -> Any:
-        raise pickle.UnpicklingError("it asks for what lies outside of it")
+        raise pickle.UnpicklingError("it refers to external objects")
 
 
 class _Kind:
@@ -78,7 +77,7 @@ def _number(kind: _Kind, data: bytes) -> bool | int | float:
 
 def _bytes_of(text: str, encoding: str) -> bytes:
     if encoding != "latin1":
-        raise pickle.UnpicklingError(f"it asks for the encoding {quoted(encoding)}")
+        raise pickle.UnpicklingError(f"it uses the encoding {quoted(encoding)}")
     return text.encode("latin1")
 
 

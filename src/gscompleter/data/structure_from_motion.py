@@ -85,14 +85,14 @@ class FoundPoses:
         notes, place = [], ""
         if self.focal is not None:
             notes.append(
-                "COLMAP failed with a free focal length, so it was held at plausible values first: "
-                f"{self.registered} of {self.photographs} cameras were found so, and a focal "
-                f"length of {self.focal:.0f} px fits them."
+                f"{self.registered} of {self.photographs} cameras were found with a focal length "
+                f"of {self.focal:.0f} px, fixed at plausible values first, because COLMAP failed "
+                "with a free one."
             )
         if len(self.models) > 1:
             *others, last = map(str, self.models)
             notes.append(
-                f"The photographs fall into {len(self.models)} parts that do not connect, of "
+                f"The photographs fall into {len(self.models)} parts that do not connect, with "
                 f"{', '.join(others)} and {last} cameras; the largest is kept."
             )
             place = " in it"
@@ -285,8 +285,8 @@ def _show(lines: Iterator[dict[str, Any]], phase: str, steps: int) -> None:
 
 def _gave_up(phase: str, code: int, complaints: IO[str]) -> str:
     complaints.seek(0)
-    said = [line.strip() for line in complaints if line.strip()]
-    reason = f": {quoted(said[-1], 200)}" if said else f" with exit code {code}"
+    messages = [line.strip() for line in complaints if line.strip()]
+    reason = f": {quoted(messages[-1], 200)}" if messages else f" with exit code {code}"
     return (
         f"COLMAP gave up while {phase[0].lower()}{phase[1:]}{reason}; leave out photographs that "
         "may be damaged, and try again."

@@ -41,8 +41,8 @@ def poses_of(content: Any, path: Path, resolution: Resolution) -> list[Frame]:
     """Read SuperSplat's poses as cameras in the frame of the splat; `resolution` must be given."""
     if resolution is None or isinstance(resolution, int):
         raise InputError(
-            f"The poses of SuperSplat in {quoted(path)} do not say how large the images are; give "
-            "a resolution (height and width).",
+            f"The poses of SuperSplat in {quoted(path)} have no image size; give a resolution "
+            "(height and width).",
             "resolution",
         )
     poses = _poses(content)

@@ -60,10 +60,10 @@ def write_upright(root: Path, source: str, folder: Path) -> Upright:
             return Upright(name, source, width, height, _focal(exif, width, height), _lens(exif))
     except InputError:
         raise
-    # A damaged file can fail in any way.
+    # Damaged files raise anything.
     except Exception as error:
         raise InputError(
-            f"{quoted(root / source)} is no image that can be read ({quoted(str(error))}); copy it "
+            f"{quoted(root / source)} cannot be read as an image ({quoted(str(error))}); copy it "
             "again, or take it out of the folder."
         ) from error
 
@@ -88,14 +88,14 @@ def _write(image: Image.Image, exif: Image.Exif, source: Path, target: Path) -> 
     plain = image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L")
     upright = exif.get(ORIENTATION, 1) == 1
     if plain and upright and max(image.size) <= MAX_SIDE:
-        image.load()  # a truncated file is found out here
+        image.load()  # detects truncated files
         shutil.copyfile(source, target)
         return image.size
-    # A JPEG is decoded at half or a quarter of its size where that is enough.
+    # Decodes a JPEG at half or a quarter of its size if that is enough.
     image.draft("RGB", (MAX_SIDE, MAX_SIDE))
     copy = ImageOps.exif_transpose(image).convert("RGB")
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
-    copy.info.clear()  # no orientation stays behind that a reader could obey once more
+    copy.info.clear()  # removes the orientation, which is applied already
     if image.format == "JPEG":
         copy.save(target, format="JPEG", quality=QUALITY, subsampling=0)
     else:
@@ -113,8 +113,13 @@ def _focal(exif: Image.Exif, width: int, height: int) -> float | None:
 
 def _lens(exif: Image.Exif) -> str:
     detail = exif.get_ifd(EXIF)
-    told = (exif.get(MAKE), exif.get(MODEL), detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35))
-    return " ".join(str(value) for value in told if value is not None)
+    values = (
+        exif.get(MAKE),
+        exif.get(MODEL),
+        detail.get(FOCAL_LENGTH),
+        detail.get(FOCAL_LENGTH_35),
+    )
+    return " ".join(str(value) for value in values if value is not None)
 
 
 def _number(value: Any) -> float | None:

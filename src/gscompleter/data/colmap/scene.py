@@ -160,7 +160,7 @@ def _scene(
 
 
 def _finder(roots: Sequence[Path]) -> ImageFinder:
-    # Beside a model with a lens, `images` may hold photographs that have lost theirs.
+    # Beside a model with distortion, `images` may hold undistorted photographs.
     lens = any(root.name.casefold() == DISTORTED for root in roots)
     return ImageFinder(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
 
@@ -185,8 +185,8 @@ def _choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
         return ()
     others = ", ".join(str(size) for number, size in enumerate(sizes) if number != best)
     return (
-        f"{len(models)} models lie in {models[best].parent}: the one in {models[best].name} with "
-        f"{sizes[best]} images was opened, of the others with {others} nothing is used.",
+        f"{len(models)} models lie in {models[best].parent}: {models[best].name} with "
+        f"{sizes[best]} images is used; the others, with {others} images, are ignored.",
     )
 
 
@@ -195,8 +195,8 @@ def _turned(frame: Frame) -> tuple[str, ...]:
     if not isinstance(frame.image, Path) or not is_turned(frame.image):
         return ()
     return (
-        f"The photographs are to be turned by their EXIF data, as {quoted(frame.name)} is: they "
-        "are used as they are stored, which is how COLMAP saw them.",
+        f"The EXIF rotation of the photographs, such as {quoted(frame.name)}, is ignored: they are "
+        "used as they are stored, like in COLMAP.",
     )
 
 
@@ -205,6 +205,6 @@ def _points_of(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
     path = _file(model, "points3D")
     if path is not None:
         return partial(_READERS[path.suffix.lower()].read_points, path)
-    # 3DGS's script leaves them as a PLY.
+    # The script of 3DGS writes them as PLY.
     cloud = find_path(model, "points3D.ply")
     return None if cloud is None else partial(read_point_cloud, cloud)

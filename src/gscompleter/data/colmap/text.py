@@ -82,7 +82,7 @@ def _lists_features(line: str) -> bool:
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
     """Yield the lines with content, each with its location."""
-    # Names may be of any encoding, and are handed on to the file system as they are.
+    # Names may have any encoding and are passed to the file system unchanged.
     lines = read_lines(path, MAX_LINE, MAX_BYTES, errors="surrogateescape")
     for number, line in enumerate(lines, start=1):
         if line.strip() and not line.lstrip().startswith("#"):
