@@ -124,13 +124,13 @@ def _array(archive: zipfile.ZipFile) -> Float[np.ndarray, "n 3"]:
 
 
 def _pose(pose: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
-    def numbers(part: str, *keys: str) -> list[float]:
+    def read_numbers(part: str, *keys: str) -> list[float]:
         entry = _object(pose, part)
         return [number_of(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
 
     c2w = np.eye(4)
-    c2w[:3, :3] = rotation_of(numbers("rotation", "qw", "qx", "qy", "qz"))
-    c2w[:3, 3] = numbers("translation", "x", "y", "z")
+    c2w[:3, :3] = rotation_of(read_numbers("rotation", "qw", "qx", "qy", "qz"))
+    c2w[:3, 3] = read_numbers("translation", "x", "y", "z")
     return c2w
 
 

@@ -22,7 +22,7 @@ this longer side. None: keep the size.
 
 @dataclass(frozen=True)
 class Framing:
-    """Resize to `resized`, then crop `size` at `corner` (all x, y)."""
+    """Resize to `scaled_size`, then crop `size` at `corner` (all x, y)."""
 
     resized: tuple[int, int]
     corner: tuple[int, int]

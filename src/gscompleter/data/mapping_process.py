@@ -107,7 +107,7 @@ class Teller:
 
 def main() -> None:
     """Run the job in the file that the command line names."""
-    teller = Teller(os.fdopen(os.dup(1), "w"))
+    progress = Teller(os.fdopen(os.dup(1), "w"))
     os.dup2(2, 1)  # keeps output of COLMAP apart from ours
     task = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     photographs = [Upright(**one) for one in task["photographs"]]
@@ -115,20 +115,20 @@ def main() -> None:
     job = Job(images, work, model, photographs, task["threads"], task["wanted"], task["min_points"])
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(SEED)
-    find_features(job, teller)
-    match(job, pairs_of(job), teller)
-    teller.say({"result": map_all(job, teller)})
+    find_features(job, progress)
+    match(job, pairs_of(job), progress)
+    progress.say({"result": map_all(job, progress)})
 
 
 def find_features(job: Job, teller: Teller) -> None:
     """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
 
-    def camera(one: Upright) -> tuple[int, int, str]:
+    def make_key(one: Upright) -> tuple[int, int, str]:
         return one.width, one.height, one.lens
 
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
     extraction.sift.max_num_features = MAX_FEATURES
-    cameras = {camera(one): one for one in job.photographs}
+    cameras = {make_key(one): one for one in job.photographs}
     numbers = {key: _add_camera(job, one) for key, one in cameras.items()}
     with teller.phase("Finding features", len(job.photographs)):
         for one in job.photographs:
@@ -136,7 +136,9 @@ def find_features(job: Job, teller: Teller) -> None:
                 job.database,
                 job.images,
                 [one.name],
-                reader_options=pycolmap.ImageReaderOptions(existing_camera_id=numbers[camera(one)]),
+                reader_options=pycolmap.ImageReaderOptions(
+                    existing_camera_id=numbers[make_key(one)]
+                ),
                 extraction_options=extraction,
                 device=pycolmap.Device.cpu,
             )
@@ -370,7 +372,7 @@ def _is_centred(camera: pycolmap.Camera) -> bool:
 def _models(job: Job, teller: Teller, is_held: bool = False) -> list[Any]:
     """Map the scene into disconnected models, the largest first."""
 
-    def first_pair() -> None:
+    def count_first_pair() -> None:
         teller.step()
         teller.step()
 
@@ -387,7 +389,7 @@ def _models(job: Job, teller: Teller, is_held: bool = False) -> list[Any]:
             job.images,
             job.work,
             options,
-            initial_image_pair_callback=first_pair,
+            initial_image_pair_callback=count_first_pair,
             next_image_callback=teller.step,
         )
     return sorted(found.values(), key=lambda model: -model.num_reg_images())

@@ -38,11 +38,11 @@ def in_order(name: str) -> tuple[str, ...]:
 def is_sequence(names: Sequence[str]) -> bool:
     """Check whether the names share a folder and differ only in their last number."""
 
-    def without_number(name: str) -> tuple[str, str]:
+    def strip_number(name: str) -> tuple[str, str]:
         path = PurePosixPath(name)
         return str(path.parent), re.sub(r"\d+(?=\D*$)", "#", path.name, count=1)
 
-    forms = {without_number(name) for name in names}
+    forms = {strip_number(name) for name in names}
     return len(forms) == 1 and "#" in next(iter(forms))[1]
 
 
@@ -60,7 +60,7 @@ def all_pairs(count: int) -> Pairs:
 def largest(
     scales: Float[np.ndarray, "n"], descriptors: Float[np.ndarray, "n 128"]
 ) -> Float[np.ndarray, "k 128"]:
-    """Select the normalized descriptors of the `FEW` largest features."""
+    """Select the normalized descriptors of the `NUM_LARGEST_FEATURES` largest features."""
     chosen = descriptors[np.argsort(-scales, kind="stable")[:FEW]]
     return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
 

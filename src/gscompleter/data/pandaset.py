@@ -68,14 +68,14 @@ def _frame(folder: Path, number: int, pose: Any, intrinsics: Intrinsics) -> Fram
 
 
 def _pose(pose: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    def numbers(part: str, keys: str) -> list[float]:
+    def read_numbers(part: str, keys: str) -> list[float]:
         entry = pose.get(part) if isinstance(pose, dict) else None
         entry = entry if isinstance(entry, dict) else {}
         return [number_of(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
 
     c2w = np.eye(4)
-    c2w[:3, :3] = rotation_of(numbers("heading", "wxyz"))
-    c2w[:3, 3] = numbers("position", "xyz")
+    c2w[:3, :3] = rotation_of(read_numbers("heading", "wxyz"))
+    c2w[:3, 3] = read_numbers("position", "xyz")
     return c2w
 
 

@@ -70,7 +70,8 @@ class PosedPhotographs(Protocol):
         """Load photographs with cameras, and depth if available.
 
         Undistorted images keep the size of the photograph and have no empty pixels (see
-        `lens.undistort_pinhole`). `ignored` marks the vehicle that carries the camera, if detected.
+        `lens.undistort_pinhole`). `ignore_mask` marks the vehicle that carries the camera, if it
+        is detected.
 
         Args:
             frames: Frame numbers.
@@ -281,7 +282,7 @@ def _oddity(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
 
 
 def _size_to_skip(frame: Frame, needed: tuple[int, int]) -> str | None:
-    """Explain why the stored photograph is not `needed` (height, width); None if it is."""
+    """Explain why the stored photograph is not of size `needed` (height, width); None if it is."""
     found = frame.stored_size()
     if found is None:
         return "its image is missing"

@@ -93,12 +93,12 @@ def _guarded(code: bytes, is_plain: Callable[[list[Any]], bool]) -> Callable[[An
     """Run an instruction only if the unpickler's stack is plain."""
     load: Callable[[Any], None] = pickle._Unpickler.dispatch[code[0]]
 
-    def guarded(unpickler: Any) -> None:
+    def load_guarded(unpickler: Any) -> None:
         if not is_plain(unpickler.stack):
             raise pickle.UnpicklingError("it holds a key or an object that is not plain")
         load(unpickler)
 
-    return guarded
+    return load_guarded
 
 
 def _are_keys(keys: Sequence[Any]) -> bool:

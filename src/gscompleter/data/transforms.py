@@ -161,18 +161,18 @@ def _matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:
 
 
 def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def pair(*keys: str, low: float = -MAX_IN_PIXELS, high: float = MAX_IN_PIXELS) -> Pair:
+    def read_pair(*keys: str, low: float = -MAX_IN_PIXELS, high: float = MAX_IN_PIXELS) -> Pair:
         x, y = (optional_number(entry, key, title, low, high) for key in keys)
         return x, y
 
-    focal = pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
-    angle = pair("camera_angle_x", "camera_angle_y", low=ANGLE_RANGE[0], high=ANGLE_RANGE[1])
+    focal = read_pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
+    angle = read_pair("camera_angle_x", "camera_angle_y", low=ANGLE_RANGE[0], high=ANGLE_RANGE[1])
     if focal == angle == (None, None):
         raise InputError(
             f"The focal length of {title} is missing; add `fl_x` and `fl_y`, or `camera_angle_x`."
         )
-    size = _size(pair("w", "h", low=1.0, high=float(MAX_SIDE)), title)
-    return Intrinsics(size, focal, pair("cx", "cy"), angle, _distortion(entry, title))
+    size = _size(read_pair("w", "h", low=1.0, high=float(MAX_SIDE)), title)
+    return Intrinsics(size, focal, read_pair("cx", "cy"), angle, _distortion(entry, title))
 
 
 def _size(size: Pair, title: str) -> tuple[int, int] | None:

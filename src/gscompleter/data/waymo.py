@@ -271,11 +271,11 @@ def _boxes(segment: Segment, time: int) -> tuple[Box, ...]:
 
 
 def _box(row: dict[str, Any], vehicle: Float[np.ndarray, "4 4"]) -> Box:
-    def vector(of: str) -> Float[np.ndarray, "3"]:
-        return np.array([row[f"{of}_{axis}"] for axis in "xyz"], dtype=np.float64)
+    def read(key: str) -> Float[np.ndarray, "3"]:
+        return np.array([row[f"{key}_{axis}"] for axis in "xyz"], dtype=np.float64)
 
-    speed, (length, width, height) = float(np.linalg.norm(vector("speed"))), vector("size").tolist()
-    pose = vehicle @ upright(vector("center"), np.float64(row["heading"]))
+    speed, (length, width, height) = float(np.linalg.norm(read("speed"))), read("size").tolist()
+    pose = vehicle @ upright(read("center"), np.float64(row["heading"]))
     return Box(pose, (length, width, height), speed if np.isfinite(speed) else None)
 
 

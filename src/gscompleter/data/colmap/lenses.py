@@ -84,14 +84,14 @@ def intrinsics_of(
 
 
 def _distortion(model: Model, values: dict[str, float]) -> Distortion:
-    def numbers(*names: str) -> tuple[float, ...]:
+    def select(*names: str) -> tuple[float, ...]:
         return tuple(values[name] for name in names if name in values)
 
     return Distortion(
         model.projection,
-        shape=numbers(*_SHAPES),
-        radial=numbers("k1", "k2", "k3", "k4"),
+        shape=select(*_SHAPES),
+        radial=select("k1", "k2", "k3", "k4"),
         tangential=(values.get("p1", 0.0), values.get("p2", 0.0)),
-        denominator=numbers("d1", "d2", "d3"),
+        denominator=select("d1", "d2", "d3"),
         prism=(values.get("s1", 0.0), values.get("s3", 0.0)),
     )
