@@ -10,13 +10,11 @@ from torch import Tensor
 def flip_map(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "h w"] | None:
-    """How much each pixel of two images differs to who flips between them; 0 is best, 1 worst.
+    """Compute the FLIP error map of two sRGB images in [0, 1]: 0 is best, 1 is worst.
 
-    Images are sRGB in [0, 1]; 67 pixels fill a degree of sight, as the package takes it by itself.
-    None where the package is missing.
+    None if the package is missing. The viewing distance is the default, 67 pixels per degree.
     """
     try:
-        # Here and not above: it is optional.
         import flip_evaluator
     except ImportError:
         return None

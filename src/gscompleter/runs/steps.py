@@ -204,7 +204,7 @@ def depth_scale(
 ) -> float | None:
     """Compute the median of D_added / D_expected over the holes: 1 means metric scale.
 
-    D_added is the z-depth of `added` rendered alone. Only holes count, so that methods that cover the
+    D_added is the z-depth of `added` rendered alone. Only holes count, so that methods covering the
     whole image are comparable. None for fewer than `MIN_PIXELS` pixels.
     """
     alone = renderer.render(added, target).depth_map()
