@@ -1,7 +1,6 @@
 """Coverage: share of pixels with alpha of at least 0.5, over held-out cameras.
 
-The cameras are random points between a context camera and its nearest neighbour, with an offset of
-about the spacing of the cameras and a rotation of some degrees.
+The cameras are random, close to the path of the context cameras and rotated by some degrees.
 """
 
 from __future__ import annotations

@@ -19,9 +19,8 @@ def fid(
     """Compute |μ - μ'|² + tr(Σ + Σ' - 2 (Σ Σ')^½) of Inception features; 0 is best.
 
     This is `FrechetInceptionDistance` of torchmetrics with 2,048 features, its own weights and its
-    own resizing to 299 x 299. Images are in [0, 1] and may differ in size. The estimate is biased:
-    compare sets of equal size only, with thousands of images if possible. Tested with a stand-in
-    for torchmetrics only.
+    own resizing. The estimate is biased: compare sets of equal size only, with thousands of images
+    if possible. Tested with a stand-in for torchmetrics only.
 
     Raises:
         InputError: torchmetrics or its weights are missing, or a side has fewer than two images.

@@ -10,10 +10,7 @@ from torch import Tensor
 def flip_map(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "h w"] | None:
-    """Compute the FLIP error map of two sRGB images in [0, 1]: 0 is best, 1 is worst.
-
-    None if the package is missing. The viewing distance is the default, 67 pixels per degree.
-    """
+    """Compute the FLIP error per pixel of two sRGB images; None if the package is missing."""
     try:
         import flip_evaluator
     except ImportError:

@@ -25,10 +25,7 @@ MIN_OPACITY = 1 / 255
 """Opacity below which renderers drop a Gaussian."""
 
 MATCHED = 0.05
-"""Largest distance of a match, as a share of the median context depth at the target.
-
-It is relative, so that scenes of any unit can be averaged.
-"""
+"""Largest distance of a match, as a share of the median context depth at the target."""
 
 
 def abs_rel(
@@ -58,10 +55,7 @@ class CloudDistances:
 
     @property
     def chamfer(self) -> float:
-        """Chamfer distance (mean_a min_b |a - b| + mean_b min_a |a - b|) / 2, in scene units.
-
-        Distances are not squared, so that a few floaters do not dominate.
-        """
+        """Mean distance in scene units, not squared, so that floaters do not dominate."""
         return float(self.a_to_b.mean() + self.b_to_a.mean()) / 2
 
     def f_score(self, threshold: float) -> float:
@@ -128,12 +122,11 @@ def alignment(
 ) -> Alignment:
     """Measure AbsRel, Chamfer distance and F-score of the added Gaussians against `context`.
 
-    Added Gaussians fill the dilated hole and meet the context at its rim. The overlap is the set of
-    target pixels that both cover when rendered alone. AbsRel compares the two z-depths there. Cloud
-    A has the means of added Gaussians in the overlap, matched with the whole context; cloud B has
-    the means of visible context Gaussians in the overlap, matched with everything added. A perfect
-    completion does not reach 0, because Gaussians are spaced and depths mix at edges: compare
-    methods on the same cases.
+    The overlap is the set of target pixels that both cover when rendered alone, the rim of the
+    hole. AbsRel compares the two z-depths there. Cloud A has the means of added Gaussians in the
+    overlap, matched with the whole context; cloud B has the means of visible context Gaussians in
+    the overlap, matched with everything added. A perfect completion does not reach 0, because
+    Gaussians are spaced and depths mix at edges: compare methods on the same cases.
     """
     added, context = drawable(added), drawable(context)
     generated = renderer.render(added, target).depth_map()
@@ -173,10 +166,7 @@ def compare_clouds(
     overlap: Bool[Tensor, "h w"],
     error: float | None,
 ) -> Alignment:
-    """Add Chamfer distance and F-score over `overlap` to the AbsRel `error`.
-
-    `reference` is the depth of the context at `target`, rendered alone.
-    """
+    """Add Chamfer distance and F-score over `overlap` to the AbsRel `error`."""
     share, count = overlap.double().mean().item(), int(overlap.sum())
     if count == 0:
         return Alignment(share, count, None, None, None, None)

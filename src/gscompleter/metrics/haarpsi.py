@@ -1,7 +1,6 @@
 """HaarPSI (Reisenhofer et al., A Haar Wavelet-Based Perceptual Similarity Index, 2018).
 
-Haar wavelets differ where only one image has an edge, so blur is penalized. The index is a weighted
-mean over pixels and can therefore be restricted to a part of the image.
+Haar wavelets differ where only one image has an edge, so blur is penalized.
 """
 
 from __future__ import annotations
@@ -51,10 +50,7 @@ def planes(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 half_h half_w"]:
 def similarities(
     a: Float[Tensor, "3 h w"], b: Float[Tensor, "3 h w"]
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 h w"]]:
-    """Compute local similarities and weights by rows, columns and chrominance.
-
-    The two finer scales of the luminance are compared; the coarsest gives the weight.
-    """
+    """Compare two finer scales of luminance, and chrominance; the coarsest scale gives weights."""
     of_a, of_b = ([wavelets(p[0], scale) for scale in (1, 2, 3)] for p in (a, b))
     luminance = torch.stack([alike(x, y) for x, y in zip(of_a[:2], of_b[:2], strict=True)]).mean(0)
     chrominance = alike(neighbour_means(a[1:]), neighbour_means(b[1:])).mean(0, keepdim=True)

@@ -34,10 +34,7 @@ def masked_psnr(
 
 
 def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
-    """Compute structural similarity as scikit-image, MVSplat and DepthSplat do.
-
-    Gaussian window of 11 pixels, sample covariances, range 1, mean over colour channels.
-    """
+    """Compute SSIM as scikit-image does: 11-pixel Gaussian window, sample covariances, range 1."""
     a, b = image.clamp(0, 1).cpu().numpy(), truth.cpu().numpy()
     inner = similarities(a, b)[RADIUS:-RADIUS, RADIUS:-RADIUS]
     if inner.size == 0:

@@ -140,13 +140,7 @@ def score(
 ) -> tuple[Scores, Drawings]:
     """Score a completion, and return the renders at the target.
 
-    Args:
-        before: The scene before completion.
-        after: The scene after completion.
-        added: Added Gaussians, or None if existing ones were changed.
-        truth: The photographs.
-        renderer: The renderer.
-        registered: All lifted Gaussians after registration, or None.
+    `added` is None if existing Gaussians were changed; `registered` has all lifted Gaussians.
     """
     target = truth.target
     was = renderer.render(before, target.camera)
@@ -234,10 +228,7 @@ def looks(
 def rim_error(
     added: Gaussians, context: Render, target: Camera, renderer: Renderer
 ) -> float | None:
-    """Compute the median of |D_added - D_context| / D_context where both cover the target.
-
-    None for fewer than `MIN_PIXELS` pixels.
-    """
+    """Compute the median of |D_added - D_context| / D_context; None for too few pixels."""
     alone = renderer.render(added, target).depth_map()
     both = alone.valid & context.depth_map().valid
     if both.sum() < MIN_PIXELS:
