@@ -252,7 +252,7 @@ class StorePlace:
 
     @contextlib.contextmanager
     def claimed(self, path: str) -> Iterator[int | None]:
-        """Create an object exclusively. Two processes that take over an expired one both run."""
+        """Create an object exclusively; two processes may both take over an expired one."""
         holder = secrets.token_hex(8)
         lost = self._taken(path, holder)
         if lost is None:
