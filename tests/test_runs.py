@@ -421,7 +421,7 @@ def test_wrong_runs_are_refused(finished, tasks, tmp_path):
     with pytest.raises(InputError, match="no generator"):
         evaluate(tasks, ["context"], tmp_path / "out", RunConfig(generator="dall-e"))
     assert not (tmp_path / "out").exists()
-    with pytest.raises(InputError, match="seed 0, and 1"):
+    with pytest.raises(InputError, match="seed 0, and this run has 1"):
         evaluate(tasks, ["context"], finished, RunConfig(seed=1, baseline_iterations=6))
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(InputError, match="something other than a run"):
