@@ -164,9 +164,9 @@ def growth_table(series: Growth) -> str:
         for size, point in zip(series.sizes, series.points, strict=True)
     ]
     powers = [*(series.slopes.get(column) for column in columns), series.memory_slope]
-    last_row = ["exponent", *("–" if power is None else f"{power:.2f}" for power in powers)]
+    cells = ["–" if power is None else f"{power:.2f}" for power in powers]
     head = [series.axis, *columns, "peak (GB)"]
-    return markdown(head, [*rows, last_row])
+    return markdown(head, [*rows, ["exponent", *cells]])
 
 
 def present(found: Sequence[Measured], columns: Sequence[str]) -> list[str]:
