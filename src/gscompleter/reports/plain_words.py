@@ -1,4 +1,4 @@
-"""What was done otherwise than usual, in plain words."""
+"""Notes on what differs from a usual completion, as sentences."""
 
 from __future__ import annotations
 
@@ -14,13 +14,11 @@ PLACED = {
     "normalised": "The splat lies in a frame that its trainer normalised.",
     "similarity": "The splat lay in a frame of its own; it was found by matching features.",
 }
-"""By how the frame of a splat was found, what is said of it."""
 NO_TARGET = "No camera was found that has much to gain; nothing was completed."
-"""What is said of a completion without any target."""
 
 
 def moved(shares: Mapping[int | None, float]) -> str | None:
-    """What is said where photographs, by their frames, are contradicted in a share of them."""
+    """Describe the dynamic fractions of photographs by frame, or return None if all are 0."""
     told = [f"{percent(share)} of frame {frame}" for frame, share in shares.items() if share > 0]
     if not told:
         return None
@@ -31,7 +29,7 @@ def moved(shares: Mapping[int | None, float]) -> str | None:
 
 
 def left_out(shares: Iterable[float]) -> str | None:
-    """Describe the shares of photographs that are ignored; None where all of them is 0."""
+    """Describe the ignored fractions of photographs, or return None if all are 0."""
     most = max(shares, default=0.0)
     if most == 0:
         return None
@@ -42,7 +40,7 @@ def left_out(shares: Iterable[float]) -> str | None:
 
 
 def exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
-    """What is said where Ψ evened out the exposures of photographs by these gains."""
+    """Describe the exposure gains of photographs, or return None without any."""
     factors = [factor for gain in gains for factor in gain or ()]
     if not factors or min(factors) <= 0:
         return None
@@ -54,7 +52,7 @@ def exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
 
 
 def about_target(row: TargetRow) -> list[str]:
-    """Fallbacks at a target: the notes of the completion, and what no note says."""
+    """List the notes of a target, with fallbacks that no note mentions."""
     said = " ".join(row.notes)
     found = list(row.notes)
     if row.anchor_fallback and "least-turned" not in said:
@@ -67,12 +65,12 @@ def about_target(row: TargetRow) -> list[str]:
 
 
 def about_scene(summary: Summary) -> list[str]:
-    """What concerns the whole completion."""
+    """List the notes on the whole completion."""
     return [*opened(summary), *compared(summary), *came_of_it(summary)]
 
 
 def opened(summary: Summary) -> Iterator[str]:
-    """Of the photographs and the frame that they share with the result."""
+    """Describe the photographs and the frame of the result."""
     placed = PLACED.get(summary.frame.method, "The splat lies in a frame of its own.")
     if placed is not None:
         yield f"{placed} summary.json has the transform from the photographs to the result."
@@ -95,7 +93,7 @@ def opened(summary: Summary) -> Iterator[str]:
 
 
 def compared(summary: Summary) -> Iterator[str]:
-    """Of what the scores mean."""
+    """Describe how the images are scored."""
     evened = exposures([row.gain for row in summary.context])
     if evened is not None:
         yield evened
@@ -109,7 +107,7 @@ def compared(summary: Summary) -> Iterator[str]:
 
 
 def came_of_it(summary: Summary) -> Iterator[str]:
-    """Of the scene that came of it."""
+    """Describe the completed scene."""
     removed = summary.gaussians.get("removed")
     if removed is not None:
         yield (
@@ -121,17 +119,17 @@ def came_of_it(summary: Summary) -> Iterator[str]:
 
 
 def shown(value: float | None, digits: int = 2) -> str:
-    """A number; a dash where there is none, or none that can be written."""
+    """Format a number, with a dash for None or an infinite one."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def percent(share: float | None, digits: int = 1) -> str:
-    """A share of one, as a percentage."""
+    """Format a fraction as a percentage."""
     return "–" if share is None or not math.isfinite(share) else f"{100 * share:.{digits}f} %"
 
 
 def gain(before: float | None, after: float | None, digits: int = 2) -> str:
-    """By how much a score rose, with its sign."""
+    """Format the change of a score with its sign."""
     if before is None or after is None or not math.isfinite(after - before):
         return "–"
     rise = round(after - before, digits)
