@@ -129,7 +129,7 @@ def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch,
             assert row[score] == pytest.approx(target[score], abs=1e-4)
     assert "not used (8 scored) the mean PSNR was" in capsys.readouterr().out
     page = (out / "report.html").read_text()
-    assert "At photographs that were not used" in page
+    assert "At held-out photographs" in page
     assert ">mean<" in page
 
     splat = ("--scene", out / "context.ply", *SMALL)

@@ -113,7 +113,7 @@ def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
     assert full["hole_flip"]["value"] < 0.8 * before["hole_flip"]["value"]
     assert full["hole_haarpsi"]["value"] > before["hole_haarpsi"]["value"]
     assert 0 < full["hole_gradients"]["value"] < 10
-    assert "### Looks" in (finished / "tables.md").read_text()
+    assert "### Perceptual quality" in (finished / "tables.md").read_text()
     assert "seconds" not in json.dumps(content)
     assert set(read_json(finished / "timings.json")) == set(METHOD_NAMES)
 
@@ -320,7 +320,7 @@ def test_fid_is_a_number_or_a_reason(finished, monkeypatch):
     assert calls == [[(SIZE, SIZE, 3)] * 2] * len(METHOD_NAMES)
     assert "| full | 2.00 |" in (finished / "tables.md").read_text()
     tables(finished)
-    assert "FID: not asked for" in (finished / "tables.md").read_text()
+    assert "FID: not requested" in (finished / "tables.md").read_text()
 
 
 def test_groups_of_methods():

@@ -34,12 +34,12 @@ CLEARANCE = 6.0
 GREY, GREEN = (150, 150, 150), (80, 220, 120)
 NOTICE = 4.0
 
-WELCOME = "Fly to where something is missing, and complete it."
-BUSY = "Something is being done already; press again when it is."
-NO_HOLE = "No camera was found that has much to gain."
+WELCOME = "Fly to a hole in the scene, then press “Complete what I see”."
+BUSY = "The last request is still running; press the button again when it is done."
+NO_HOLE = "No large hole is left around the photographs."
 FLYING = (
-    "Drag to turn, drag with the right button to shift, scroll to come closer, W A S D Q E to fly. "
-    "A click on a photograph goes to where it was taken."
+    "Drag to rotate, drag with the right button to move, scroll to zoom, fly with W A S D Q E. "
+    "Click a photograph to go to its camera."
 )
 
 Job = Callable[[viser.ClientHandle, Pose], str]
@@ -104,12 +104,12 @@ class Page:
 
     def find(self, client: viser.ClientHandle, seen: Pose) -> str:
         """Move a browser to the camera with the most to gain."""
-        self.say("Looking for a hole …")
+        self.say("Searching for a hole …")
         camera = self.subject.find(self.session.now)
         if camera is None:
             return NO_HOLE
         self._jump(client, pose_of(camera, self._unit))
-        return "Here something is missing."
+        return "The scene has a hole here; press “Complete what I see”."
 
     def undo(self, client: viser.ClientHandle, seen: Pose) -> str:
         """Undo the last step."""
@@ -117,7 +117,7 @@ class Page:
         self.session = undone(before)
         self._draw(before)
         left = len(self.session.steps)
-        return f"Undone. {left} of what was completed {'is' if left == 1 else 'are'} left."
+        return f"Undone: {left} {'completion is' if left == 1 else 'completions are'} left."
 
     def save(self, client: viser.ClientHandle, seen: Pose) -> str:
         """Write the completed scene."""
@@ -162,13 +162,13 @@ class Page:
     def _ask(self, job: Job, event: viser.GuiEvent[Any]) -> None:
         """Queue a request, or refuse it while another runs."""
         client = event.client
-        if client is None:  # it has closed its page meanwhile
+        if client is None:  # The browser has closed the page.
             return
         seen = Pose(client.camera.wxyz, client.camera.position, client.camera.fov)
         if self._busy.acquire(blocking=False):
             self._requests.put(partial(job, client, seen))
         else:
-            client.add_notification("One thing at a time", BUSY, auto_close_seconds=NOTICE)
+            client.add_notification("Still busy", BUSY, auto_close_seconds=NOTICE)
 
     def _stand_at(self, pose: Pose) -> None:
         rotation = viser.transforms.SO3(pose.wxyz).as_matrix()
@@ -267,10 +267,10 @@ def answer(request: Callable[[], str]) -> str:
         return request()
     except InputError as error:
         return str(error)
-    # The page stays, and the scene as it was.
+    # The page stays open and the scene unchanged.
     except Exception as error:
         traceback.print_exc()
-        return f"That went wrong ({type(error).__name__}: {error}); the scene is as it was."
+        return f"That failed ({type(error).__name__}: {error}); the scene is unchanged."
 
 
 def stages_at(stage: str) -> str:
@@ -282,8 +282,8 @@ def outcome(result: TargetCompletion, seconds: float) -> str:
     """Describe a completion: one sentence, then one line per note."""
     if not len(result.added):
         return "\n".join(result.notes or (NOTHING_ADDED,))
-    said = (
-        f"Completed in {seconds:.1f} s: {100 * result.hole_fraction:.1f} % of the image was a "
-        f"hole, and {len(result.added):,} Gaussians were added."
+    text = (
+        f"Completed in {seconds:.1f} s: {len(result.added):,} Gaussians are added in a hole of "
+        f"{100 * result.hole_fraction:.1f} % of the image."
     )
-    return "\n".join((said, *result.notes))
+    return "\n".join((text, *result.notes))

@@ -24,10 +24,10 @@ def serving(host: str, port: int) -> viser.ViserServer:
         socket.create_server((host, port)).close()
     except OSError as error:
         raise InputError(
-            f"Nothing can be served at {host}, port {port}: {error.strerror}; choose another port.",
+            f"{host} cannot use port {port} ({error.strerror}); choose another port.",
             "port",
         ) from error
-    with redirect_stdout(StringIO()), only_own_pages(host):  # viser prints a box of its own
+    with redirect_stdout(StringIO()), only_own_pages(host):  # viser prints a box
         return viser.ViserServer(host, port, verbose=False)
 
 
@@ -35,7 +35,7 @@ def serving(host: str, port: int) -> viser.ViserServer:
 def only_own_pages(host: str) -> Iterator[None]:
     """Make servers started inside refuse pages of other origins if `host` is this machine.
 
-    Any page in a browser may connect to this machine; only its `Origin` shows where it is from.
+    Any page in a browser may connect to this machine; only its `Origin` shows its source.
     websockets can check it, but viser has no option for that. Programs send no origin and may
     connect.
     """

@@ -138,9 +138,9 @@ def facts_of(good: Sequence[Mapping[str, Any]], failed: int) -> list[tuple[str, 
     return [
         ("done", str(len(good))),
         ("failed", str(failed)),
-        ("median gain", f"{shown(median(gains))} dB" if gains else "–"),
+        ("median ΔPSNR", f"{shown(median(gains))} dB" if gains else "–"),
         ("median time", f"{shown(median(seconds))} s" if seconds else "–"),
-        ("time of all", f"{shown(sum(seconds) / 3600)} h" if seconds else "–"),
+        ("total time", f"{shown(sum(seconds) / 3600)} h" if seconds else "–"),
     ]
 
 

@@ -65,8 +65,8 @@ def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
     means = np.array([mean for mean, _ in places]).reshape(-1, 3)
     frame = frame_of(np.stack(poses), means)
     targets = sum(camera.kind == "target" for camera in cameras)
-    told = f"{len(cameras)} cameras, {targets} of them targets, among {len(places)} points."
-    svg = figure("Cameras in space", told, SIZE, SIZE, "space")
+    text = f"{len(cameras)} cameras, {targets} of them targets, and {len(places)} scene points."
+    svg = figure("Cameras in space", text, SIZE, SIZE, "space")
     draw_points(svg, frame(means), [added for _, added in places])
     for camera, pose in zip(cameras, poses, strict=True):
         draw_camera(svg, camera, frame(frustum(pose, camera.pose.opening, DEPTH * frame.radius)))
@@ -83,18 +83,18 @@ def draw_points(svg: Element, points: Float[np.ndarray, "n 3"], added: Sequence[
     within = np.abs(points).max(axis=1, initial=0) <= EDGE
     centers, kinds = projected(points).tolist(), ["added" if new else "seen" for new in added]
     for row in np.flatnonzero(within):
-        (x, y), told = centers[row], text_of(points[row])
-        put(svg, "circle", class_=kinds[row], r=1.6, cx=x, cy=y, data_points=told)
+        (x, y), position = centers[row], text_of(points[row])
+        put(svg, "circle", class_=kinds[row], r=1.6, cx=x, cy=y, data_points=position)
 
 
 def draw_camera(svg: Element, camera: Placed, corners: Float[np.ndarray, "11 3"]) -> None:
     """Draw a camera as one line along `corners`."""
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in projected(corners))
-    drawn = put(svg, "polyline", class_=camera.kind, points=line, data_points=text_of(corners))
-    put(drawn, "title", camera.name)
+    shape = put(svg, "polyline", class_=camera.kind, points=line, data_points=text_of(corners))
+    put(shape, "title", camera.name)
     if camera.label:
-        (x, y), told = projected(corners[:1])[0], text_of(corners[:1])
-        beside = {"dx": 6, "dy": -6, "data_points": told}
+        (x, y), position = projected(corners[:1])[0], text_of(corners[:1])
+        beside = {"dx": 6, "dy": -6, "data_points": position}
         put(svg, "text", camera.label, class_=camera.kind, x=x, y=y, **beside)
 
 

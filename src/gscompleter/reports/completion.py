@@ -115,7 +115,7 @@ def compare(
         frozen = renderer.freeze(completion.context, camera)
         if completion.set_aside is None:
             after = frozen.composite(completion.added)
-        else:  # some of the context was set aside
+        else:  # some of the context was pruned
             after = renderer.render(completion.scene, camera)
     return Images(frozen.context, after, truth)
 
@@ -178,7 +178,7 @@ def summarize(
                     for key in ("scale", "shift", "inliers", "method", "agreement")
                 },
                 **scored,
-                # the property of completed.ply that marks what this target added
+                # the property of completed.ply that marks the Gaussians of this target
                 "generated": int(result.added.generated[0]) if len(result.added) else None,
                 "added": len(result.added),
                 "notes": list(result.notes),

@@ -24,21 +24,21 @@ from gscompleter.reports.record import TargetRecord
 
 VIEWER = "view.html"
 PICTURES = {
-    "reference": "The image that was synthesized",
-    "hole_mask": "Where the scene had a hole (white)",
-    "support": "How far photographs support what the target saw (white: fully)",
-    "truth": "The photograph, used for scores only",
+    "reference": "Reference: the synthesized image",
+    "hole_mask": "Hole mask (white: hole)",
+    "support": "Trust: agreement of the scene with the photographs (white: full)",
+    "truth": "Photograph, used for scores only",
 }
 CURVES = {
     "register": "Loss of the registration along the rays",
     "refine": "Loss of the refinement",
 }
 METHODS = {
-    "ransac": "RANSAC fitted scene depth = {scale} × lifted depth {shift}; {inliers} of the pixels "
+    "ransac": "RANSAC fits scene depth = {scale} × lifted depth {shift}; {inliers} of the pixels "
     "agree",
-    "median": "The median ratio of depths was taken, scene depth = {scale} × lifted depth; "
+    "median": "The median depth ratio is used: scene depth = {scale} × lifted depth; "
     "{inliers} of the pixels agree",
-    "identity": "Depths were left as they were lifted",
+    "identity": "The lifted depths are used unchanged",
 }
 SCORES = ("camera", "PSNR before", "PSNR after", "change", "SSIM before", "SSIM after", "change")
 
@@ -89,7 +89,7 @@ def completion_page(folder: Path) -> str:
             "pitch": PITCH,
             "scores": score_tables(summary),
             "bars": time_bars("Seconds by stage", stages_of(summary)),
-            "total": f"{shown(summary.seconds.get('total'), 1)} s in all, on {summary.device}.",
+            "total": f"{shown(summary.seconds.get('total'), 1)} s in total on {summary.device}.",
             "settings": settings_table(summary),
             "viewer": viewer,
         },
@@ -124,7 +124,7 @@ def facts_of(summary: Summary) -> list[tuple[str, str]]:
         ("time", f"{shown(summary.seconds.get('total'), 1)} s"),
     ]
     removed = summary.gaussians.get("removed")
-    return facts if not removed else [*facts, ("Gaussians set aside", f"{removed:,}")]
+    return facts if not removed else [*facts, ("Gaussians pruned", f"{removed:,}")]
 
 
 def section(
@@ -179,15 +179,13 @@ def fit_sentence(affine: Affine, unit: str) -> str:
     """Describe the depth alignment of a target."""
     sign = "−" if affine.shift < 0 else "+"
     shift = f"{sign} {shown(abs(affine.shift), 3)} {unit}"
-    words = METHODS.get(affine.method, "Depths were fitted by an unknown method")
-    said = words.format(
+    words = METHODS.get(affine.method, "The depths are aligned by an unknown method")
+    text = words.format(
         scale=shown(affine.scale, 3), shift=shift, inliers=percent(affine.inliers, 0)
     )
     if affine.agreement is None:
-        return f"{said}."
-    return (
-        f"{said}. At the target {percent(affine.agreement, 0)} of what is seen of the scene agree."
-    )
+        return f"{text}."
+    return f"{text}. At the target, {percent(affine.agreement, 0)} of the visible scene agree."
 
 
 def scatter_of(affine: Affine, kept: TargetRecord, unit: str) -> Markup | None:
@@ -210,9 +208,9 @@ def coverage_sentence(summary: Summary) -> str:
     """Describe the coverage around the photographs."""
     covered = summary.coverage
     return (
-        f"{covered.cameras} cameras around the photographs, which nothing was completed for, see "
-        f"{percent(covered.before)} of their images covered before and "
-        f"{percent(covered.after)} after."
+        f"{covered.cameras} cameras around the photographs, none of them a target, test the "
+        f"result: the scene covers {percent(covered.before)} of their images before and "
+        f"{percent(covered.after)} after the completion."
     )
 
 
@@ -227,7 +225,9 @@ def ignored_pictures(summary: Summary, gallery: Gallery) -> Iterator[tuple[Pictu
     """Embed the photographs that have ignored pixels."""
     for number, row in enumerate(summary.context, start=1):
         if row.ignored > 0:
-            caption = f"Photograph {row.frame}, {percent(row.ignored)} of it ignored (magenta)"
+            caption = (
+                f"Photograph {row.frame}: {percent(row.ignored)} of the image is ignored (magenta)"
+            )
             yield gallery.photo(f"context{number}_ignored.png", caption), caption
 
 
@@ -247,9 +247,9 @@ def cameras_of(found: Finished) -> Markup | None:
 def cameras_caption(found: Finished) -> str:
     """Describe how many cameras the drawing shows."""
     record = found.record
-    drawn, count = len(record.photographs), record.num_photographs
-    of = f"{count} photographs" if drawn == count else f"{drawn} of {count} photographs"
-    return f"{of}, {len(record.context)} of the context. Drag the drawing to turn it."
+    kept, count = len(record.photographs), record.num_photographs
+    text = f"{count} photographs" if kept == count else f"{kept} of {count} photographs"
+    return f"{text}, {len(record.context)} in the context. Drag the drawing to rotate it."
 
 
 def score_tables(summary: Summary) -> list[Table]:
@@ -261,8 +261,8 @@ def score_tables(summary: Summary) -> list[Table]:
         unused.append(score_row("mean", mean_of(summary.held_out)))
     tables = [
         Table("At the targets", SCORES, targets),
-        Table("At photographs that were not used", SCORES, unused),
-        Table("At the photographs of the context", SCORES, context),
+        Table("At held-out photographs", SCORES, unused),
+        Table("At the context photographs", SCORES, context),
     ]
     return [table for table in tables if table.rows]
 
@@ -293,7 +293,7 @@ def stages_of(summary: Summary) -> dict[str, float]:
 
 def settings_table(summary: Summary) -> Table:
     """Make the table of all settings."""
-    told = {
+    facts = {
         "version": summary.version,
         "format": summary.scene.format,
         "near": summary.depth_range.near,
@@ -301,8 +301,8 @@ def settings_table(summary: Summary) -> Table:
         "seed": summary.seed,
         "device": summary.device,
     }
-    rows = [*flat({"settings": summary.settings}), *flat({"found": told})]
-    return Table("Everything that decided the result", ("setting", "value"), rows)
+    rows = [*flat({"settings": summary.settings}), *flat({"found": facts})]
+    return Table("All settings", ("setting", "value"), rows)
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:

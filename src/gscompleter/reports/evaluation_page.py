@@ -17,11 +17,11 @@ from gscompleter.reports.summary import GROUPS, Column, stage_place
 
 TABLES = "tables.json"
 TIMINGS = "timings.json"
-ADVICE = "let `tables` write it again"
+ADVICE = "run `gscompleter tables` again"
 PLOTS = {
-    "gain_by_hole": "Gain at the target against the size of the hole",
-    "gain_by_distance": "Gain at the target against the distance from what was given",
-    "seconds": "Median seconds of a step, by stage",
+    "gain_by_hole": "ΔPSNR at the target by hole size",
+    "gain_by_distance": "ΔPSNR at the target by distance from the context",
+    "seconds": "Median seconds of a step by stage",
 }
 
 
@@ -84,7 +84,7 @@ def evaluation_page(folder: Path) -> str:
         "evaluation.html",
         {
             "facts": [
-                ("cases that all finished", f"{len(tables.common)} of {tables.cases}"),
+                ("cases finished by all methods", f"{len(tables.common)} of {tables.cases}"),
                 ("methods", str(len(tables.methods))),
                 ("failed", str(len(tables.failures))),
             ],
@@ -104,7 +104,7 @@ def read_timings(path: Path) -> dict[str, Timing]:
     """Read the timings by method."""
     content = read_json(path, ADVICE)
     if not isinstance(content, Mapping):
-        raise InputError(f"{quoted(path)} is not what an evaluation writes; {ADVICE}.")
+        raise InputError(f"{quoted(path)} is not a file of timings; {ADVICE}.")
     methods = {name: value for name, value in content.items() if name != "steps"}
     return {name: as_written(Timing, value, path, ADVICE) for name, value in methods.items()}
 
@@ -147,7 +147,7 @@ def distance_table(tables: Tables) -> Table | None:
     if len(gains) < 2:
         return None
     rows = [[m, *(shown(gains[gap].get(m)) for gap in gains)] for m in tables.methods]
-    caption = "Mean gain in dB, by frames from the target to the nearest context frame"
+    caption = "Mean ΔPSNR in dB by frames from the target to the nearest context frame"
     return Table(caption, ["method", *gains], rows)
 
 
@@ -182,7 +182,7 @@ def timing_table(timings: Mapping[str, Timing]) -> Table:
         seconds = (shown(timing.seconds.get(stage)) for stage in stages)
         rows.append([method, *seconds, shown(memory)])
     return Table(
-        "Median seconds of a step, and the most memory (GiB)", ["method", *stages, "memory"], rows
+        "Median seconds of a step and peak memory (GiB)", ["method", *stages, "memory"], rows
     )
 
 

@@ -77,8 +77,8 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
 def span(values: Sequence[float]) -> tuple[float, float]:
     """Compute an axis range around `values`, never empty."""
     low, high = min(values), max(values)
-    room = 0.05 * ((high - low) or abs(high) or 1.0)
-    return low - room, high + room
+    padding = 0.05 * ((high - low) or abs(high) or 1.0)
+    return low - padding, high + padding
 
 
 def plot(
@@ -112,8 +112,8 @@ def loss_curve(title: str, losses: Sequence[float]) -> Markup | None:
     if len(known) < 2:
         return None
     first, last = known[0][1], known[-1][1]
-    told = f"A curve over {len(losses)} iterations, from {first:.3g} to {last:.3g}."
-    svg = figure(title, told, WIDTH, HEIGHT, "plot")
+    text = f"A curve over {len(losses)} iterations, from {first:.3g} to {last:.3g}."
+    svg = figure(title, text, WIDTH, HEIGHT, "plot")
     x, y = plot(
         svg, (0.0, float(len(losses))), span([loss for _, loss in known]), ("iteration", "loss")
     )
@@ -138,8 +138,8 @@ def affine_scatter(
         return None
     share = sum(agrees for *_, agrees in known) / len(known)
     line = f"{scale:.3f} times depth plus {shift:.3g}"
-    told = f"{len(known)} pixels; {share:.0%} lie on the line {line}."
-    svg = figure("Depths before and after the affine", told, WIDTH, HEIGHT, "plot")
+    text = f"{len(known)} pixels; {share:.0%} lie on the line {line}."
+    svg = figure("Lifted depth against scene depth", text, WIDTH, HEIGHT, "plot")
     ranges = span([p for p, _, _ in known]), span([c for _, c, _ in known])
     x, y = plot(svg, *ranges, (f"lifted depth ({unit})", f"scene depth ({unit})"))
     for agrees, kind in ((False, "outlier"), (True, "inlier")):
@@ -168,9 +168,9 @@ def time_bars(title: str, seconds: Mapping[str, float]) -> Markup | None:
     longest = max(known.values(), default=0.0)
     if longest <= 0:
         return None
-    told = ", ".join(f"{name} {s:.2f} s" for name, s in known.items())
+    text = ", ".join(f"{name} {s:.2f} s" for name, s in known.items())
     height = len(known) * (BAR + GAP)
-    svg = figure(title, f"{told}.", NAMES + LONGEST + 60, height, "bars")
+    svg = figure(title, f"{text}.", NAMES + LONGEST + 60, height, "bars")
     for row, (name, s) in enumerate(known.items()):
         top, width = row * (BAR + GAP), s / longest * LONGEST
         label(svg, name, "name", NAMES - 8, top + 13, "end")
@@ -184,15 +184,15 @@ def colour_scale(limits: tuple[float, float], unit: str) -> Markup | None:
     near, far = limits
     if not 0 < near < far < math.inf:
         return None
-    told = f"From {near:.3g} to {far:.3g} {unit}, by the logarithm; grey where there is no depth."
-    svg = figure("Colours of depth", told, WIDTH, 44.0, "scale")
+    text = f"From {near:.3g} to {far:.3g} {unit} on a logarithmic scale; grey means no depth."
+    svg = figure("Depth colours", text, WIDTH, 44.0, "scale")
     wide = WIDTH - 88
     for k, colour in enumerate(colours()[np.linspace(1, 255, COLOURS).astype(int)].tolist()):
         patch(svg, k * wide / COLOURS, wide / COLOURS + 0.5, colour)
     for share, anchor in ((0.0, "start"), (0.5, "middle"), (1.0, "end")):
         depth = near * (far / near) ** share
-        text = f"{depth:.3g} {unit}" if share == 1 else f"{depth:.3g}"
-        label(svg, text, "tick", share * wide, 30.0, anchor)
+        tick = f"{depth:.3g} {unit}" if share == 1 else f"{depth:.3g}"
+        label(svg, tick, "tick", share * wide, 30.0, anchor)
     patch(svg, wide + 16, 14.0, NONE)
     label(svg, "no depth", "tick", wide + 34, 12.0)
     return markup(svg)

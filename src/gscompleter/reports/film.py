@@ -83,11 +83,11 @@ def frames(
     completion: Completion, cameras: Sequence[Camera], renderer: Renderer
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Render the frames, there and back."""
-    drawn = []
+    images = []
     for camera in track(cameras, "film"):
-        drawn.append(frame(completion, camera, renderer))
-        yield drawn[-1]
-    yield from drawn[-2:0:-1]
+        images.append(frame(completion, camera, renderer))
+        yield images[-1]
+    yield from images[-2:0:-1]
 
 
 def frame(completion: Completion, camera: Camera, renderer: Renderer) -> UInt8[np.ndarray, "h w 3"]:

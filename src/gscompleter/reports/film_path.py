@@ -1,6 +1,6 @@
 """The camera path of a video: smooth, near the photographs, with a level horizon.
 
-A straight line between distant targets may pass through surfaces. Where photographs were taken
+A straight line between distant targets may pass through surfaces. Around the photographs
 there is free space, and the scene is sharpest.
 """
 
@@ -67,7 +67,7 @@ def vertical(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
     about = upward(cameras).double()
     axes = torch.stack([camera.c2w[:3, :2].T for camera in cameras]).double()
     rows = axes[-axes[:, 1] @ about > ROUGHLY, 0]
-    # Where all look the same way, several directions are square to the rows.
+    # If all cameras have the same direction, several axes are orthogonal to the rows.
     slant = rows.T @ rows / len(rows) - ABOUT_UP * torch.outer(about, about)
     axis = torch.linalg.eigh(slant).eigenvectors[:, 0]
     return (axis if axis @ about > 0 else -axis).to(cameras[0].c2w)
@@ -78,7 +78,7 @@ def waypoints(first: Camera, second: Camera, photographs: Sequence[Camera]) -> l
 
     It prefers many short steps. All cameras get the intrinsics of `first`.
     """
-    # Here, so that what shows no film does not wait for it.
+    # Imported here, since SciPy is slow to import and only videos need it.
     from scipy.sparse.csgraph import shortest_path
 
     cameras = [first, *photographs, second]

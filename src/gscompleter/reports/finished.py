@@ -155,22 +155,24 @@ def read_finished(folder: Path) -> Finished:
     check_version(folder, content)
     summary = as_written(Summary, content, folder / SUMMARY)
     if not os.path.isfile(folder / NAME):
-        raise InputError(f"{quoted(folder)} has no {NAME}, of which a report is made; {ADVICE}.")
+        raise InputError(f"{quoted(folder)} has no {NAME}, which the report needs; {ADVICE}.")
     record = as_written(Record, read_json(folder / NAME, ADVICE), folder / NAME)
     sizes = (len(summary.targets), len(summary.context))
     if sizes != (len(record.targets), len(record.context)):
-        raise InputError(f"{SUMMARY} and {NAME} in {quoted(folder)} differ in cameras; {ADVICE}.")
+        raise InputError(
+            f"{SUMMARY} and {NAME} in {quoted(folder)} list different numbers of cameras; {ADVICE}."
+        )
     return Finished(folder, summary, record)
 
 
 def check_results(folder: Path, name: str) -> None:
     """Raise an InputError unless `folder` holds the file `name`."""
     if not os.path.isdir(folder):
-        raise InputError(f"There is no folder {quoted(folder)}; name one that has results.")
+        raise InputError(f"There is no folder {quoted(folder)}; name one with results.")
     if not os.path.isfile(folder / name):
         raise InputError(
-            f"{quoted(folder)} has no {name}; name the folder that a completion or an evaluation "
-            "wrote."
+            f"{quoted(folder)} has no {name}; name the output folder of a completion or an "
+            "evaluation."
         )
 
 
@@ -194,6 +196,5 @@ def as_written(kind: type[T], content: Any, path: Path, advice: str = ADVICE) ->
         wrong = error.errors(include_url=False)[0]
         place = ".".join(map(str, wrong["loc"])) or "its content"
         raise InputError(
-            f"{quoted(path)} does not hold what a report needs ({quoted(place)}: "
-            f"{quoted(wrong['msg'])}); {advice}."
+            f"{quoted(path)} is damaged ({quoted(place)}: {quoted(wrong['msg'])}); {advice}."
         ) from None

@@ -29,17 +29,17 @@ def plots(summary: Summary, out: Path) -> list[Path]:
     Writes `gain_by_hole.png`, `gain_by_distance.png`, `seconds.png`, and `sequence_TASK.png` for
     each sequence. The first two omit ablations if other methods are compared.
     """
-    drawn = [
+    paths = [
         save_curves(out / f"sequence_{slug(name)}.png", steps)
         for name, steps in summary.sequences.items()
     ]
     if not summary.common:
-        return drawn
-    drawn.append(save_plot(out / "gain_by_hole.png", draw_gain_by_hole, summary))
+        return paths
+    paths.append(save_plot(out / "gain_by_hole.png", draw_gain_by_hole, summary))
     if len(summary.gains) > 1:
-        drawn.append(save_plot(out / "gain_by_distance.png", draw_gain_by_distance, summary))
+        paths.append(save_plot(out / "gain_by_distance.png", draw_gain_by_distance, summary))
     height = 1.5 + 0.28 * len(summary.methods)
-    return [*drawn, save_plot(out / "seconds.png", draw_seconds, summary, height)]
+    return [*paths, save_plot(out / "seconds.png", draw_seconds, summary, height)]
 
 
 CURVES: tuple[tuple[str, Callable[[Step], float | None]], ...] = (
@@ -155,5 +155,5 @@ def style_of(number: int) -> dict[str, Any]:
 def _finish_gain(axes: Axes, label: str) -> None:
     axes.axhline(0, color="black", linewidth=0.8)
     axes.set_xlabel(label)
-    axes.set_ylabel("gain at the target (dB PSNR)")
+    axes.set_ylabel("ΔPSNR at the target (dB)")
     axes.grid(alpha=0.3)

@@ -184,28 +184,28 @@ SEQUENCE = (
 
 GROUPS = {
     "Images": IMAGES,
-    "Looks": LOOKS,
+    "Perceptual quality": LOOKS,
     "Geometry": GEOMETRY,
-    "Geometry of what was added": ADDED,
-    "Geometry of all that was lifted": LIFTED,
+    "Geometry of added Gaussians": ADDED,
+    "Geometry of all lifted Gaussians": LIFTED,
     "Sequences": SEQUENCE,
 }
 
 NOTES = {
     "reggs": (
-        "reggs starts from our metric lift and from the true poses. RegGS as the paper has it gets "
-        "neither, so the row of reggs is not the paper's."
+        "reggs gets our metric lift and the true poses. RegGS in its paper gets neither, so this "
+        "row is not comparable with that paper."
     ),
 }
 
 FEW_PIXELS = (
-    f"A number of geometry counts where it was measured over at least {MIN_PIXELS} pixels; the "
-    "columns of pixels are medians over all cases."
+    f"A geometry score counts if it is measured over at least {MIN_PIXELS} pixels; the columns of "
+    "pixels are medians over all cases."
 )
 
 NO_PIXELS = (
-    "Some rows are of an earlier version, which counted no pixels, so their geometry is left out; "
-    "scoring again adds it."
+    "Some rows are from an earlier version, which counted no pixels, so their geometry is left "
+    "out; score the run again to add it."
 )
 
 
@@ -298,7 +298,9 @@ def read_rows(out: Path) -> list[Row]:
     check_run(out)
     rows = [read_row(path) for path in row_paths(out)]
     if not rows:
-        raise InputError(f"The run in {out} has no rows yet; let `evaluate` finish a case first.")
+        raise InputError(
+            f"The run in {out} has no finished case; run `gscompleter evaluate` first."
+        )
     return sorted(rows, key=lambda row: (row["task"]["name"], *place_of(row["method"])))
 
 

@@ -31,12 +31,12 @@ from gscompleter.reports.summary import (
 from gscompleter.runs.store import step_path, task_folder, truth_path
 
 LPIPS_MISSING = (
-    "LPIPS: weights not available. `gscompleter.metrics.lpips.load_lpips()` fetches them; then "
-    "scoring again adds the column.\n"
+    "LPIPS: weights not available. `gscompleter.metrics.lpips.load_lpips()` downloads them; then "
+    "score the run again to add the column.\n"
 )
 FLIP_MISSING = (
-    "FLIP: not at hand. `pip install 'gscompleter[evaluation]'` brings it; then scoring again adds "
-    "the columns.\n"
+    "FLIP: not installed. Run `pip install 'gscompleter[evaluation]'`; then score the run again to "
+    "add the columns.\n"
 )
 
 
@@ -59,7 +59,7 @@ def tables(out: Path, with_fid: bool = False) -> Summary:
         InputError: if `out` has no run, no rows, or a damaged one.
     """
     summary = summarize(read_rows(out))
-    fids = fid_of(out, summary) if with_fid else Fid({}, "not asked for")
+    fids = fid_of(out, summary) if with_fid else Fid({}, "not requested")
     texts = {
         "tables.md": score_markdown(summary, fids),
         "tables.tex": score_latex(summary),
@@ -84,8 +84,8 @@ def fid_of(out: Path, summary: Summary) -> Fid:
         truths = [read_image(truth_path(folder, number)) for folder, number in steps]
         values = {}
         for method in summary.methods:
-            drawn = [step_path(folder, method, n).with_suffix(".png") for folder, n in steps]
-            values[method] = fid([read_image(path) for path in drawn], truths)
+            paths = [step_path(folder, method, n).with_suffix(".png") for folder, n in steps]
+            values[method] = fid([read_image(path) for path in paths], truths)
     except InputError as error:
         return Fid({}, f"not available ({error})")
     return Fid(values)
@@ -143,14 +143,16 @@ def score_markdown(summary: Summary, fids: Fid) -> str:
 def scope(summary: Summary) -> str:
     """Describe which cases the numbers cover."""
     text = (
-        f"Over the {len(summary.common)} of {len(summary.tasks)} cases that all methods finished. "
-        "A number in brackets is how many of them have the score, where not all have it.\n"
+        f"Means over the {len(summary.common)} of {len(summary.tasks)} cases that all methods "
+        "finished. A number in brackets is the number of cases with the score, if some have "
+        "none.\n"
     )
     if not summary.sequences:
         return text
     return text + (
-        f"They have {summary.num_steps} steps in all: means over the steps of each, then over the "
-        "cases. A depth scale of 1 is metric; its drift over a sequence is max(ln s) - min(ln s).\n"
+        f"They have {summary.num_steps} steps in total: means are over the steps of each case, "
+        "then over the cases. A depth scale of 1 is metric; its drift over a sequence is "
+        "max(ln s) - min(ln s).\n"
     )
 
 
@@ -160,8 +162,8 @@ def fid_markdown(summary: Summary, fids: Fid) -> str:
         return f"FID: {fids.reason}.\n"
     rows = [[method, f"{value:.2f}"] for method, value in fids.values.items()]
     return (
-        f"### FID\n\nOf {summary.num_steps} pictures against as many photographs; biased for "
-        "few pictures.\n\n" + markdown(["method", "FID"], rows)
+        f"### FID\n\n{summary.num_steps} images against as many photographs; FID is biased for "
+        "few images.\n\n" + markdown(["method", "FID"], rows)
     )
 
 
@@ -175,8 +177,8 @@ def gain_markdown(summary: Summary) -> str:
         for method in summary.methods
     ]
     return (
-        "### Gain by distance\n\nMean gain in dB by the frames between the target and the nearest "
-        "context frame (k of n-k), and how many cases that is.\n\n" + markdown(head, rows)
+        "### ΔPSNR by distance\n\nMean ΔPSNR in dB by the frames between the target and the "
+        "nearest context frame (k of n-k), with the number of cases.\n\n" + markdown(head, rows)
     )
 
 
@@ -201,7 +203,9 @@ def step_cells(step: Step) -> list[str]:
 
 def score_latex(summary: Summary) -> str:
     """Format the tables of scores for LaTeX with booktabs."""
-    blocks = [f"% Over the {len(summary.common)} of {len(summary.tasks)} cases that all finished."]
+    blocks = [
+        f"% Over the {len(summary.common)} of {len(summary.tasks)} cases that all methods finished."
+    ]
     blocks += [f"% {note}" for note in summary.notes]
     for group in summary.groups.values():
         columns = summary.present(group)
@@ -276,8 +280,8 @@ def timing_markdown(summary: Summary) -> str:
         rows.append([method, *(shown(seconds.get(stage), 2) for stage in stages), shown(memory, 2)])
     return (
         f"Median seconds of a step over the {len(summary.common)} cases that all methods finished, "
-        "and the most memory (GiB) of any. The total is without the reconstruction of the context, "
-        "which is done once for all methods.\n\n" + markdown(["method", *stages, "memory"], rows)
+        "and peak memory (GiB). The total excludes the reconstruction of the context, which all "
+        "methods share.\n\n" + markdown(["method", *stages, "memory"], rows)
     )
 
 
