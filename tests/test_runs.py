@@ -178,7 +178,7 @@ def test_rows_of_a_version_that_had_fewer_scores_still_make_tables(finished, tmp
     assert now["hole_haarpsi"] == {"value": None, "cases": 0}
     text = (out / "tables.md").read_text()
     assert "HaarPSI" not in text
-    assert "scoring again adds the columns" in text
+    assert "score the run again to add the columns" in text
     assert "AbsRel" not in text
     assert "which counted no pixels, so their geometry is left out" in text
 
