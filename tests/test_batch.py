@@ -309,7 +309,7 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     capsys.readouterr()
     assert run(monkeypatch, *words[:-1]) == 0
     told = capsys.readouterr().err
-    assert "Done 0, failed 0, there before 4, 2 of them failed (--rerun failures does" in told
+    assert "Done 0, failed 0, done earlier 4, 2 of them failed (--rerun failures repeats" in told
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")} == before
 
 

@@ -130,7 +130,7 @@ def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch,
         assert not row["is_check"]
         for score in ("psnr_before", "psnr_after", "ssim_before", "ssim_after"):
             assert row[score] == pytest.approx(target[score], abs=1e-4)
-    assert "not used (8 scored) the mean PSNR was" in capsys.readouterr().out
+    assert "Mean PSNR of 8 photographs that were not used: " in capsys.readouterr().out
     page = (out / "report.html").read_text()
     assert "At photographs that were not used" in page
     assert ">mean<" in page
@@ -245,8 +245,8 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
     ("more", "sentence"),
     [
         (("--near", 5, "--far", 1), "near"),
-        (("--auto", 2), "Targets are named, and others are to be found besides; "),
-        (("--auto",), "complete the result for the others (--auto)."),
+        (("--auto", 2), "--target and --auto are both given; use one of them"),
+        (("--auto",), "again with the other (--auto)."),
         (("--near", 0), "near"),
         (("--generator", "oracle", "--generator=oracle"), "--generator is given twice"),
         (("--near", -1), "near"),
@@ -451,7 +451,7 @@ def test_help_all_knows_every_setting(monkeypatch, capsys):
     for kind in GENERATORS.values():
         assert all(f"--generator-{f.name.replace('_', '-')}" in said for f in fields(kind))
     assert "--config.alignment.min-agreement" in said
-    assert "How many further seeds are tried" in said
+    assert "Further seeds to try if" in said
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

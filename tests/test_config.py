@@ -88,9 +88,9 @@ def refused(path: Path, text: str, sentence: str) -> None:
         ("holes: {dilation: 2.5}", "holes.dilation must be a valid integer, got 2.5"),
         ("holes: {dilation: -1}", "holes.dilation must be greater than or equal to 0, got -1"),
         ("holes: {dilation: [1, 2]}", r"holes.dilation must be a valid integer, got \[1, 2\]"),
-        ("holes: 3", "holes holds settings of its own, got 3"),
-        ("holes: [1]", r"holes holds settings of its own, got \[1\]"),
-        ("holes:", "holes holds settings of its own, got None"),
+        ("holes: 3", "holes is a group of settings, got 3"),
+        ("holes: [1]", r"holes is a group of settings, got \[1\]"),
+        ("holes:", "holes is a group of settings, got None"),
         (
             "registration: {lr_unit: tiny}",
             "registration.lr_unit must be 'distance' or 'scene', got",

@@ -44,7 +44,7 @@ def test_a_setting_that_a_generator_does_not_know_is_refused(name, setting, way_
     ((key, value),) = setting.items()
     with pytest.raises(InputError) as told:
         GeneratorOptions(name, setting).settings()
-    assert f"{name!r} knows no {key} ({value})" in str(told.value)
+    assert f"{name!r} has no setting {key} ({value})" in str(told.value)
     assert way_out in str(told.value)
     assert told.value.argument == f"generator_{key}"
 
@@ -78,7 +78,7 @@ def test_the_command_refuses_them_too_and_writes_nothing(tmp_path, capsys, monke
     words = ["complete", tmp_path, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]
     assert run(monkeypatch, *words, "--generator-batch-size", 8) == 2
     said = capsys.readouterr().err
-    assert "'warp-inpaint' knows no batch_size (8); leave that out, or choose pe-field" in said
+    assert "'warp-inpaint' has no setting batch_size (8); leave it out, or choose pe-field" in said
     assert "(--generator-batch-size)." in said
     assert not (tmp_path / "out").exists()
 

@@ -179,11 +179,11 @@ def test_too_few_photographs_beside_the_targets_are_refused(scene, tmp_path, mon
     words = ["complete", scene, "--out", tmp_path / "out", "--target", 0, 1, 2, 3]
     assert run(monkeypatch, *words) == 2
     assert (
-        "Besides the targets there is 1 photograph that can be used, and at least 2 are needed;"
+        "1 usable photograph is left without the targets, and the context needs at least 2;"
     ) in capsys.readouterr().err
     assert run(monkeypatch, *words, 4) == 2
     assert (
-        "Besides the targets there are 0 photographs that can be used, and at least 2 are needed;"
+        "0 usable photographs are left without the targets, and the context needs at least 2;"
     ) in capsys.readouterr().err
 
 

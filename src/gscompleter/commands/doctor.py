@@ -88,7 +88,7 @@ def examined() -> Iterator[Found]:
 
 def machine_facts() -> Iterator[Found]:
     """Inspect versions, processor, memory and device."""
-    # Here and below, so that `--help` does not wait for torch.
+    # Imported here so that `--help` does not wait for torch.
     from gscompleter.benchmark.machine import machine
     from gscompleter.render import choose_device
 
@@ -103,7 +103,7 @@ def packages() -> Iterator[Found]:
     """Inspect the packages that everything needs."""
     for requirement in required():
         there = installed(requirement)
-        told = there or f"{requirement}, without which nothing runs; pip install '{requirement}'"
+        told = there or f"{requirement}, which every command needs; pip install '{requirement}'"
         yield Found("packages", requirement.name, there is not None, told)
 
 
@@ -111,7 +111,7 @@ def extras() -> Iterator[Found]:
     """Inspect the extras."""
     for extra, purpose in PURPOSES.items():
         if not required(extra):
-            why = f"what is installed is older than this extra, or this Python is; for {purpose}"
+            why = f"the installed version or this Python is older than this extra; for {purpose}"
             yield Found("extras", extra, False, why)
             continue
         versions = {requirement.name: installed(requirement) for requirement in required(extra)}
@@ -131,8 +131,8 @@ def required(extra: str = "") -> list[Requirement]:
         all_of_them = [Requirement(line) for line in requires(DISTRIBUTION) or []]
     except PackageNotFoundError:
         raise InputError(
-            f"What {DISTRIBUTION} needs is told by its installation, and there is none; run "
-            "`pip install .` in the folder of its sources."
+            f"{DISTRIBUTION} is not installed, so its requirements are unknown; run "
+            "`pip install .` in its source folder."
         ) from None
     return [r for r in all_of_them if is_for(extra, r)]
 

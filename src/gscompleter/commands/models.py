@@ -47,7 +47,7 @@ def tell(found: dict[str, Path | None]) -> None:
     table.add_column("source", overflow="fold")
     for name, path in found.items():
         table.add_row(*cells(PUBLISHED[name], path))
-    # Into a file or a pipe, every row is one line.
+    # Rows are not wrapped in a file or a pipe.
     console = Console(width=None if sys.stdout.isatty() else WIDEST, markup=False, highlight=False)
     console.print(table)
     doubts: dict[str, list[str]] = {}
@@ -58,7 +58,7 @@ def tell(found: dict[str, Path | None]) -> None:
     for caution, names in doubts.items():
         print(f"    {', '.join(names)}: {caution}.")
     if not hub_is_installed():
-        print(f"\nThe hub's cache was not looked at, for huggingface_hub is missing: {INSTALL}")
+        print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")
 
 
 def cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:

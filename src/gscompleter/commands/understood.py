@@ -66,7 +66,7 @@ def cameras_line(frames: Sequence[Frame]) -> str:
     """Describe the cameras and lenses."""
     cameras = dict.fromkeys(frame.intrinsics for frame in frames)
     lenses = dict.fromkeys(c.distortion.projection for c in cameras if c.distortion)
-    lens = f"{' and '.join(lenses)} lens taken out" if lenses else "no lens distortion"
+    lens = f"{' and '.join(lenses)} lens distortion removed" if lenses else "no lens distortion"
     return f"{len(cameras)} {'camera' if len(cameras) == 1 else 'cameras'} with {lens}"
 
 
@@ -130,7 +130,7 @@ def count_line(task: Task) -> str:
         return f"{named} {'photograph' if named == 1 else 'photographs'} for the context, as named"
     limit = ""
     if budget.allowed < budget.wanted:
-        limit = f", for there is no memory for {budget.wanted}"
+        limit = f" (memory is too small for {budget.wanted})"
     return (
         f"at most {budget.allowed} of {budget.usable:,} photographs for the context{limit} "
         "(--context names others)"
