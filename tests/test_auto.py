@@ -1,4 +1,4 @@
-"""Targets that nobody names, on the command line."""
+"""Target cameras that the command finds."""
 
 import json
 import re
@@ -37,7 +37,7 @@ def scene(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def completed(scene, tmp_path_factory) -> Path:
-    """The output where no target was named, and two were found at most."""
+    """Return the output without named targets, of which it finds two at most."""
     out = tmp_path_factory.mktemp("runs") / "out"
     with pytest.MonkeyPatch.context() as monkeypatch:
         assert run(monkeypatch, "complete", scene, "--out", out, "--auto", 2, *QUICK) == 0
@@ -112,7 +112,7 @@ def test_a_plan_begins_as_the_completion_and_can_be_given_back(
 def test_a_scene_that_was_brought_is_explored_with_its_doubts(
     scene, completed, tmp_path, monkeypatch, capsys
 ):
-    """What the photographs support of it is told for the small images, too."""
+    """Trust is computed for the small images as well."""
     out = tmp_path / "out"
     given = ("--scene", completed / "context.ply", "--context", 0, 2, 4)
     said = [word for word in QUICK if word != "--quiet"]

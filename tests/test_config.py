@@ -68,7 +68,7 @@ def test_a_whole_number_is_a_float_and_an_empty_file_changes_nothing(tmp_path):
 
 
 def refused(path: Path, text: str, sentence: str) -> None:
-    """The file is refused at once, in a sentence of a readable length."""
+    """Check that the file is refused with one short sentence."""
     path.write_text(text)
     with pytest.raises(InputError, match=sentence) as told:
         load_config(str(path))
