@@ -244,7 +244,7 @@ def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
     [
         ({"targt": 2}, "no option --targt; the nearest is --target"),
         ({"resolution": "wide"}, "resolution"),
-        ({"out": "elsewhere"}, "no say in 'out'"),
+        ({"out": "elsewhere"}, "cannot set 'out'"),
         ({"video": "perhaps"}, "must be true or false"),
         ({"format": "--overwrite"}, "begins with a dash"),
         ({"seed": -1}, "seed must be greater than or equal to 0"),

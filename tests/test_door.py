@@ -126,7 +126,7 @@ def test_fewer_photographs_are_chosen_where_there_is_no_memory_for_more(scene, m
         assert len(task.views) == chosen
         said = budget_line(options, task, "cpu")
         assert said.startswith(f"at most {chosen} of 4 photographs for the context")
-        assert (", for there is no memory for 3 (" in said) == (chosen < 3)
+        assert (" (memory is too small for 3) (" in said) == (chosen < 3)
     for memory in (needed_bytes(pixels, 3), needed_bytes(pixels, 3) - 1):
         monkeypatch.setattr("gscompleter.memory.memory_bytes", lambda memory=memory: memory)
         assert images_that_fit(pixels) == (3 if memory == needed_bytes(pixels, 3) else 2)

@@ -181,7 +181,7 @@ def test_a_remote_scene_is_completed_around_a_local_origin(room, tmp_path, monke
     cameras["frames"] = cameras["frames"][2:]
     target.write_text(json.dumps(cameras))
     assert run(monkeypatch, "complete", far, *where, "--target", 2, target) == 0
-    assert "the result is relative to" in capsys.readouterr().out
+    assert "the result has its origin at" in capsys.readouterr().out
     summary = json.loads((out / "summary.json").read_text())
     assert summary["frame"]["method"] == "given"
     assert np.allclose(np.array(summary["frame"]["transform"])[:3, 3], -origin)

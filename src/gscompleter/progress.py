@@ -153,12 +153,12 @@ class Work:
     def sentence(self) -> str:
         """Format everything as one line."""
         left, share, spent = self.left(), self.share(), self.spent()
-        told = [
+        parts = [
             *([] if share is None else [f"{share:.0%}"]),
             *([f"{in_words(spent)} so far"] if spent >= 1 else []),
             *([] if left is None else [f"about {in_words(left)} left"]),
         ]
-        return ": ".join([self.description(), *([", ".join(told)] if told else [])])
+        return ": ".join([self.description(), *([", ".join(parts)] if parts else [])])
 
 
 def outermost_counted(activities: Sequence[Activity]) -> Activity | None:

@@ -73,12 +73,12 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
         say(console, *found_out(options, opened, task), f"To do: {plan}.")
         with output_folder(options.out, replaceable(options)) as folder:
             with clock("clean"):
-                taken = superfluous(splat_of(task), task.views, renderer, options.config)
+                removed = superfluous(splat_of(task), task.views, renderer, options.config)
             settings = settings_of(options, options.config, targets={}, models={})
-            said = {"settings": settings, "device": device, **opened_as(options, opened, task)}
-            summary = said | scores(task, taken, renderer) | {"seconds": clock.seconds}
+            facts = {"settings": settings, "device": device, **opened_as(options, opened, task)}
+            summary = facts | scores(task, removed, renderer) | {"seconds": clock.seconds}
             with stage("writing"):
-                write(folder, task, taken, {"version": __version__, **summary})
+                write(folder, task, removed, {"version": __version__, **summary})
     return summary
 
 

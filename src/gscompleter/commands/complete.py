@@ -118,14 +118,14 @@ def write_done(
 ) -> dict[str, Any]:
     """Write all results but the targets and the video, and return the summary."""
     task, cameras = done.task, tuple(done.cameras.values())
-    said = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
+    facts = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
     with meanwhile(looks_around, options, done.completion, cameras, explorer) as looks:
         summary = write_report(
             folder,
             done.completion,
             task.targets,
             explorer.completer,
-            said,
+            facts,
             task.brought,
             lambda: Around(tuple(looks()), cameras),
             read_held_out(options, done.opened, task, done.cameras),

@@ -103,8 +103,8 @@ def packages() -> Iterator[Found]:
     """Inspect the packages that everything needs."""
     for requirement in required():
         there = installed(requirement)
-        told = there or f"{requirement}, which every command needs; pip install '{requirement}'"
-        yield Found("packages", requirement.name, there is not None, told)
+        details = there or f"{requirement}, which every command needs; pip install '{requirement}'"
+        yield Found("packages", requirement.name, there is not None, details)
 
 
 def extras() -> Iterator[Found]:
@@ -186,8 +186,10 @@ def weights() -> Iterator[Found]:
     for name, network in NETWORKS.items():
         places = [place_of_lpips(file, None) for file in (network.backbone, network.linear)]
         there = all(place.is_file() for place in places)
-        told = "for LPIPS in the tables of evaluate" + ("" if there else "; load_lpips fetches it")
-        yield Found("weights", f"lpips-{name}", there, told)
+        details = "for LPIPS in the tables of evaluate" + (
+            "" if there else "; load_lpips fetches it"
+        )
+        yield Found("weights", f"lpips-{name}", there, details)
 
 
 def viewer() -> Iterator[Found]:

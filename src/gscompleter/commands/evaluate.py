@@ -72,8 +72,8 @@ def run_evaluation(options: EvaluateOptions) -> None:
     with shown_on(shown):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
-        told = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
-        console.print(told)
+        line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
+        console.print(line)
         # A shard without cases has no tables.
         if counts.done + counts.failed + counts.skipped > 0:
             show(options.out, options.quiet, num_rows=len(tasks) * len(methods))

@@ -102,14 +102,14 @@ def sentence_of(plan: Plan, out: Path) -> str:
     number = len(plan.holes)
     if number == 0:
         return "No camera has much to gain; there is nothing to complete."
-    said = "in a time that is not known in advance"
+    duration = "in a time that is not known in advance"
     if plan.seconds is not None:
-        said = (
+        duration = (
             f"in about {plan.seconds * number:.0f} s after the context "
             f"({plan.context_seconds:.0f} s)"
         )
     counted = "1 camera" if number == 1 else f"{number} cameras"
-    return f"To complete: {counted}, {said}. Edit the cameras in {quoted(out / TARGETS)}."
+    return f"To complete: {counted}, {duration}. Edit the cameras in {quoted(out / TARGETS)}."
 
 
 def name_of(frame: int | None, near: int | None) -> str:

@@ -88,14 +88,23 @@ def check_viser() -> None:
 
 def prepare(options: LiveOptions, console: Console) -> Prepared:
     """Open the scene as `complete` does."""
-    asked = as_complete(options)
-    opened, task, explorer, seconds = prepared(asked, console)
-    say(console, *found_out(asked, opened, task))
+    as_complete_options = as_complete(options)
+    opened, task, explorer, seconds = prepared(as_complete_options, console)
+    say(console, *found_out(as_complete_options, opened, task))
     if task.scene is not None and task.scene.is_antialiased:
         say(console, CLASSIC)
     frames = frames_of(task)
-    asked = replace(asked, context=frames, target=(str(options.out / TARGETS),))
-    return Prepared(asked, opened, task, explorer, cameras_of(asked, opened, task), seconds)
+    as_complete_options = replace(
+        as_complete_options, context=frames, target=(str(options.out / TARGETS),)
+    )
+    return Prepared(
+        as_complete_options,
+        opened,
+        task,
+        explorer,
+        cameras_of(as_complete_options, opened, task),
+        seconds,
+    )
 
 
 def as_complete(options: LiveOptions) -> CompleteOptions:

@@ -50,12 +50,12 @@ def tell(found: dict[str, Path | None]) -> None:
     # Rows are not wrapped in a file or a pipe.
     console = Console(width=None if sys.stdout.isatty() else WIDEST, markup=False, highlight=False)
     console.print(table)
-    doubts: dict[str, list[str]] = {}
+    cautions: dict[str, list[str]] = {}
     for weights in PUBLISHED.values():
         if weights.caution:
-            doubts.setdefault(weights.caution, []).append(weights.name)
+            cautions.setdefault(weights.caution, []).append(weights.name)
     print("\n(!) Whether commercial use is allowed is unclear:")
-    for caution, names in doubts.items():
+    for caution, names in cautions.items():
         print(f"    {', '.join(names)}: {caution}.")
     if not hub_is_installed():
         print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")

@@ -224,8 +224,8 @@ def in_frame_of_splat(
 
 def with_witnesses(task: Task, given: Photographs) -> Task:
     """Add check views: unused photographs near the targets and all around."""
-    taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
-    others = [frame for frame in range(len(given)) if frame not in taken]
+    used = {view.frame for view in task.views} | {target.frame for target in task.targets}
+    others = [frame for frame in range(len(given)) if frame not in used]
     cameras = usable_cameras(given, others, WITNESS_SIDE)
     wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
     views = []
@@ -294,9 +294,11 @@ def chosen_context(
 
     Targets are never chosen, because their photographs score the result.
     """
-    asked = {target.frame for target in targets}
+    target_frames = {target.frame for target in targets}
     resolution = working_size(options.resolution)
-    cameras = usable_cameras(given, [f for f in range(len(given)) if f not in asked], resolution)
+    cameras = usable_cameras(
+        given, [f for f in range(len(given)) if f not in target_frames], resolution
+    )
     if len(cameras) < needed_views(options):
         left = "photograph is" if len(cameras) == 1 else "photographs are"
         raise InputError(

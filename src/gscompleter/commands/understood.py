@@ -57,9 +57,9 @@ def photographs_line(opened: Opened) -> str:
     if opened.number != len(given):
         count = f"{len(given)} of {count}"
     points = given.points()
-    told = "no points" if points is None else f"{len(points):,} points"
+    num_points = "no points" if points is None else f"{len(points):,} points"
     name = "photographs without cameras" if opened.format == "photographs" else opened.format
-    return f"{name}, {count}, {cameras_line(given.frames)}, {told}"
+    return f"{name}, {count}, {cameras_line(given.frames)}, {num_points}"
 
 
 def cameras_line(frames: Sequence[Frame]) -> str:
