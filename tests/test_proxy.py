@@ -9,7 +9,7 @@ import torch
 
 from gscompleter.benchmark.crowding import crowded
 from gscompleter.completer import GSCompleter
-from gscompleter.config import SupportConfig
+from gscompleter.config import TrustConfig
 from gscompleter.frames.thinning import thinned
 from gscompleter.memory import BYTES_PER_SPLAT
 from gscompleter.metrics.image import psnr
@@ -138,7 +138,7 @@ def test_the_same_runs_on_any_number_of_threads(monkeypatch):
 
 def evidence_of(drawn: Gaussians) -> Evidence:
     frozen = [RENDERER.freeze(drawn, camera) for camera in CAMERAS]
-    return gather_evidence(drawn, VIEWS, frozen, SupportConfig())
+    return gather_evidence(drawn, VIEWS, frozen, TrustConfig())
 
 
 def believed(drawn: Gaussians) -> torch.Tensor:

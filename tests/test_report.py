@@ -23,7 +23,7 @@ from gscompleter.reports.completion_page import completion_page
 from gscompleter.reports.depth_picture import NONE, colours, limits_of, write_depth
 from gscompleter.reports.evaluation_page import evaluation_page
 from gscompleter.reports.figures import affine_scatter, colour_scale, loss_curve, ticks, time_bars
-from gscompleter.reports.finished import Affine, TargetRow
+from gscompleter.reports.finished import Affine, TargetRow, read_finished
 from gscompleter.reports.page import data_uri, gallery_of
 from gscompleter.reports.plain_words import about_target, gain, moved, percent, shown
 from gscompleter.reports.record import MAX_LOOKS, most_changed
@@ -281,6 +281,27 @@ def row(**values) -> TargetRow:
     named = {"notes": (), "added": 5, "anchor_fallback": False} | values
     scores = dict.fromkeys(("psnr_before", "psnr_after", "ssim_before", "ssim_after"))
     return TargetRow(frame=None, anchor=0, hole_fraction=0.1, affine=affine, **scores, **named)
+
+
+def test_keys_of_the_last_release_are_read(completed_room, tmp_path):
+    names = {
+        "context": {"exposure_gain": "gain", "dynamic_fraction": "contradicted"},
+        "targets": {"derived_from": "near", "target_id": "generated"},
+    }
+    old, out = tmp_path / "old", completed_room
+    shutil.copytree(out, old)
+
+    def rename(summary: dict) -> None:
+        for group, keys in names.items():
+            summary[group] = [{keys.get(k, k): v for k, v in r.items()} for r in summary[group]]
+            summary[group][0].update({"gain": [2, 2, 2], "contradicted": 0.5, "near": 3})
+
+    changed(old / "summary.json", rename)
+    assert all(f'"{new}"' not in (old / "summary.json").read_text() for new in names["context"])
+    summary = read_finished(old).summary
+    row, target = summary.context[0], summary.targets[0]
+    assert (row.exposure_gain, row.dynamic_fraction) == ((2, 2, 2), 0.5)
+    assert target.derived_from == 3
 
 
 def test_every_fallback_is_said_once():

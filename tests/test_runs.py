@@ -461,7 +461,7 @@ def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
     arguments = ["evaluate", chunk.parent, "--protocol", "n-1", "n-2", "--out", out]
     assert run(monkeypatch, *arguments, "--methods", "context", "--device", "cpu") == 0
     told = " ".join(capsys.readouterr().err.split())
-    assert "Left out wide: frame 0: its opening angle" in told
+    assert "Skipped wide: frame 0: its opening angle" in told
     rows = [read_json(path) for path in (out / "tasks").glob("*/*.json")]
     reasons = {row["task"]["name"]: row["error"] for row in rows}
     assert len(reasons) == 8

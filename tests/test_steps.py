@@ -414,7 +414,7 @@ def test_the_command_runs_end_to_end(tmp_path, monkeypatch, capsys):
     arguments = ["evaluate", tmp_path, "--out", out, *by_steps, "--methods"]
     assert run(monkeypatch, *arguments, "context", "full") == 0
     said = capsys.readouterr()
-    assert "Left out short: it has 2 frames, and sequence-1 needs 3." in " ".join(said.err.split())
+    assert "Skipped short: it has 2 frames, and sequence-1 needs 3." in " ".join(said.err.split())
     assert len(list(out.glob("sequence_long*.png"))) == 1
     assert "Scored 2, failed 0" in said.err
     assert "1 of 1 cases" in said.out

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from gscompleter.config import CompleterConfig, RegistrationConfig
+from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.frames.thinning import thinned
@@ -242,7 +242,7 @@ class GSCompleter:
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
             completion = Completion(drawn, scene, views, (), (), {}, others, proxy=proxy)
-            if witnesses is not None and self.config.support.doubts:
+            if witnesses is not None and self.config.trust == "photometric":
                 completion = self.doubted(completion)
             completion = self.judged(completion)
         return replace(completion, seconds=clock.seconds)
@@ -312,14 +312,14 @@ class GSCompleter:
             if reference is None:
                 (reference,) = self.synthesize([sight], contexts_of(frozen_views))
         result = replace(result, reference=View(sight.window.crop(reference.image), target))
-        if reference.disagrees and self.config.harm.max_loss is not None:
+        if reference.disagrees and self.config.psnr_guard.max_opacity_loss is not None:
             return replace(result, notes=(*reference.notes, NOTHING_ADDED))
         with clock("lift"):
             lifted = self.lift(sight, reference)
         with clock("register"):
             registration = self.register(sight, lifted, reference, frozen_views)
         at_anchor = frozen_views[sight.anchor.index].context
-        fit, settings = registration.affine, self.config.registration.affine
+        fit, settings = registration.affine, self.config.alignment
         pairs = compared_depths(lifted, sight.frozen.context, at_anchor, fit, settings)
         everything = registration.gaussians if self.keep_registered else None
         result = replace(result, affine=fit, pairs=pairs, registered=everything)
@@ -412,7 +412,7 @@ class GSCompleter:
 
     def lift(self, sight: Sight, reference: Synthesized) -> Lift:
         """Stage 2: the image as Gaussians, those that lie near a hole, in the mode of the scene."""
-        radius = self.config.holes.neighbourhood
+        radius = self.config.holes.candidate_radius
         wanted = None if radius is None else dilate(self.holes(sight), radius)
         lifted = lift(self.reconstructor, reference, sight.anchor_view, wanted)
         scene, made = sight.completion.drawn, lifted.gaussians
@@ -434,17 +434,18 @@ class GSCompleter:
             sight.anchor_view.camera,
             self.renderer,
             torch.Generator().manual_seed(self.seed),
-            self.registration(sight),
+            self.config.registration,
             self.config.holes.max_alpha,
+            self.config.alignment,
+            self.reject_below(sight),
         )
 
-    def registration(self, sight: Sight) -> RegistrationConfig:
-        """How candidates are registered. A scene that is doubted refutes none: where it is wrong,
-        what is right differs from it, and its photographs judge what is added."""
-        config = self.config.registration
-        if sight.believed is None:
-            return config
-        return replace(config, affine=replace(config.affine, min_merged=None))
+    def reject_below(self, sight: Sight) -> float | None:
+        """Return the depth agreement that a target needs.
+
+        With photometric trust it needs none: where the scene is wrong, right depths differ from it.
+        """
+        return self.config.depth_agreement.reject_below if sight.believed is None else None
 
     def keep(
         self,
@@ -457,7 +458,7 @@ class GSCompleter:
         it."""
         mask = dilate(self.holes(sight), self.config.holes.dilation)
         wide, views = sight.window.wide, sight.completion.views
-        side, earlier = self.config.exploration.side, sight.completion.targets
+        side, earlier = self.config.next_best_view.image_size, sight.completion.targets
         completed = [result.target for result in earlier if len(result.added)]
         aside = [shrunk(camera, side) for camera in (*sight.completion.bystanders, *completed)]
         kept, placed = respect_free_space(
@@ -522,7 +523,7 @@ class GSCompleter:
                 kept, sight.frozen, reference, holes, plans, observed, settings
             )
             drawings = [in_colours(plan, refined.sh) for plan in plans]
-        return do_no_harm(refined, frozen, budgets, config.harm, drawings), losses
+        return do_no_harm(refined, frozen, budgets, config.psnr_guard, drawings), losses
 
     def sight(self, completion: Completion, target: Camera, wide: Camera | None = None) -> Sight:
         """The scene as it stands, frozen at the target's wider camera, and the target's anchor.
@@ -553,7 +554,7 @@ class GSCompleter:
         if config.min_overlap == 0:
             return select_anchor(target, views, config)
         cameras = [
-            shrunk(c, self.config.exploration.side)
+            shrunk(c, self.config.next_best_view.image_size)
             for c in (target, *(view.camera for view in views))
         ]
         seen, *at_views = self.small_renders(completion, cameras)
@@ -575,7 +576,7 @@ class GSCompleter:
             drawn,
             self.reconstructor,
             self.renderer,
-            self.config.support,
+            self.config.trust_settings,
         )
 
     def believed(
@@ -595,7 +596,7 @@ class GSCompleter:
         has what it does not see."""
         sums, kept = weight_sums(frozen), completion.num_kept
         seen = in_context(completion, sums[:kept])
-        found = support(evidence, seen, camera, self.config.support)
+        found = support(evidence, seen, camera, self.config.trust_settings)
         values = torch.ones_like(sums)
         values[:kept] = of_kept(completion, found)
         return values
@@ -605,7 +606,7 @@ class GSCompleter:
         show of it."""
         views, drawn = completion.photographs, completion.drawn
         frozen_views = self.at(completion, views)
-        evidence = gather_evidence(drawn, views, frozen_views, self.config.support)
+        evidence = gather_evidence(drawn, views, frozen_views, self.config.trust_settings)
         return replace(completion, evidence=evidence)
 
     def without_unsupported(self, sight: Sight) -> Sight:
@@ -614,8 +615,8 @@ class GSCompleter:
         What is set aside leaves the scene, and is none of what the target is completed with.
         Without witnesses nothing is: what the context does not show, others may have shown.
         """
-        completion, config = sight.completion, self.config.support
-        if completion.evidence is None or not completion.witnesses or config.keep_unsupported:
+        completion, config = sight.completion, self.config.trust_settings
+        if completion.evidence is None or not completion.witnesses or not config.prune:
             return sight
         doubtful = self.unseen_in_holes(sight, completion.evidence)
         if not doubtful.any():
@@ -662,7 +663,7 @@ class GSCompleter:
     def wary_of_what_moved(self, completion: Completion) -> Completion:
         """`completion`, whose photographs say where others contradict them."""
         views, drawn = completion.views, contexts_of(self.at(completion, completion.views))
-        masks = contradicted(views, drawn, self.config.contradiction)
+        masks = contradicted(views, drawn, self.config.dynamic_masks)
         return replace(
             completion,
             views=tuple(
@@ -673,8 +674,8 @@ class GSCompleter:
 
     def judged(self, completion: Completion) -> Completion:
         """`completion` before any target, with what its photographs ask of whatever is added."""
-        config = self.config.harm
-        tolerance = 0.0 if completion.evidence is not None else config.tolerance or 0.0
+        config = self.config.psnr_guard
+        tolerance = 0.0 if completion.evidence is not None else config.max_drop or 0.0
         drawn = contexts_of(self.at(completion, completion.photographs))
         budgets = tuple(
             error_budgets(
@@ -682,7 +683,7 @@ class GSCompleter:
                 render.image,
                 hole_mask(render.alpha, self.config.holes),
                 tolerance,
-                config.ssim_tolerance,
+                config.max_ssim_drop,
             )
             for view, render in zip(completion.photographs, drawn, strict=True)
         )

@@ -158,8 +158,8 @@ def summarize(
             {
                 "frame": view.frame,
                 **scored,
-                "gain": gain,
-                "contradicted": share_of(view.contradicted),
+                "exposure_gain": gain,
+                "dynamic_fraction": share_of(view.contradicted),
                 "ignored": share_of(view.ignored),
             }
             for view, scored, gain in zip(
@@ -169,7 +169,7 @@ def summarize(
         "targets": [
             {
                 "frame": target.frame,
-                "near": target.near,
+                "derived_from": target.near,
                 "anchor": completion.views[result.anchor].frame,
                 "anchor_fallback": result.anchor_fallback,
                 "hole_fraction": result.hole_fraction,
@@ -179,7 +179,7 @@ def summarize(
                 },
                 **scored,
                 # the property of completed.ply that marks the Gaussians of this target
-                "generated": int(result.added.generated[0]) if len(result.added) else None,
+                "target_id": int(result.added.generated[0]) if len(result.added) else None,
                 "added": len(result.added),
                 "notes": list(result.notes),
                 "refused": result.refused,

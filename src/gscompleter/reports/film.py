@@ -26,7 +26,7 @@ from gscompleter.reports.record import spread
 from gscompleter.stages.candidates import resized, shrunk
 from gscompleter.types import Camera, Completion
 
-NAME = "film.mp4"
+NAME = "video.mp4"
 RATE = 24
 SECONDS = 3.0
 """Duration of one direction."""
@@ -84,7 +84,7 @@ def frames(
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Render the frames, there and back."""
     images = []
-    for camera in track(cameras, "film"):
+    for camera in track(cameras, "video"):
         images.append(frame(completion, camera, renderer))
         yield images[-1]
     yield from images[-2:0:-1]

@@ -16,6 +16,12 @@ from gscompleter.reports.record import NAME, Record
 
 ADVICE = "complete the scene again"
 
+RENAMED = {
+    "context": {"gain": "exposure_gain", "contradicted": "dynamic_fraction"},
+    "targets": {"near": "derived_from", "generated": "target_id"},
+}
+"""Keys of the last release in lists of `summary.json`, with the new ones; read for one release."""
+
 T = TypeVar("T")
 
 
@@ -45,9 +51,9 @@ class Scores:
 class ContextRow(Scores):
     """A photograph of the context."""
 
-    gain: tuple[float, ...] | None = None
+    exposure_gain: tuple[float, ...] | None = None
     """Exposure gain per channel; None if exposures were not normalized."""
-    contradicted: float = 0.0
+    dynamic_fraction: float = 0.0
     """Fraction of the image in the dynamic mask."""
     ignored: float = 0.0
     """Fraction of ignored pixels, which stay the same while the camera moves."""
@@ -69,14 +75,14 @@ class TargetRow(Scores):
     hole_fraction: float
     affine: Affine
     added: int
-    near: int | None = None
+    derived_from: int | None = None
     notes: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
         """Name of the target beside its number."""
-        if self.near is not None:
-            return f"near photograph {self.near}"
+        if self.derived_from is not None:
+            return f"near photograph {self.derived_from}"
         return "a given camera" if self.frame is None else f"photograph {self.frame}"
 
 
@@ -153,7 +159,7 @@ def read_finished(folder: Path) -> Finished:
     check_results(folder, SUMMARY)
     content = read_json(folder / SUMMARY, ADVICE)
     check_version(folder, content)
-    summary = as_written(Summary, content, folder / SUMMARY)
+    summary = as_written(Summary, with_new_keys(content), folder / SUMMARY)
     if not os.path.isfile(folder / NAME):
         raise InputError(f"{quoted(folder)} has no {NAME}, which the report needs; {ADVICE}.")
     record = as_written(Record, read_json(folder / NAME, ADVICE), folder / NAME)
@@ -163,6 +169,20 @@ def read_finished(folder: Path) -> Finished:
             f"{SUMMARY} and {NAME} in {quoted(folder)} list different numbers of cameras; {ADVICE}."
         )
     return Finished(folder, summary, record)
+
+
+def with_new_keys(content: Any) -> Any:
+    """Return the content of a summary with today's keys for those of the last release."""
+    if not isinstance(content, Mapping):
+        return content
+    changed = dict(content)
+    for group, names in RENAMED.items():
+        if isinstance(rows := content.get(group), list):
+            changed[group] = [
+                {names.get(k, k): v for k, v in row.items()} if isinstance(row, Mapping) else row
+                for row in rows
+            ]
+    return changed
 
 
 def check_results(folder: Path, name: str) -> None:

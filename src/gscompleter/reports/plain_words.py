@@ -80,7 +80,7 @@ def opened(summary: Summary) -> Iterator[str]:
             "The coordinates are much larger than the distances between the cameras, so the result "
             "is relative to a local origin, which summary.json lists."
         )
-    motion = moved({row.frame: row.contradicted for row in summary.context})
+    motion = moved({row.frame: row.dynamic_fraction for row in summary.context})
     if motion is not None:
         yield motion
     static = left_out(row.ignored for row in summary.context)
@@ -95,7 +95,7 @@ def opened(summary: Summary) -> Iterator[str]:
 
 def compared(summary: Summary) -> Iterator[str]:
     """Describe how the images are scored."""
-    exposure = exposures([row.gain for row in summary.context])
+    exposure = exposures([row.exposure_gain for row in summary.context])
     if exposure is not None:
         yield exposure
     if summary.settings.get("uses_target_photographs"):

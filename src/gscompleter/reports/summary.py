@@ -82,40 +82,40 @@ def _of_step(key: str) -> Callable[[Step], float | None]:
     return lambda step: step[key]
 
 
-GAIN = Column("gain", "gain", 2, gain_of)
+GAIN = Column("gain", "ΔPSNR", 2, gain_of)
 
 IMAGES = (
     Column("psnr", "PSNR", 2, psnr_after),
     GAIN,
-    Column("lowest_gain", "lowest gain", 2, gain_of, min, min),
+    Column("lowest_gain", "min ΔPSNR", 2, gain_of, min, min),
     Column("ssim", "SSIM", 3, _at("target_after", "ssim")),
     Column("lpips_vgg", "LPIPS (VGG)", 3, _at("target_after", "lpips_vgg")),
     Column("lpips_alex", "LPIPS (Alex)", 3, _at("target_after", "lpips_alex")),
-    Column("hole_psnr", "in holes", 2, _at("hole_psnr")),
-    Column("observed_psnr", "outside", 2, _at("observed_psnr", "after")),
-    Column("neighbours", "beside", 2, _at("neighbours_psnr", "after")),
-    Column("neighbours_gain", "gain beside", 2, _change("neighbours_psnr")),
-    Column("context", "context", 2, _views("context_psnr")),
-    Column("context_ssim", "SSIM of context", 3, _views("context_ssim")),
-    Column("context_change", "worst context change", 2, _worst_view, min, min),
+    Column("hole_psnr", "PSNR (hole)", 2, _at("hole_psnr")),
+    Column("observed_psnr", "PSNR (observed)", 2, _at("observed_psnr", "after")),
+    Column("neighbours", "PSNR (neighbour views)", 2, _at("neighbours_psnr", "after")),
+    Column("neighbours_gain", "ΔPSNR (neighbour views)", 2, _change("neighbours_psnr")),
+    Column("context", "PSNR (context)", 2, _views("context_psnr")),
+    Column("context_ssim", "SSIM (context)", 3, _views("context_ssim")),
+    Column("context_change", "min ΔPSNR (context)", 2, _worst_view, min, min),
 )
 """PSNR in dB at the target, in its hole and observed part, at neighbour and context views."""
 
 LOOKS = (
-    Column("hole_flip", "FLIP in holes", 3, _at("hole_looks", "flip")),
-    Column("observed_flip", "FLIP outside", 3, _at("observed_looks", "flip")),
-    Column("hole_haarpsi", "HaarPSI in holes", 3, _at("hole_looks", "haarpsi")),
-    Column("observed_haarpsi", "HaarPSI outside", 3, _at("observed_looks", "haarpsi")),
+    Column("hole_flip", "FLIP (hole)", 3, _at("hole_looks", "flip")),
+    Column("observed_flip", "FLIP (observed)", 3, _at("observed_looks", "flip")),
+    Column("hole_haarpsi", "HaarPSI (hole)", 3, _at("hole_looks", "haarpsi")),
+    Column("observed_haarpsi", "HaarPSI (observed)", 3, _at("observed_looks", "haarpsi")),
     Column(
         "hole_gradients",
-        "gradient energy in holes",
+        "gradient energy (hole)",
         2,
         _at("hole_looks", "gradient_energy"),
         over_tasks=statistics.median,
     ),
     Column(
         "observed_gradients",
-        "gradient energy outside",
+        "gradient energy (observed)",
         2,
         _at("observed_looks", "gradient_energy"),
         over_tasks=statistics.median,
@@ -159,7 +159,7 @@ GEOMETRY = (
 )
 
 ADDED = (
-    *_mean_and_median("depth_rim", "step at rim", 4, "align_pixels"),
+    *_mean_and_median("depth_rim", "depth step at seam", 4, "align_pixels"),
     *_mean_and_median("align_abs_rel", "AbsRel to context", 4, "align_pixels"),
     *_mean_and_median("align_chamfer", "Chamfer to context", 4, "align_pixels"),
     *_mean_and_median("align_f_score", "F-score to context", 3, "align_pixels"),

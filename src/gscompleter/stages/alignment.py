@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.config import AffineConfig
+from gscompleter.config import AlignmentConfig, DepthAgreementConfig
 from gscompleter.types import DepthAffine, DepthMap, Lift, Render
 
 MAX_TRIALS = 512
@@ -117,19 +117,22 @@ def fit_bridge(
     at_target: Render,
     at_anchor: Render,
     rng: torch.Generator,
-    config: AffineConfig = AffineConfig(),
+    config: AlignmentConfig = AlignmentConfig(),
+    reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> DepthAffine:
     """The affine that brings the lifted depths to the scene's, compared in the bridge view.
 
     The anchor is the paper's bridge: the scene is dense there, while at the target it has the very
     holes that are to be filled. What the target sees nevertheless may contradict it.
     """
-    if config.bridge == "none":
+    if config.align_at == "none":
         return DepthAffine()
-    if config.bridge == "target":
+    if config.align_at == "target":
         return fit_affine(lift.reference_depth, at_target.depth_map(), rng)
     affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng)
-    return unless_contradicted(affine, lift.reference_depth, at_target.depth_map(), rng, config)
+    return unless_contradicted(
+        affine, lift.reference_depth, at_target.depth_map(), rng, config, reject_below
+    )
 
 
 def unless_contradicted(
@@ -137,7 +140,8 @@ def unless_contradicted(
     predicted: DepthMap,
     context: DepthMap,
     rng: torch.Generator,
-    config: AffineConfig,
+    config: AlignmentConfig,
+    reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> DepthAffine:
     """`affine`, unless the scene that the target sees has other depths and one other affine.
 
@@ -156,4 +160,4 @@ def unless_contradicted(
     if own.inliers >= max(MIN_INLIERS, 2 * agree):
         return replace(own, agreement=own.inliers, contradicted=True)
     enough = len(x) >= MIN_SEEN * context.depth.numel()
-    return replace(affine, refuted=enough and agree < (config.min_merged or 0.0))
+    return replace(affine, refuted=enough and agree < (reject_below or 0.0))

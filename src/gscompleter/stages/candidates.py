@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gscompleter.config import ExplorationConfig
+from gscompleter.config import NextBestViewConfig
 from gscompleter.geometry import project, rotation_about
 from gscompleter.types import Camera, Render
 
@@ -41,7 +41,7 @@ def candidates(
     bases: Sequence[Camera],
     renders: Sequence[Render],
     step: float,
-    config: ExplorationConfig = ExplorationConfig(),
+    config: NextBestViewConfig = NextBestViewConfig(),
 ) -> list[Candidate]:
     """The moves of each of `bases` that end in free space.
 
@@ -56,7 +56,9 @@ def candidates(
     found = []
     for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
         longest = config.max_step * depth
-        away = moves(base, depth, min(step, longest) if step > 0 else longest, config.turn, up)
+        away = moves(
+            base, depth, min(step, longest) if step > 0 else longest, config.yaw_fraction, up
+        )
         found += [Candidate(camera, index, nearest[index]) for camera in away]
     small = [resized(b, *r.alpha.T.shape) for b, r in zip(bases, renders, strict=True)]
     return [c for c in found if in_the_open(c.camera.center, small, renders)]
@@ -142,7 +144,7 @@ def in_the_open(
     return not hidden
 
 
-def is_close(render: Render, nearest: float, config: ExplorationConfig) -> bool:
+def is_close(render: Render, nearest: float, config: NextBestViewConfig) -> bool:
     """Whether surfaces before a camera fill more of its image than they may; `nearest` is how near,
     in scene units, they are where a photograph was taken."""
     seen = render.depth_map()

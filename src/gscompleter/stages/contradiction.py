@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
-from gscompleter.config import ContradictionConfig
+from gscompleter.config import DynamicMasksConfig
 from gscompleter.coverage import COVERED
 from gscompleter.generators.robust import robust_affine
 from gscompleter.geometry import baseline_between, inside, project, sample, unproject
@@ -111,7 +111,7 @@ class Answer:
 def contradicted(
     views: Sequence[View],
     renders: Sequence[Render],
-    config: ContradictionConfig = ContradictionConfig(),
+    config: DynamicMasksConfig = DynamicMasksConfig(),
 ) -> list[Bool[Tensor, "_ _"]]:
     """Which pixels of each photograph its neighbours contradict, as regions.
 
@@ -120,12 +120,12 @@ def contradicted(
         renders: The scene that Ψ made of them, as these cameras see it.
         config: From which difference on.
     """
-    if config.min_difference is None:
+    if config.min_color_difference is None:
         return [torch.zeros_like(view.counted) for view in views]
     sights = [small(view, render) for view, render in zip(views, renders, strict=True)]
     votes = [torch.zeros_like(sight.known, dtype=torch.int32) for sight in sights]
     for one, other in neighbours([view.camera for view in views]):
-        answers = questioned(sights[one], sights[other], config.min_difference)
+        answers = questioned(sights[one], sights[other], config.min_color_difference)
         for index, answer, region in zip((one, other), answers, agreed(*answers), strict=True):
             votes[index] += region.int() - (answer.confirmed & ~region).int()
     return [at_size(vote > 0, view.camera) for vote, view in zip(votes, views, strict=True)]

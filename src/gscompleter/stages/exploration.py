@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gscompleter.config import ExplorationConfig
+from gscompleter.config import NextBestViewConfig
 from gscompleter.frames.thinning import thinned, thinning
 from gscompleter.geometry import (
     baseline_between,
@@ -61,7 +61,7 @@ class Choice:
 
 
 def gain(
-    holes: Bool[Tensor, "h w"], overlap: float, config: ExplorationConfig = ExplorationConfig()
+    holes: Bool[Tensor, "h w"], overlap: float, config: NextBestViewConfig = NextBestViewConfig()
 ) -> float:
     """What there is to gain where an image has `holes`, as a share of the image.
 
@@ -70,7 +70,7 @@ def gain(
         overlap: Share of what the camera observes that its anchor sees too.
         config: How far from what was observed a hole counts.
     """
-    radius = max(round(config.reach * max(holes.shape)), 1)
+    radius = max(round(config.border_radius * max(holes.shape)), 1)
     bordering = holes & dilate(~holes, radius)
     return bordering.float().mean().item() * overlap
 
@@ -91,7 +91,7 @@ def best(
     choices: Sequence[Choice],
     photographs: Sequence[Camera],
     step: float,
-    config: ExplorationConfig = ExplorationConfig(),
+    config: NextBestViewConfig = NextBestViewConfig(),
 ) -> Choice | None:
     """The camera to complete next; None where little is left to gain.
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gscompleter.config import HarmConfig
+from gscompleter.config import PsnrGuardConfig
 from gscompleter.masks import dilate
 from gscompleter.render import FrozenView, OpacityImage, image_of
 from gscompleter.ssim import RADIUS, ssim_map
@@ -87,7 +87,7 @@ def do_no_harm(
     added: Gaussians,
     frozen_views: Sequence[FrozenView],
     budgets: Sequence[Sequence[ErrorBudget]],
-    config: HarmConfig = HarmConfig(),
+    config: PsnrGuardConfig = PsnrGuardConfig(),
     drawings: Sequence[OpacityImage] | None = None,
 ) -> Gaussians:
     """Lower the opacities of `added` until every photograph is within its error budgets.
@@ -108,7 +108,7 @@ def do_no_harm(
         drawings: What draws each of the photographs with other opacities of `added`, where that is
             known already.
     """
-    if config.tolerance is None or len(added) == 0:
+    if config.max_drop is None or len(added) == 0:
         return added
     if drawings is None:
         drawings = [image_of(frozen.plan(added)) for frozen in frozen_views]
@@ -199,13 +199,13 @@ def those_over(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[D
 
 
 def is_undone(
-    added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: HarmConfig = HarmConfig()
+    added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: PsnrGuardConfig = PsnrGuardConfig()
 ) -> bool:
     """Whether of the opacities of what was `added` so little is `left` that the photographs
     contradict all of it."""
-    if config.max_loss is None or len(added) == 0:
+    if config.max_opacity_loss is None or len(added) == 0:
         return False
-    return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_loss
+    return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_opacity_loss
 
 
 def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:

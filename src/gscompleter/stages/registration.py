@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gscompleter.config import RegistrationConfig
+from gscompleter.config import AlignmentConfig, DepthAgreementConfig, RegistrationConfig
 from gscompleter.coverage import COVERED
 from gscompleter.descent import Adam
 from gscompleter.geometry import reaching, slide, z_depths
@@ -52,6 +52,8 @@ def register(
     rng: torch.Generator,
     config: RegistrationConfig = RegistrationConfig(),
     max_alpha: float = COVERED,
+    alignment: AlignmentConfig = AlignmentConfig(),
+    reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> Registration:
     """Bring the lifted Gaussians to the scene: first all by one affine, then each along its ray.
 
@@ -65,8 +67,10 @@ def register(
         rng: Randomness of RANSAC.
         config: Weights, steps and choices.
         max_alpha: A pixel of the target that the scene covers by less is a hole.
+        alignment: Settings of the affine fit.
+        reject_below: As `DepthAgreementConfig`.
     """
-    affine = fit_bridge(lift, frozen_target.context, at_anchor, rng, config.affine)
+    affine = fit_bridge(lift, frozen_target.context, at_anchor, rng, alignment, reject_below)
     coarse = apply_affine(
         lift.gaussians, affine, reference.camera, config.footprint, config.min_ratio
     )
@@ -75,7 +79,11 @@ def register(
     registered, losses = register_along_rays(
         coarse, frozen_target, at_anchor, reference, anchor, renderer, config
     )
-    if config.carry_into_holes and config.degrees_of_freedom == 1 and lift.pixel_index is not None:
+    if (
+        config.extrapolate_into_holes
+        and config.degrees_of_freedom == 1
+        and lift.pixel_index is not None
+    ):
         scene = frozen_target.context.depth_map(max_alpha)
         registered = carry_into_holes(
             coarse, registered, lift.pixel_index, scene, reference.camera, config
@@ -160,7 +168,7 @@ def register_along_rays(
     optimizer = Adam([(parameters, config.learning_rate)], (config.beta1, config.beta2))
     losses = []
     for iteration in track(range(config.iterations), "Registering"):
-        left = 1 - iteration / config.iterations if config.schedule == "falling" else 1.0
+        left = 1 - iteration / config.iterations if config.lr_schedule == "linear" else 1.0
         moved = displace(seen, parameters, reference.camera, config)
         loss = objective(moved, frozen_target, alone, renderer.render(moved, anchor))
         optimizer.step(loss, left)
@@ -180,7 +188,7 @@ def displace(
     """`coarse` moved by the optimised parameters: along the rays (Eq. 10), or freely in 3-DoF."""
     offsets = coarse.means - camera.center
     distances = offsets.norm(dim=1, keepdim=True)
-    unit = distances if config.step == "relative" else torch.ones_like(distances)
+    unit = distances if config.lr_unit == "distance" else torch.ones_like(distances)
     if config.degrees_of_freedom == 3:
         return replace(coarse, means=coarse.means + unit * parameters, encoded=None)
     ratio = 1 + (unit * parameters / distances)[:, 0]
@@ -232,7 +240,7 @@ class Objective:
         """The objective that draws the candidates to the scene as both cameras see it."""
         anchor_depth = compared_depth(at_anchor, anchor, config)
         seen = anchor_depth.depth[anchor_depth.valid]
-        relative = config.step == "relative" and len(seen) > 0
+        relative = config.lr_unit == "distance" and len(seen) > 0
         unit = seen.median().item() if relative else 1.0
         target_depth = compared_depth(at_target, reference.camera, config)
         return Objective(target_depth, anchor_depth, reference.image, unit, config)
@@ -262,10 +270,10 @@ class Objective:
         """
         c = self.config
         loss = torch.zeros((), device=candidates.means.device)
-        if c.depth_of == "composite" or c.rgb_weight > 0:
+        if c.rendered_depth == "composite" or c.rgb_weight > 0:
             together = frozen_target.composite(candidates)
             loss = loss + c.rgb_weight * (together.image - self.image).abs().mean()
-        shown = together if c.depth_of == "composite" else alone(candidates)
+        shown = together if c.rendered_depth == "composite" else alone(candidates)
         loss = loss + c.depth_weight * self.depth_error(
             shown, self.target_depth, self.target_depth.valid & shown.depth_map().valid
         )

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.config import SupportConfig
+from gscompleter.config import TrustConfig
 from gscompleter.errors import InputError
 from gscompleter.geometry import unproject
 from gscompleter.reconstructors import Reconstructor
@@ -49,7 +49,7 @@ def stereo_among(
     drawn: Render,
     reconstructor: Reconstructor,
     renderer: Renderer,
-    config: SupportConfig,
+    config: TrustConfig,
 ) -> Stereo | None:
     """What Ψ makes of those of `views` that matter to `camera`; None where they tell no depth.
 

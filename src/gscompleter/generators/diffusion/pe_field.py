@@ -65,7 +65,7 @@ class PEField:
     """What positions of the target are rounded to: bfloat16 as in the authors' run."""
     retries: int = 0
     """How many further seeds are tried where an image disagrees with the photographs."""
-    at_once: int = PEFieldSettings.at_once
+    at_once: int = PEFieldSettings.batch_size
     """Most images that are denoised together."""
 
     takes_margin: bool = True
@@ -167,11 +167,11 @@ def load_pe_field(
 ) -> PEField:
     """PE-Field as the settings want it; an InputError where packages or weights are missing."""
     return PEField(
-        load_kontext(settings.path, device, settings.offload),
+        load_kontext(settings.weights, device, settings.offload),
         seed,
         settings.steps,
         None if settings.depth is None else source_depth_named(settings.depth, device),
         device,
         retries=settings.retries,
-        at_once=settings.at_once,
+        at_once=settings.batch_size,
     )

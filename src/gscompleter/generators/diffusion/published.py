@@ -149,7 +149,7 @@ def needs_diffusers(name: str) -> None:
 
 
 @contextmanager
-def reading(source: Source, setting: str = "path") -> Iterator[None]:
+def reading(source: Source, setting: str = "weights") -> Iterator[None]:
     """While the files of `source` are read: nothing is said, and what fails becomes a sentence.
 
     `setting` of the generator names a folder in its place.
