@@ -86,11 +86,11 @@ def of_script(path: Path) -> str:
 
 
 def of_commands() -> str:
-    """What `--help` says of each command."""
+    """What `--help-all` says of each command."""
     from gscompleter.cli import COMMANDS
 
     sections = [f"## {name}\n\n{as_definitions(help_of(name))}" for name in COMMANDS]
-    return "# Command line\n\nWhat `gscompleter COMMAND --help` says.\n\n" + "\n".join(sections)
+    return "# Command line\n\nWhat `gscompleter COMMAND --help-all` says.\n\n" + "\n".join(sections)
 
 
 def as_definitions(said: str) -> str:
@@ -123,7 +123,7 @@ def help_of(command: str) -> str:
         contextlib.redirect_stdout(said),
         contextlib.suppress(SystemExit),
     ):
-        parsed([command, "--help"])
+        parsed([command, "--help-all"])
     return re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue()).strip()
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from torch import Tensor
 
 from gscompleter.completer import GSCompleter
-from gscompleter.config import SupportConfig
+from gscompleter.config import TrustConfig
 from gscompleter.data.formats import open_photographs
 from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def find(scene: Gaussians, views: Sequence[View], trained: Sequence[int]) -> None:
-    renderer, config = load_renderer("cpu"), SupportConfig()
+    renderer, config = load_renderer("cpu"), TrustConfig()
     frozen_views = [renderer.freeze(scene, view.camera) for view in views]
     evidence = gather_evidence(Proxy(scene), views, frozen_views, config)
     for frame in sorted(set(range(len(views))) - set(trained)):

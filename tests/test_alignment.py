@@ -3,9 +3,11 @@
 import pytest
 import torch
 
-from gscompleter.config import AffineConfig, CompleterConfig
+from gscompleter.config import AlignmentConfig, CompleterConfig
 from gscompleter.stages.alignment import fit_affine, unless_contradicted
 from gscompleter.types import DepthAffine, DepthMap
+
+CONFIG = AlignmentConfig()
 
 
 def depths(low: float = 2.0, high: float = 6.0, size: int = 64) -> torch.Tensor:
@@ -80,12 +82,17 @@ def test_the_same_seed_gives_the_same_fit():
     assert fit(predicted, context) == fit(predicted, context)
 
 
-def checked(scale: float, context: torch.Tensor, config: AffineConfig = AffineConfig()):
-    """Check an affine that fits the anchor at a target with the depths `context`."""
+def checked(
+    scale: float,
+    context: torch.Tensor,
+    config: AlignmentConfig = CONFIG,
+    reject_below: float | None = 0.15,
+):
+    """What becomes of an affine that fits the anchor, where the target sees `context`."""
     random = torch.Generator().manual_seed(0)
     through_anchor = DepthAffine(scale, 0.0, 0.9, "ransac")
     return unless_contradicted(
-        through_anchor, everywhere(depths()), everywhere(context), random, config
+        through_anchor, everywhere(depths()), everywhere(context), random, config, reject_below
     )
 
 
@@ -101,7 +108,7 @@ def test_an_affine_that_the_target_confirms_or_cannot_judge_stays():
     none = DepthMap(depths(), torch.zeros(64, 64, dtype=torch.bool))
     affine = DepthAffine(3.0, 0.0, 0.9, "ransac")
     random = torch.Generator()
-    assert unless_contradicted(affine, everywhere(depths()), none, random, AffineConfig()) == affine
+    assert unless_contradicted(affine, everywhere(depths()), none, random, CONFIG) == affine
 
 
 def unlike() -> torch.Tensor:
@@ -113,7 +120,7 @@ def test_where_no_affine_fits_what_the_target_sees_the_one_of_the_anchor_is_refu
     affine = checked(1.0, unlike())
     assert (affine.refuted, affine.contradicted, affine.scale) == (True, False, 1.0)
     assert 0 < affine.agreement < 0.1
-    assert not checked(1.0, unlike(), AffineConfig(min_merged=None)).refuted
+    assert not checked(1.0, unlike(), reject_below=None).refuted
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.4])
@@ -127,7 +134,7 @@ def test_where_enough_agrees_the_affine_is_not_refuted(share):
 def test_what_is_seen_of_little_refutes_nothing():
     seen = torch.zeros(128, 128, dtype=torch.bool)
     seen[:10, :10] = True
-    random, config = torch.Generator().manual_seed(0), AffineConfig()
+    random, config = torch.Generator().manual_seed(0), AlignmentConfig()
     predicted = everywhere(depths(size=128))
     through_anchor = DepthAffine(1.0, 0.0, 0.9, "ransac")
     for share, refuted in ((seen, False), (torch.ones_like(seen), True)):
@@ -138,6 +145,6 @@ def test_what_is_seen_of_little_refutes_nothing():
 
 
 def test_the_paper_trusts_the_anchor_always():
-    config = CompleterConfig.paper().registration.affine
+    config = CompleterConfig.paper().alignment
     for context in (depths() / 5, unlike()):
         assert checked(1.2, context, config) == DepthAffine(1.2, 0.0, 0.9, "ransac")

@@ -210,10 +210,10 @@ def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):
     for name in ("one", "two scenes"):
         (tmp_path / "scenes" / name).mkdir(parents=True)
     (tmp_path / "m.csv").write_text(
-        "folder,target,film,config.holes.max_alpha\nscenes/one,4 6,yes,0.4\nscenes/two scenes,,,\n"
+        "folder,target,video,config.holes.max_alpha\nscenes/one,4 6,yes,0.4\nscenes/two scenes,,,\n"
     )
     (tmp_path / "m.jsonl").write_text(
-        '{"folder": "scenes/one", "target": [4, 6], "film": true, "config": {"holes": '
+        '{"folder": "scenes/one", "target": [4, 6], "video": true, "config": {"holes": '
         '{"max_alpha": 0.4}}}\n{"folder": "scenes/two scenes"}\n'
     )
     by_csv = read_manifest(str(tmp_path / "m.csv"), {})
@@ -224,7 +224,7 @@ def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):
     options = [[options_of(j.options, tmp_path / "o") for j in jobs] for jobs in (by_csv, by_json)]
     assert options[0] == options[1]
     assert options[0][0].target == ("4", "6")
-    assert options[0][0].film
+    assert options[0][0].video
     assert options[0][0].config.holes.max_alpha == 0.4
     assert options[0][1] == options_of(by_folder[1].options, tmp_path / "o")
 
@@ -244,8 +244,8 @@ def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
     [
         ({"targt": 2}, "no option --targt; the nearest is --target"),
         ({"resolution": "wide"}, "resolution"),
-        ({"out": "elsewhere"}, "no say in 'out'"),
-        ({"film": "perhaps"}, "must be true or false"),
+        ({"out": "elsewhere"}, "cannot set 'out'"),
+        ({"video": "perhaps"}, "must be true or false"),
         ({"format": "--overwrite"}, "begins with a dash"),
         ({"seed": -1}, "seed must be greater than or equal to 0"),
         ({"folder": None}, "no folder"),
@@ -309,7 +309,7 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     capsys.readouterr()
     assert run(monkeypatch, *words[:-1]) == 0
     errors = capsys.readouterr().err
-    assert "Done 0, failed 0, there before 4, 2 of them failed (--again failures does" in errors
+    assert "Done 0, failed 0, done earlier 4, 2 of them failed (--rerun failures repeats" in errors
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")} == before
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gscompleter import Camera
-from gscompleter.config import ExplorationConfig
+from gscompleter.config import NextBestViewConfig
 from gscompleter.geometry import baseline_between, rotation_between
 from gscompleter.stages.candidates import (
     candidates,
@@ -63,7 +63,7 @@ def test_up_is_what_is_up_in_most_images():
 def test_a_candidate_behind_a_surface_is_none():
     """The camera is one step in front of the wall at z = 5, which a second one sees from afar."""
     cameras = [camera_at(-2.0, z=4.2), camera_at(-2.0, z=1.0)]
-    far = ExplorationConfig(max_step=1.0)
+    far = NextBestViewConfig(max_step=1.0)
     found = candidates(cameras, [seen_by(c) for c in cameras], 0.79, far)
     centers = torch.stack([c.camera.center for c in found])
     assert (centers[:, 2] < 4.9).all()

@@ -148,8 +148,8 @@ def test_the_command_says_what_it_did(scene, tmp_path, monkeypatch, capsys):
     words = [word for word in clean(scene, splat, tmp_path / "out") if word != "--quiet"]
     assert run(monkeypatch, *words, "--context", 0, 2) == 0
     said = capsys.readouterr()
-    assert "Gaussians taken out" in said.out
-    assert "judged by 2 photographs" in said.err
+    assert "Gaussians removed" in said.out
+    assert "compared with 2 photographs" in said.err
 
 
 @pytest.mark.parametrize(

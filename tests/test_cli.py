@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import struct
@@ -21,6 +22,8 @@ import torch
 from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.cli import parsed
+from gscompleter.commands.renamed import warn_of
+from gscompleter.commands.row_options import options_of
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import (
     GENERATORS,
@@ -36,7 +39,7 @@ SIZE = 64
 
 @pytest.fixture(scope="module")
 def scene(room) -> Path:
-    """Photographs of a room from three places; frame 2 sees what 0 and 1 do not."""
+    """Return photographs of a room from three places; frame 2 sees what 0 and 1 do not."""
     return room
 
 
@@ -45,12 +48,12 @@ def complete(scene, out, *more, context=(0, 1), target=(2,)) -> list:
 
 
 SMALL = ("--resolution", 32, "--near", 0.5, "--far", 20, "--quiet")
-"""Where what is completed matters less than that it is."""
+"""Options of fast runs whose result does not matter."""
 
 
 @pytest.fixture(scope="module")
 def completed(completed_room) -> Path:
-    """The output of one plain run."""
+    """Return the output of one plain run."""
     return completed_room
 
 
@@ -87,10 +90,10 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
     scores = {"psnr_before", "psnr_after", "ssim_before", "ssim_after"}
     assert [row["frame"] for row in summary["context"]] == [0, 1]
     assert all(
-        set(row) == {"frame", "gain", "contradicted", "ignored", *scores}
+        set(row) == {"frame", "exposure_gain", "dynamic_fraction", "ignored", *scores}
         for row in summary["context"]
     )
-    assert all(row["gain"] is None for row in summary["context"])  # two stay as they were taken
+    assert all(row["exposure_gain"] is None for row in summary["context"])  # as they were taken
     (target,) = summary["targets"]
     assert set(target) >= {"frame", "anchor", "anchor_fallback", "hole_fraction", "affine", *scores}
     assert (target["frame"], target["anchor"], target["anchor_fallback"]) == (2, 0, False)
@@ -127,9 +130,9 @@ def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch,
         assert not row["is_check"]
         for score in ("psnr_before", "psnr_after", "ssim_before", "ssim_after"):
             assert row[score] == pytest.approx(target[score], abs=1e-4)
-    assert "not used (8 scored) the mean PSNR was" in capsys.readouterr().out
+    assert "Mean PSNR of 8 photographs that were not used: " in capsys.readouterr().out
     page = (out / "report.html").read_text()
-    assert "At photographs that were not used" in page
+    assert "At held-out photographs" in page
     assert ">mean<" in page
 
     splat = ("--scene", out / "context.ply", *SMALL)
@@ -189,7 +192,7 @@ def test_the_oracle_looks_at_the_photograph_and_says_so(scene, tmp_path, monkeyp
 
 
 def broken_scene(scene: Path, folder: Path, change) -> Path:
-    """A copy of the scene whose transforms.json was changed."""
+    """Copy the scene with a changed transforms.json."""
     folder.mkdir()
     for image in scene.glob("*.png"):
         (folder / image.name).write_bytes(image.read_bytes())
@@ -200,7 +203,7 @@ def broken_scene(scene: Path, folder: Path, change) -> Path:
 
 
 def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
-    """The command exits with 2, says one sentence and writes nothing."""
+    """Check that the command exits with 2, prints one sentence and writes nothing."""
     assert run(monkeypatch, *arguments) == 2
     said = capsys.readouterr().err
     assert sentence in said
@@ -242,8 +245,8 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
     ("more", "sentence"),
     [
         (("--near", 5, "--far", 1), "near"),
-        (("--auto", 2), "Targets are named, and others are to be found besides; "),
-        (("--auto",), "complete the result for the others (--auto)."),
+        (("--auto", 2), "--target and --auto are both given; use one of them"),
+        (("--auto",), "again with the other (--auto)."),
         (("--near", 0), "near"),
         (("--generator", "oracle", "--generator=oracle"), "--generator is given twice"),
         (("--near", -1), "near"),
@@ -260,7 +263,12 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--sed", 1), "no option --sed; the nearest is --seed (see gscompleter complete --help)."),
         (("--drop_nonfinit",), "no option --drop_nonfinit; the nearest is --drop-nonfinite (see"),
         (("--qwertz", 1), "Unrecognized options: --qwertz, 1 (see gscompleter complete --help)."),
-        (("--config.registration.stepp", 1), "the nearest is --config.registration.step (see"),
+        (("--config.registration.lr-unitt", 1), "nearest is --config.registration.lr-unit (see"),
+        (
+            ("--config.harm.max-loss", 1),
+            "g --config.harm.max-loss is now called --config.psnr-guard.max-opacity-loss; use",
+        ),
+        (("--config.support.doubts=no",), "called --config.trust (full or photometric); use"),
         (("--device", "tpu"), "invalid choice 'tpu' for argument '--device'."),
         (("--near", "a" * 5000), "aaa…aaa"),
         (("--config",), "Missing value for argument '--config'."),
@@ -326,7 +334,7 @@ def test_a_splat_in_place_of_the_photographs_is_sent_to_its_option(tmp_path, mon
 
 
 def config_of(scene, tmp_path, monkeypatch, *more) -> CompleterConfig:
-    """The settings that a command leads to."""
+    """Return the settings of a command."""
     words = [str(word) for word in complete(scene, tmp_path / "out", *more)]
     return parsed(words).config
 
@@ -343,9 +351,9 @@ def test_single_settings_are_applied_over_those_that_are_named(scene, tmp_path, 
     assert config == replace(paper, registration=replace(paper.registration, iterations=7))
     file = tmp_path / "mine.yaml"
     file.write_text("base: paper\nmargin: 0.1\n")
-    changes = ("--config.harm.tolerance", 0.5, "--config.registration.mask_occluded", "True")
+    changes = ("--config.psnr-guard.max-drop", 0.5, "--config.registration.mask_occluded", "True")
     config = config_of(scene, tmp_path, monkeypatch, f"--config={file}", *changes)
-    assert (config.margin, config.harm.tolerance) == (0.1, 0.5)
+    assert (config.margin, config.psnr_guard.max_drop) == (0.1, 0.5)
     assert config.registration == replace(paper.registration, mask_occluded=True)
 
 
@@ -355,12 +363,19 @@ def test_a_single_setting_reaches_the_completion_and_its_summary(scene, tmp_path
     assert run(monkeypatch, *complete(scene, out, *more)) == 0
     config = json.loads((out / "summary.json").read_text())["settings"]["config"]
     assert config["registration"]["iterations"] == 3
-    assert config["registration"]["affine"]["bridge"] == "none"
+    assert config["alignment"]["align_at"] == "none"
 
 
 def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
-    words = ("--generator", "pe-field", "--generator-path", "a/b", "--generator-steps", 8)
-    words += ("--generator-retries", 2, "--generator-depth", "monocular", "--generator-at-once", 3)
+    words = ("--generator", "pe-field", "--generator-weights", "a/b", "--generator-steps", 8)
+    words += (
+        "--generator-retries",
+        2,
+        "--generator-depth",
+        "monocular",
+        "--generator-batch-size",
+        3,
+    )
     options = parsed([str(w) for w in complete(scene, tmp_path, *words, "--generator-offload")])
     assert options.synthesis.settings() == PEFieldSettings("a/b", 2, True, 8, "monocular", 3)
     words = ("--generator", "diffusers-inpaint", "--generator-prompt", "a quiet street")
@@ -370,13 +385,73 @@ def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
     assert options.synthesis.settings() == WarpInpaintSettings()
 
 
-def test_help_knows_every_setting(monkeypatch, capsys):
-    assert run(monkeypatch, "complete", "--help") == 0
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (("--keep-unsupported",), ("--no-prune",)),
+        (("--keep_unsupported",), ("--no-prune",)),
+        (("--film",), ("--video",)),
+        (("--generator-path", "a/b"), ("--generator-weights", "a/b")),
+        (("--generator-path=a/b",), ("--generator-weights", "a/b")),
+        (("--generator-at-once", 3), ("--generator-batch-size", 3)),
+    ],
+)
+def test_an_old_option_name_works_and_a_line_names_the_new_one(scene, tmp_path, capsys, old, new):
+    warn_of.cache_clear()
+    more = ("--generator", "pe-field")
+    options = [parsed(list(map(str, complete(scene, tmp_path, *more, *o)))) for o in (old, new)]
+    assert options[0] == options[1]
+    name = old[0].split("=")[0].replace("_", "-")
+    assert capsys.readouterr().err == (
+        f"gscompleter: {name} is now called {new[0]}; the old name stops working in the next "
+        "release.\n"
+    )
+
+
+def test_old_option_names_of_other_commands_and_of_rows_work_too(tmp_path, capsys):
+    warn_of.cache_clear()
+    words = ["evaluate", "cases.json", "--out", "o", "--again", "scores", "--ignore-masked"]
+    options = parsed(words)
+    assert (options.rerun, options.use_masks) == ("scores", True)
+    assert parsed(["batch", "m.csv", "--out", "o", "--again", "failures"]).rerun == "failures"
+    row = {"folder": "scene", "keep_unsupported": "true", "film": "no"}
+    options = options_of(row, tmp_path)
+    assert (options.no_prune, options.video) == (True, False)
+    assert capsys.readouterr().err.count("\n") == 4  # once each
+
+
+SHORT = {"complete": 13, "live": 14, "evaluate": 13, "batch": 9, "clean": 9, "bench": 10}
+"""Number of options in the short help, with those for help."""
+
+
+@pytest.mark.parametrize("command", SHORT)
+def test_help_is_short_and_names_the_option_that_shows_all(monkeypatch, capsys, command):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run(monkeypatch, command, "--help") == 0
+    said = capsys.readouterr().out
+    assert "--help-all" in said
+    assert said.count("\n") < 60
+    assert "None" not in said
+    options = re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z-]+)", said, re.MULTILINE)
+    assert len(options) <= SHORT[command]
+    assert run(monkeypatch, command, "--help-all") == 0
+    full = re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z.-]+)", capsys.readouterr().out, re.MULTILINE)
+    assert set(options) - {"--help-all", "--config"} < set(full)
+
+
+@pytest.mark.parametrize("words", [("--help-all",), ("doctor", "--help-all"), ("-h",)])
+def test_every_command_has_both_kinds_of_help(monkeypatch, capsys, words):
+    assert run(monkeypatch, *words) == 0
+    assert capsys.readouterr().out.startswith("usage: gscompleter")
+
+
+def test_help_all_knows_every_setting(monkeypatch, capsys):
+    assert run(monkeypatch, "complete", "--help-all") == 0
     said = capsys.readouterr().out
     for kind in GENERATORS.values():
         assert all(f"--generator-{f.name.replace('_', '-')}" in said for f in fields(kind))
-    assert "--config.registration.affine.min-agreement" in said
-    assert "How many further seeds are tried" in said
+    assert "--config.alignment.min-agreement" in said
+    assert "Further seeds to try if" in said
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -490,7 +565,7 @@ def test_quiet_is_quiet(scene, tmp_path, monkeypatch, capsys):
 
 
 def gscompleter(*arguments) -> subprocess.Popen:
-    """The command in a process of its own."""
+    """Start the command in a process of its own."""
     command = [sys.executable, "-c", "from gscompleter.cli import main; main()"]
     return subprocess.Popen(
         [*command, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -512,15 +587,14 @@ def test_help_does_not_wait_for_torch():
 
 
 def num_written(folder: Path) -> int:
-    """How many files and folders with a dot in their names lie in a folder that others write to:
-    `os.walk` passes over what goes while it looks."""
+    """Count files and folders with a dot in their names, in a folder that others write to."""
     return sum("." in name for _, *names in os.walk(folder) for name in chain(*names))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills with a POSIX signal")
 @pytest.mark.parametrize("written", [2, 4, 8])
 def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
-    """The process is killed once it has begun to write so many files and folders."""
+    """The process is killed after it has begun to write this many files and folders."""
     out = tmp_path / "out"
     process = gscompleter(*complete(scene, out, *SMALL))
     while process.poll() is None and num_written(tmp_path) < written:

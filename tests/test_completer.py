@@ -15,7 +15,7 @@ from gscompleter import (
     load_renderer,
 )
 from gscompleter.completer import STAGES
-from gscompleter.config import HarmConfig
+from gscompleter.config import PsnrGuardConfig
 from gscompleter.generators import Synthesis
 from gscompleter.geometry import project
 from gscompleter.metrics.image import psnr
@@ -474,7 +474,7 @@ def test_what_photographs_make_fade_is_not_added():
     assert is_undone(added, 0.2 * added)
     assert not is_undone(added, 0.3 * added)
     assert not is_undone(added[:0], added[:0])
-    assert not is_undone(added, 0.0 * added, HarmConfig(max_loss=None))
+    assert not is_undone(added, 0.0 * added, PsnrGuardConfig(max_opacity_loss=None))
 
 
 def test_nothing_is_added_before_what_an_earlier_target_sees(monkeypatch):

@@ -1,18 +1,20 @@
 """Settings by name and from YAML."""
 
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
 
 from gscompleter.config import (
     ABLATIONS,
-    AffineConfig,
+    AlignmentConfig,
     CompleterConfig,
     HoleConfig,
     RefineConfig,
     load_config,
     named_config,
 )
+from gscompleter.config.renamed import RENAMED
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 
@@ -23,13 +25,13 @@ def test_the_papers_numbers():
     assert (paper.registration.iterations, paper.registration.learning_rate) == (50, 0.01)
     weights = paper.registration
     assert (weights.depth_weight, weights.stereo_weight, weights.rgb_weight) == (1, 1, 0.1)
-    assert (paper.registration.step, paper.registration.footprint) == ("literal", "fixed")
+    assert (paper.registration.lr_unit, paper.registration.footprint) == ("scene", "fixed")
     assert not paper.registration.mask_occluded
     assert (paper.holes.max_alpha, paper.holes.dilation) == (0.5, 0)
     assert named_config("paper/dilation").holes.dilation == 3
     assert (paper.refine.iterations, paper.refine.learning_rate) == (30, 0.08)
     assert (paper.refine.target_weight, paper.refine.num_views) == (0.1, 2)
-    assert paper.harm.tolerance is None
+    assert paper.psnr_guard.max_drop is None
     assert not paper.registration.mask_sky
     assert paper.registration.min_ratio is None
     assert paper.anchor.min_baseline == 0
@@ -44,17 +46,17 @@ def test_every_ablation_changes_something_of_the_paper(name):
 def test_without_anything_is_without_each():
     config = named_config("none")
     assert config.anchor.selection == "nearest"
-    assert config.registration.affine.bridge == "none"
+    assert config.alignment.align_at == "none"
     assert config.registration.iterations == 0
 
 
 def test_a_yaml_file_names_only_what_differs(tmp_path):
     file = tmp_path / "mine.yaml"
-    file.write_text("base: paper\nholes: {dilation: 5}\nregistration: {affine: {bridge: none}}\n")
+    file.write_text("base: paper\nholes: {dilation: 5}\nalignment: {align_at: none}\n")
     config = load_config(str(file))
-    assert config.holes == HoleConfig(dilation=5, neighbourhood=None)
-    assert config.registration.affine == AffineConfig("none", min_agreement=None, min_merged=None)
-    assert config.registration.step == "literal"
+    assert config.holes == HoleConfig(dilation=5, candidate_radius=None)
+    assert config.alignment == AlignmentConfig("none", min_agreement=None)
+    assert config.registration.lr_unit == "scene"
 
 
 def test_a_whole_number_is_a_float_and_an_empty_file_changes_nothing(tmp_path):
@@ -66,7 +68,7 @@ def test_a_whole_number_is_a_float_and_an_empty_file_changes_nothing(tmp_path):
 
 
 def refused(path: Path, text: str, sentence: str) -> None:
-    """The file is refused at once, in a sentence of a readable length."""
+    """Check that the file is refused with one short sentence."""
     path.write_text(text)
     with pytest.raises(InputError, match=sentence) as told:
         load_config(str(path))
@@ -86,15 +88,18 @@ def refused(path: Path, text: str, sentence: str) -> None:
         ("holes: {dilation: 2.5}", "holes.dilation must be a valid integer, got 2.5"),
         ("holes: {dilation: -1}", "holes.dilation must be greater than or equal to 0, got -1"),
         ("holes: {dilation: [1, 2]}", r"holes.dilation must be a valid integer, got \[1, 2\]"),
-        ("holes: 3", "holes holds settings of its own, got 3"),
-        ("holes: [1]", r"holes holds settings of its own, got \[1\]"),
-        ("holes:", "holes holds settings of its own, got None"),
-        ("registration: {step: tiny}", "registration.step must be 'relative' or 'literal', got 't"),
+        ("holes: 3", "holes is a group of settings, got 3"),
+        ("holes: [1]", r"holes is a group of settings, got \[1\]"),
+        ("holes:", "holes is a group of settings, got None"),
+        (
+            "registration: {lr_unit: tiny}",
+            "registration.lr_unit must be 'distance' or 'scene', got",
+        ),
         ("registration: {beta1: 1}", "registration.beta1 must be less than 1, got 1"),
         ("registration: {iterations: 1000000000000}", "iterations must be less than or equal to"),
         ("registration: {learning_rate: 0}", "learning_rate must be greater than 0, got 0"),
-        ("harm: {tolerance: true}", "harm.tolerance must be a valid number, got True"),
-        ("harm: {max_trials: 0}", "no setting 'harm.max_trials'; choose one of tolerance"),
+        ("psnr_guard: {max_drop: true}", "psnr_guard.max_drop must be a valid number, got True"),
+        ("psnr_guard: {max_trials: 0}", "no setting 'psnr_guard.max_trials'; choose one of max_"),
         ("margin: .nan", "margin must be a finite number, got nan"),
         ("margin: .inf", "margin must be a finite number, got inf"),
         ("margin: -0.5", "margin must be greater than or equal to 0, got -0.5"),
@@ -171,6 +176,41 @@ def test_python_is_checked_alike_and_the_argument_is_named(config, name):
     with pytest.raises(InputError, match=name) as told:
         checked(config, "config.")
     assert told.value.argument == f"config.{name}"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("harm: {tolerance: 1}", "setting harm.tolerance is now called psnr_guard.max_drop; use"),
+        ("harm: {}", "setting harm is now called psnr_guard; use the new name"),
+        ("harm: {loss: 1}", "setting harm.loss is now called psnr_guard.loss; use"),
+        ("harm: 3", "setting harm is now called psnr_guard"),
+        (
+            "registration: {affine: {bridge: none}}",
+            "affine.bridge is now called alignment.align_at",
+        ),
+        ("registration: {affine: {a: {b: 1}}}", "registration.affine.a is now called alignment.a"),
+        (
+            "registration: {step: literal}",
+            r"called registration.lr_unit \(distance or scene\); use",
+        ),
+        ("support: {doubts: false}", r"is now called trust \(full or photometric\); use"),
+        ("contradiction: {min_difference: 1}", "called dynamic_masks.min_color_difference"),
+    ],
+)
+def test_an_old_name_is_refused_with_the_new_one(tmp_path, text, sentence):
+    refused(tmp_path / "mine.yaml", text, sentence)
+
+
+@pytest.mark.parametrize("new", RENAMED.values())
+def test_every_new_name_is_a_setting(new):
+    assert attrgetter(new)(CompleterConfig()) is not None
+
+
+def test_no_old_name_is_a_setting_still():
+    for old in RENAMED:
+        with pytest.raises(AttributeError):
+            attrgetter(old)(CompleterConfig())
 
 
 def test_an_unknown_name_or_missing_file_gets_a_sentence():

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter import GSCompleter
-from gscompleter.config import CompleterConfig, ContradictionConfig
+from gscompleter.config import CompleterConfig, DynamicMasksConfig
 from gscompleter.geometry import project, sample, unproject
 from gscompleter.stages.contradiction import contradicted
 from gscompleter.types import Camera, Completion, Render, TargetCompletion, View
@@ -42,7 +42,7 @@ def photographed() -> tuple[list[View], list[Bool[Tensor, "h w"]]]:
 @cache
 def beginning(min_difference: float | None) -> Completion:
     """Return the scene of these photographs without targets."""
-    config = CompleterConfig(contradiction=ContradictionConfig(min_difference))
+    config = CompleterConfig(dynamic_masks=DynamicMasksConfig(min_difference))
     return GSCompleter(config=config).begin(photographed()[0])
 
 
@@ -129,4 +129,4 @@ def test_the_context_stays_as_it_is():
     assert torch.equal(with_check.context.sh, without.context.sh)
     assert [b.limit for b in with_check.budgets[0]] == [b.limit for b in without.budgets[0]]
     assert all(view.contradicted is None for view in without.views)
-    assert CompleterConfig.paper().contradiction.min_difference is None
+    assert CompleterConfig.paper().dynamic_masks.min_color_difference is None

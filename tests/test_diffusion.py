@@ -190,14 +190,14 @@ def test_further_seeds_are_tried_and_the_best_is_kept(kontext_folder):
 
 
 def test_settings_reach_the_generators(kontext_folder, inpaint_folder, tmp_path):
-    chosen_settings = PEFieldSettings(str(kontext_folder), steps=3, retries=2, at_once=1)
+    chosen_settings = PEFieldSettings(str(kontext_folder), steps=3, retries=2, batch_size=1)
     generator = load_generator("pe-field", 5, settings=chosen_settings)
     assert (generator.seed, generator.steps, generator.retries) == (5, 3, 2)
     assert generator.at_once == 1
     assert generator.depth is None
     chosen = load_generator("pe-field", settings=replace(chosen_settings, depth="context"))
     assert chosen.depth is context_depth
-    assert load_generator("pe-field", settings=PEFieldSettings(chosen_settings.path)).steps == 4
+    assert load_generator("pe-field", settings=PEFieldSettings(chosen_settings.weights)).steps == 4
     network = tiny_model(tmp_path)
     with_depth = load_generator("pe-field", settings=replace(chosen_settings, depth=str(network)))
     assert isinstance(with_depth.depth, MonocularDepth)
@@ -270,13 +270,13 @@ def test_the_size_follows_the_pipeline_and_the_aspect(inpaint_folder):
 def test_a_pipeline_of_another_kind_is_refused(tmp_path, kontext_folder):
     with pytest.raises(InputError, match="has 12 heads"):
         folder = tiny_diffusion.saved(tiny_diffusion.kontext_pipeline(heads=12), tmp_path / "few")
-        load_generator("pe-field", settings=PEFieldSettings(path=str(folder)))
+        load_generator("pe-field", settings=PEFieldSettings(weights=str(folder)))
     (tmp_path / "empty").mkdir()
     empty = str(tmp_path / "empty")
     with pytest.raises(InputError, match="neither a model_index.json"):
-        load_generator("pe-field", settings=PEFieldSettings(path=empty))
+        load_generator("pe-field", settings=PEFieldSettings(weights=empty))
     with pytest.raises(InputError, match="Could not load"):
-        load_generator("diffusers-inpaint", settings=DiffusersInpaintSettings(path=empty))
+        load_generator("diffusers-inpaint", settings=DiffusersInpaintSettings(weights=empty))
 
 
 def test_a_checker_of_images_is_no_exception(tmp_path):
@@ -337,11 +337,11 @@ def test_a_smoke_test_of_a_whole_completion_with_random_weights(
     name, kontext_folder, inpaint_folder, tmp_path, monkeypatch
 ):
     folder = kontext_folder if name == "pe-field" else inpaint_folder
-    words = ["--generator", name, "--generator-path", folder]
+    words = ["--generator", name, "--generator-weights", folder]
     words += ["--generator-steps", 2, "--generator-retries", 1]
     summary = completed(tmp_path, monkeypatch, *words)
     assert summary["settings"]["generator"] == name
-    assert summary["settings"]["generator_path"] == str(folder)
+    assert summary["settings"]["generator_weights"] == str(folder)
     assert summary["settings"]["generator_steps"] == 2
     assert summary["targets"][0]["hole_fraction"] > 0
     if name == "pe-field":
@@ -356,11 +356,11 @@ def test_a_smoke_test_of_an_evaluation_with_random_weights(inpaint_folder, tmp_p
     content = {"resolution": [SIZE, SIZE], "cases": [case]}
     (tmp_path / "cases.json").write_text(json.dumps(content))
     words = ["evaluate", tmp_path / "cases.json", "--methods", "full", "--out", tmp_path / "out"]
-    words += ["--generator", "diffusers-inpaint", "--generator-path", inpaint_folder, "--quiet"]
+    words += ["--generator", "diffusers-inpaint", "--generator-weights", inpaint_folder, "--quiet"]
     assert run(monkeypatch, *words, "--generator-steps", 2, "--device", "cpu") == 0
     remembered = json.loads((tmp_path / "out" / "run.json").read_text())
     assert remembered["generator_steps"] == 2
-    assert remembered["generator_path"] == str(inpaint_folder)
+    assert remembered["generator_weights"] == str(inpaint_folder)
     (row,) = (tmp_path / "out" / "tasks").glob("*/full.json")
     assert json.loads(row.read_text())["error"] is None
 
@@ -375,7 +375,7 @@ def test_a_smoke_test_on_photographs_with_random_weights(
     folder = kontext_folder if name == "pe-field" else inpaint_folder
     command = ["complete", scene, "--context", 0, 4, "--target", 12]
     command += ["--resolution", 96, 128, "--near", 1, "--far", 100, "--device", "cpu"]
-    command += ["--generator", name, "--generator-path", folder, "--out", out, "--quiet"]
+    command += ["--generator", name, "--generator-weights", folder, "--out", out, "--quiet"]
     assert run(monkeypatch, *command) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["targets"][0]["hole_fraction"] > 0

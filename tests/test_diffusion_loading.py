@@ -24,7 +24,7 @@ from scenes import camera_at, photographed
 def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatch):
     monkeypatch.setattr(published, "PACKAGES", ("a_package_nobody_has", "torch"))
     with pytest.raises(InputError) as caught:
-        load_generator(name, settings=settings_class(name)(path="somebody/something"))
+        load_generator(name, settings=settings_class(name)(weights="somebody/something"))
     message = str(caught.value)
     assert "a_package_nobody_has" in message
     assert "torch" not in message
@@ -34,7 +34,7 @@ def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatc
 @pytest.mark.parametrize(
     ("name", "setting", "way_out"),
     [
-        ("warp-inpaint", {"path": "somebody/something"}, "choose pe-field or diffusers-inpaint"),
+        ("warp-inpaint", {"weights": "somebody/something"}, "choose pe-field or diffusers-inpaint"),
         ("oracle", {"steps": 8}, "choose pe-field or diffusers-inpaint"),
         ("pe-field", {"prompt": "a cat"}, "choose diffusers-inpaint"),
         ("diffusers-inpaint", {"depth": "monocular"}, "choose pe-field"),
@@ -44,7 +44,7 @@ def test_a_setting_that_a_generator_does_not_know_is_refused(name, setting, way_
     ((key, value),) = setting.items()
     with pytest.raises(InputError) as caught:
         GeneratorOptions(name, setting).settings()
-    assert f"{name!r} knows no {key} ({value})" in str(caught.value)
+    assert f"{name!r} has no setting {key} ({value})" in str(caught.value)
     assert way_out in str(caught.value)
     assert caught.value.argument == f"generator_{key}"
 
@@ -60,8 +60,8 @@ def test_the_settings_of_another_generator_are_refused():
         ("steps", 0, "steps must be greater than or equal to 1, got 0"),
         ("steps", 10**9, "steps must be less than or equal to 1000"),
         ("retries", -1, "retries must be greater than or equal to 0"),
-        ("at_once", 0, "at_once must be greater than or equal to 1"),
-        ("path", "", "path must have at least 1 character"),
+        ("batch_size", 0, "batch_size must be greater than or equal to 1"),
+        ("weights", "", "weights must have at least 1 character"),
         ("depth", "", "depth must have at least 1 character"),
         ("offload", True, "offload keeps parts .* and it runs on the CPU"),
     ],
@@ -76,10 +76,12 @@ def test_the_command_refuses_them_too_and_writes_nothing(tmp_path, capsys, monke
     cameras = [camera_at(x, size=32) for x in (-0.3, 0.1, 0.6)]
     photographed(tmp_path, cameras)
     words = ["complete", tmp_path, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]
-    assert run(monkeypatch, *words, "--generator-at-once", 8) == 2
+    assert run(monkeypatch, *words, "--generator-batch-size", 8) == 2
     printed = capsys.readouterr().err
-    assert "'warp-inpaint' knows no at_once (8); leave that out, or choose pe-field" in printed
-    assert "(--generator-at-once)." in printed
+    assert (
+        "'warp-inpaint' has no setting batch_size (8); leave it out, or choose pe-field" in printed
+    )
+    assert "(--generator-batch-size)." in printed
     assert not (tmp_path / "out").exists()
 
 
@@ -124,7 +126,7 @@ def test_what_is_read_twice_is_announced_once(capsys):
 
 
 def test_the_sentence_names_what_did_not_load_and_how_to_mend_it(tmp_path):
-    def message_for(source: Source, error: Exception, setting: str = "path") -> str:
+    def message_for(source: Source, error: Exception, setting: str = "weights") -> str:
         return str(cannot_load(source, error, setting))
 
     lost = IncompleteWeightsError("vae", ["a", "b", "c"])

@@ -1,4 +1,4 @@
-"""A sentence quotes what was given, and stays a sentence."""
+"""Quotes of the input in sentences."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from gscompleter.data.chunks import open_chunks
 from gscompleter.data.colmap.binary import read_images
 from gscompleter.data.point_cloud import read_point_cloud
 from gscompleter.data.upright import write_upright
-from gscompleter.errors import InputError, names_listed, numbers_listed, quoted
+from gscompleter.errors import InputError, names_listed, numbers_listed, quoted, warn_deprecated
 from gscompleter.io.image import read_pixels
 from gscompleter.weights.reading import check_kind
 
@@ -106,3 +106,14 @@ def test_every_reader_tells_a_pointer_of_git_lfs_in_the_same_words(tmp_path):
             f"{pointer} is a git-lfs pointer, not the file itself; run `git lfs pull` in its "
             "repository to fetch it."
         )
+
+
+def old_name() -> None:
+    """Act as a public function under an old name."""
+    warn_deprecated("witnesses=", "check_views=")
+
+
+def test_a_deprecated_name_warns_its_caller_and_names_the_new_one():
+    sentence = "witnesses= is deprecated and stops working in the next release; use check_views="
+    with pytest.warns(DeprecationWarning, match=sentence):
+        old_name()

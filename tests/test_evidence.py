@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from gscompleter.config import SupportConfig
+from gscompleter.config import TrustConfig
 from gscompleter.geometry import z_depths
 from gscompleter.kernels.evidence import BLOCK, LEAST
 from gscompleter.render.cpu import CpuRenderer
@@ -30,7 +30,7 @@ def expected_support(evidence, means, sums, camera, config):
     rays = normalize(means - camera.center, dim=-1).double()
     seen = normalize(means[None] - evidence.centers[:, None], dim=-1).double()
     turn = torch.rad2deg(torch.acos((seen * rays).sum(-1).clamp(-1, 1)))
-    weights = evidence.areas * (torch.exp(-((turn / config.max_turn) ** 2)) + LEAST)
+    weights = evidence.areas * (torch.exp(-((turn / config.angle_sigma) ** 2)) + LEAST)
     mean = (weights * evidence.agreement).sum(0) / weights.sum(0).clamp_min(1e-20)
     z = z_depths(means, camera).clamp_min(0.0)
     needed = sums * z**2 / (camera.K[0, 0] * camera.K[1, 1])
@@ -42,7 +42,7 @@ def expected_support(evidence, means, sums, camera, config):
 @pytest.mark.parametrize("max_turn", [20.0, 180.0])
 def test_support_is_a_mean_by_direction_times_what_is_shown(n, max_turn):
     evidence, means, sums = some_evidence(n, 5)
-    camera, config = camera_at(0.3, yaw=10), SupportConfig(max_turn=max_turn)
+    camera, config = camera_at(0.3, yaw=10), TrustConfig(angle_sigma=max_turn)
     found = support(evidence, sums, camera, config)
     wanted = expected_support(evidence, means, sums, camera, config)
     assert torch.allclose(found, wanted, rtol=1e-4, atol=1e-6)
@@ -59,7 +59,7 @@ def test_evidence_is_what_the_slopes_of_a_drawing_say():
     scene, camera = random_gaussians(60, sh_degree=0), camera_at(size=40)
     frozen = CpuRenderer().freeze(scene, camera)
     view = View(torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(1)), camera)
-    evidence = gather_evidence(scene, [view], [frozen], SupportConfig())
+    evidence = gather_evidence(scene, [view], [frozen], TrustConfig())
     sums = frozen.sums(torch.ones(40, 40, 3))[:, 0]
     z = z_depths(scene.means, camera).clamp_min(0.0)
     areas = sums * z**2 / (camera.K[0, 0] * camera.K[1, 1])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gscompleter import CompleterConfig, GSCompleter
-from gscompleter.config import AffineConfig, ExplorationConfig, RegistrationConfig
+from gscompleter.config import AlignmentConfig, NextBestViewConfig, RegistrationConfig
 from gscompleter.explorer import Explorer, with_bystanders
 from gscompleter.metrics.coverage import coverage_of, covered, held_out_cameras, looks_of
 from gscompleter.render import load_renderer
@@ -24,7 +24,7 @@ def photographs() -> list[View]:
 
 
 def explorer(**changes: float) -> Explorer:
-    config = replace(CompleterConfig(), exploration=ExplorationConfig(side=48, **changes))
+    config = replace(CompleterConfig(), next_best_view=NextBestViewConfig(image_size=48, **changes))
     return Explorer(GSCompleter(KnowingReconstructor(), KnowingGenerator(), config=config))
 
 
@@ -40,10 +40,10 @@ def cameras():
 def test_holes_count_where_they_border_on_what_was_observed():
     holes = torch.zeros(40, 40, dtype=torch.bool)
     holes[:, 20:] = True
-    near = ExplorationConfig(reach=0.1)
+    near = NextBestViewConfig(border_radius=0.1)
     assert gain(holes, 1.0, near) == pytest.approx(4 / 40)
     assert gain(holes, 0.5, near) == pytest.approx(2 / 40)
-    assert gain(holes, 1.0, ExplorationConfig(reach=1.0)) == pytest.approx(0.5)
+    assert gain(holes, 1.0, NextBestViewConfig(border_radius=1.0)) == pytest.approx(0.5)
     assert gain(torch.ones_like(holes), 1.0) == 0.0
     assert gain(torch.zeros_like(holes), 1.0) == 0.0
 
@@ -144,9 +144,11 @@ def test_cameras_that_judge_coverage_are_the_same_for_the_same_seed():
 
 
 def test_nothing_is_added_before_what_a_bystander_sees(begun):
-    """Lifted depths are a fifth too short, which only further cameras can detect."""
-    unmended = RegistrationConfig(affine=AffineConfig(bridge="none"), iterations=0)
-    completer = replace(knowing(), config=replace(CompleterConfig(), registration=unmended))
+    """What is lifted stands a fifth too near, and nothing mends that but who looks through it."""
+    config = CompleterConfig(
+        alignment=AlignmentConfig(align_at="none"), registration=RegistrationConfig(iterations=0)
+    )
+    completer = replace(knowing(), config=config)
     target = camera_at(0.7, yaw=12, size=SIZE)
     aside = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((0.5, 4), (-0.6, -4))]
     watched = with_bystanders(begun, [*cameras(), *aside])

@@ -1,4 +1,4 @@
-"""The film of a completion: its way, its frames, and the file."""
+"""The video of a completion: path, frames and file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 
 def pitched(camera: Camera, degrees: float) -> Camera:
-    """`camera` looking so much further down."""
+    """Tilt a camera downwards."""
     angle = math.radians(degrees)
     cos, sin = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[1, 0, 0], [0, cos, sin], [0, -sin, cos]])
@@ -41,14 +41,14 @@ def pitched(camera: Camera, degrees: float) -> Camera:
 
 
 def on_a_circle(degrees: float) -> Camera:
-    """A camera that stands a unit away from (0, 0, 0), which it looks at."""
+    """Return a camera one unit from the origin that faces it."""
     angle = math.radians(degrees)
     return camera_at(math.sin(angle), 0, -math.cos(angle), -degrees, size=SIZE)
 
 
 @pytest.fixture(scope="module")
 def completion() -> Completion:
-    """A room of which the right half was added at a target beside the only photograph."""
+    """A room whose right half was added at a target beside the only photograph."""
     camera = camera_at(size=SIZE)
     view, context, right = half_a_room_of(Room(), camera)
     target = camera_at(0.4, yaw=6, size=SIZE)
@@ -60,7 +60,7 @@ def completion() -> Completion:
 
 
 def decoded(path: Path) -> tuple[dict, np.ndarray]:
-    """What a file says of itself, and its frames [n, h, w, 3]."""
+    """Read the metadata and the frames [n, h, w, 3] of a video."""
     reader = imageio_ffmpeg.read_frames(str(path))
     meta = next(reader)
     width, height = meta["size"]
@@ -211,9 +211,9 @@ def test_the_same_completion_gives_the_same_bytes(completion, tmp_path):
         (tmp_path / name).mkdir()
         with shown_on(None):
             write_film(tmp_path / name, completion, photographs, renderer)
-    first, second = ((tmp_path / name / "film.mp4").read_bytes() for name in ("a", "b"))
+    first, second = ((tmp_path / name / "video.mp4").read_bytes() for name in ("a", "b"))
     assert first == second
-    _, found = decoded(tmp_path / "a" / "film.mp4")
+    _, found = decoded(tmp_path / "a" / "video.mp4")
     assert found.shape == (144, 358, 720, 3)
 
 
@@ -222,13 +222,13 @@ SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "-
 
 def test_a_completion_writes_a_film_where_it_is_asked(room, tmp_path, monkeypatch, capfd):
     out = tmp_path / "out"
-    assert run(monkeypatch, "complete", room, *SMALL, "--film", "--out", out) == 0
-    meta, found = decoded(out / "film.mp4")
+    assert run(monkeypatch, "complete", room, *SMALL, "--video", "--out", out) == 0
+    meta, found = decoded(out / "video.mp4")
     assert meta["size"] == (720, 358)
     assert len(found) == 144
     said = capfd.readouterr()
-    assert "film 1 of 73" in said.err
-    assert str(out / "film.mp4") in said.out
+    assert "video 1 of 73" in said.err
+    assert str(out / "video.mp4") in said.out
 
 
 def test_without_the_extra_nothing_is_begun(room, tmp_path, monkeypatch, capsys):
@@ -236,7 +236,7 @@ def test_without_the_extra_nothing_is_begun(room, tmp_path, monkeypatch, capsys)
     monkeypatch.setattr("gscompleter.io.video.find_spec", lambda name: None)
     with pytest.raises(InputError, match="imageio-ffmpeg"):
         check_writer()
-    assert run(monkeypatch, "complete", room, *SMALL, "--film", "--out", tmp_path / "out") == 2
+    assert run(monkeypatch, "complete", room, *SMALL, "--video", "--out", tmp_path / "out") == 2
     said = capsys.readouterr().err
     assert "pip install gscompleter[film]" in said
     assert said.count("\n") == 1

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.config import HarmConfig
+from gscompleter.config import PsnrGuardConfig
 from gscompleter.metrics.image import psnr, ssim
 from gscompleter.render import in_colours, load_renderer
 from gscompleter.stages import harm
@@ -35,7 +35,7 @@ def mse(view: View, limit: float) -> ErrorBudget:
     return ErrorBudget(view, "mse", limit)
 
 
-MENDED = HarmConfig(max_loss=None)
+MENDED = PsnrGuardConfig(max_opacity_loss=None)
 """Budgets without a limit on the lost opacity."""
 
 
@@ -170,7 +170,7 @@ def test_the_fewest_gaussians_that_suffice_are_lowered():
 def test_without_a_tolerance_nothing_is_checked():
     view, context, added = half_a_room()
     frozen = load_renderer("cpu").freeze(context, CAMERA)
-    assert do_no_harm(added, [frozen], [[mse(view, 0.0)]], HarmConfig(tolerance=None)) is added
+    assert do_no_harm(added, [frozen], [[mse(view, 0.0)]], PsnrGuardConfig(max_drop=None)) is added
 
 
 def test_half_a_decibel_is_an_error_larger_by_an_eighth():

@@ -98,7 +98,7 @@ def test_refinement_ends_where_nothing_is_to_be_gained():
     config = RefineConfig()
     _, losses = refined_by(added, frozen, shown, [], config)
     assert len(losses) == 2
-    _, losses = refined_by(added, frozen, shown, [], replace(config, min_fall=None))
+    _, losses = refined_by(added, frozen, shown, [], replace(config, rel_tol=None))
     assert len(losses) == config.iterations
 
 

@@ -130,7 +130,7 @@ def test_photographs_without_a_camera_are_named(tmp_path, monkeypatch, capsys):
     assert run(monkeypatch, "poses", blank(tmp_path / "p", 4), "--out", tmp_path / "out") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "No camera was found for 1.png; they are left out."
-    assert said[1].startswith("3 of 4 cameras and 90 points, 0.50 px off on average: ")
+    assert said[1].startswith("3 of 4 cameras and 90 points, mean error 0.50 px: ")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import torch
 
 from gscompleter.benchmark.crowding import crowded
 from gscompleter.completer import GSCompleter
-from gscompleter.config import SupportConfig
+from gscompleter.config import TrustConfig
 from gscompleter.frames.thinning import thinned
 from gscompleter.memory import BYTES_PER_SPLAT
 from gscompleter.metrics.image import psnr
@@ -138,7 +138,7 @@ def test_the_same_runs_on_any_number_of_threads(monkeypatch):
 
 def evidence_of(scene: Gaussians) -> Evidence:
     frozen = [RENDERER.freeze(scene, camera) for camera in CAMERAS]
-    return gather_evidence(scene, VIEWS, frozen, SupportConfig())
+    return gather_evidence(scene, VIEWS, frozen, TrustConfig())
 
 
 def trusted_alpha(scene: Gaussians) -> torch.Tensor:

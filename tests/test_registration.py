@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from gscompleter.config import CompleterConfig, RegistrationConfig
+from gscompleter.config import AlignmentConfig, CompleterConfig, RegistrationConfig
 from gscompleter.geometry import project, slide
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cpu import CpuRenderer
@@ -276,7 +276,6 @@ def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
 
     def moved(mask_occluded: bool) -> float:
         config = RegistrationConfig(mask_occluded=mask_occluded, rgb_weight=0.0)
-        config = replace(config, affine=replace(config.affine, bridge="none"))
         result = register(
             candidates,
             nothing_else,
@@ -286,6 +285,7 @@ def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
             renderer,
             torch.Generator(),
             config,
+            alignment=AlignmentConfig(align_at="none"),
         )
         return (result.gaussians.means[:, 2] - 4.0).abs().mean().item()
 

@@ -1,4 +1,4 @@
-"""The page on a completion and on an evaluation: what it shows, and that it needs nothing else."""
+"""Report pages of completions and evaluations: content, escaping, and no external requests."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gscompleter.reports.completion_page import completion_page
 from gscompleter.reports.depth_picture import NONE, colours, limits_of, write_depth
 from gscompleter.reports.evaluation_page import evaluation_page
 from gscompleter.reports.figures import affine_scatter, colour_scale, loss_curve, ticks, time_bars
-from gscompleter.reports.finished import Affine, TargetRow
+from gscompleter.reports.finished import Affine, TargetRow, read_finished
 from gscompleter.reports.page import data_uri, gallery_of
 from gscompleter.reports.plain_words import about_target, gain, moved, percent, shown
 from gscompleter.reports.record import MAX_LOOKS, most_changed
@@ -34,7 +34,7 @@ HOSTILE = '</script><script>alert(1)</script><img src=x onerror="alert(2)">&\''
 
 
 class Page(HTMLParser):
-    """A page as its tags, each of which has to be closed where it was opened."""
+    """Tags and words of a page; asserts that every tag is closed in order."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -69,12 +69,12 @@ class Page(HTMLParser):
 
 @pytest.fixture
 def out(completed_room, tmp_path) -> Path:
-    """A completion that may be changed."""
+    """A copy of a completion that tests may change."""
     return Path(shutil.copytree(completed_room, tmp_path / "out"))
 
 
 def changed(path: Path, change) -> None:
-    """Rewrite a JSON file as `change` leaves its content."""
+    """Apply `change` to the content of a JSON file."""
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
@@ -255,11 +255,11 @@ def a_file(out: Path) -> None:
     [
         (broken_json, "is not JSON"),
         (other_version, "was written by version 0.0.1"),
-        (a_list, "does not hold what a report needs"),
-        (wrong_type, "does not hold what a report needs (targets.0.hole_fraction"),
+        (a_list, "is damaged"),
+        (wrong_type, "is damaged (targets.0.hole_fraction"),
         (no_summary, "has no summary.json"),
         (no_record, "has no report.json"),
-        (other_record, "differ in cameras"),
+        (other_record, "list different numbers of cameras"),
         (no_folder, "There is no folder"),
         (a_file, "There is no folder"),
     ],
@@ -281,6 +281,27 @@ def row(**values) -> TargetRow:
     named = {"notes": (), "added": 5, "anchor_fallback": False} | values
     scores = dict.fromkeys(("psnr_before", "psnr_after", "ssim_before", "ssim_after"))
     return TargetRow(frame=None, anchor=0, hole_fraction=0.1, affine=affine, **scores, **named)
+
+
+def test_keys_of_the_last_release_are_read(completed_room, tmp_path):
+    names = {
+        "context": {"exposure_gain": "gain", "dynamic_fraction": "contradicted"},
+        "targets": {"derived_from": "near", "target_id": "generated"},
+    }
+    old, out = tmp_path / "old", completed_room
+    shutil.copytree(out, old)
+
+    def rename(summary: dict) -> None:
+        for group, keys in names.items():
+            summary[group] = [{keys.get(k, k): v for k, v in r.items()} for r in summary[group]]
+            summary[group][0].update({"gain": [2, 2, 2], "contradicted": 0.5, "near": 3})
+
+    changed(old / "summary.json", rename)
+    assert all(f'"{new}"' not in (old / "summary.json").read_text() for new in names["context"])
+    summary = read_finished(old).summary
+    row, target = summary.context[0], summary.targets[0]
+    assert (row.exposure_gain, row.dynamic_fraction) == ((2, 2, 2), 0.5)
+    assert target.derived_from == 3
 
 
 def test_every_fallback_is_said_once():
@@ -393,7 +414,7 @@ TABLES = {
     },
     "gain_by_distance": {"1": {"full": 2.0, "reggs": None}, "2": {"full": 1.0, "reggs": 0.5}},
     "notes": [f"reggs is not the paper's {HOSTILE}"],
-    "fid": {"values": {}, "reason": "not asked for"},
+    "fid": {"values": {}, "reason": "not requested"},
     "failures": [{"case": "b", "method": "reggs", "reason": HOSTILE}],
 }
 TIMINGS = {
@@ -427,7 +448,7 @@ def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypat
 @pytest.mark.parametrize("name", ["tables.json", "timings.json"])
 def test_damaged_tables_are_refused(evaluated, name):
     (evaluated / name).write_text('{"methods": 5}')
-    with pytest.raises(InputError, match="does not hold what a report needs"):
+    with pytest.raises(InputError, match="is damaged"):
         evaluation_page(evaluated)
 
 

@@ -113,7 +113,7 @@ def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
     assert full["hole_flip"]["value"] < 0.8 * before["hole_flip"]["value"]
     assert full["hole_haarpsi"]["value"] > before["hole_haarpsi"]["value"]
     assert 0 < full["hole_gradients"]["value"] < 10
-    assert "### Looks" in (finished / "tables.md").read_text()
+    assert "### Perceptual quality" in (finished / "tables.md").read_text()
     assert "seconds" not in json.dumps(content)
     assert set(read_json(finished / "timings.json")) == set(METHOD_NAMES)
 
@@ -178,7 +178,7 @@ def test_rows_of_a_version_that_had_fewer_scores_still_make_tables(finished, tmp
     assert now["hole_haarpsi"] == {"value": None, "cases": 0}
     text = (out / "tables.md").read_text()
     assert "HaarPSI" not in text
-    assert "scoring again adds the columns" in text
+    assert "score the run again to add the columns" in text
     assert "AbsRel" not in text
     assert "which counted no pixels, so their geometry is left out" in text
 
@@ -321,7 +321,7 @@ def test_fid_is_a_number_or_a_reason(finished, monkeypatch):
     assert calls == [[(SIZE, SIZE, 3)] * 2] * len(METHOD_NAMES)
     assert "| full | 2.00 |" in (finished / "tables.md").read_text()
     tables(finished)
-    assert "FID: not asked for" in (finished / "tables.md").read_text()
+    assert "FID: not requested" in (finished / "tables.md").read_text()
 
 
 def test_groups_of_methods():
@@ -462,7 +462,7 @@ def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
     arguments = ["evaluate", chunk.parent, "--protocol", "n-1", "n-2", "--out", out]
     assert run(monkeypatch, *arguments, "--methods", "context", "--device", "cpu") == 0
     errors = " ".join(capsys.readouterr().err.split())
-    assert "Left out wide: frame 0: its opening angle" in errors
+    assert "Skipped wide: frame 0: its opening angle" in errors
     rows = [read_json(path) for path in (out / "tasks").glob("*/*.json")]
     reasons = {row["task"]["name"]: row["error"] for row in rows}
     assert len(reasons) == 8

@@ -152,7 +152,7 @@ def options_of(command: str) -> set[str]:
         said: list[str] = []
         patch.setattr("sys.stdout.write", lambda text: said.append(text) or len(text))
         with pytest.raises(SystemExit):
-            parsed([command, "--help"])
+            parsed([command, "--help-all"])
     return set(re.findall(r"--[a-z][\w.-]*", "".join(said)))
 
 
@@ -162,7 +162,7 @@ def test_commands_within_sentences_name_what_there_is(page):
     for code in re.findall(r"`gscompleter ([a-z][^`]*)`", prose):
         command, *words = code.split()
         assert command in COMMANDS
-        named = {word for word in words if word.startswith("--") and word != "--help"}
+        named = {word for word in words if word.startswith("--")} - {"--help", "--help-all"}
         assert named <= options_of(command), code
     for code in re.findall(r"`((?:make|python|pip) [^`]+)`", prose):
         program, *words = shlex.split(code)

@@ -1,5 +1,6 @@
-"""What a completion never imports."""
+"""Start and end of the command's process."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -19,7 +20,7 @@ print(*sys.modules)
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory) -> set[str]:
-    """The modules that a quiet completion of a small room ends with."""
+    """Return the modules that a quiet completion of a small room has imported."""
     folder = tmp_path_factory.mktemp("start")
     cameras = [camera_at(x, yaw=yaw, size=32) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
     scene = photographed(folder / "room", cameras)
@@ -63,7 +64,7 @@ atexit.register(print, "done at the end")
 
 
 def ended(*words: str, **settings) -> subprocess.CompletedProcess[str]:
-    """The command as it is installed, in a process of its own."""
+    """Run the command as it is installed, in a process of its own."""
     command = [sys.executable, "-c", ENDING, *words]
     return subprocess.run(command, text=True, stderr=subprocess.PIPE, check=False, **settings)
 
@@ -78,6 +79,17 @@ def test_what_is_wrong_ends_as_ever():
     done = ended("view", "nowhere", stdout=subprocess.PIPE)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words", [("complete", "--help-all"), ("doctor", "--help"), ("--version",)]
+)
+def test_a_reader_that_ends_early_leaves_no_traceback(words):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as closed:
+        done = ended(*words, stdout=closed)
+    assert done.stderr == ""
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

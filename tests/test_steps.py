@@ -419,7 +419,7 @@ def test_the_command_runs_end_to_end(tmp_path, monkeypatch, capsys):
     arguments = ["evaluate", tmp_path, "--out", out, *by_steps, "--methods"]
     assert run(monkeypatch, *arguments, "context", "full") == 0
     captured = capsys.readouterr()
-    assert "Left out short: it has 2 frames, and sequence-1 needs 3." in " ".join(
+    assert "Skipped short: it has 2 frames, and sequence-1 needs 3." in " ".join(
         captured.err.split()
     )
     assert len(list(out.glob("sequence_long*.png"))) == 1

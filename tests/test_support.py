@@ -11,11 +11,11 @@ import torch
 from command import run
 from gscompleter.completer import GSCompleter
 from gscompleter.config import (
-    AffineConfig,
+    AlignmentConfig,
     CompleterConfig,
     ReconcileConfig,
     RegistrationConfig,
-    SupportConfig,
+    TrustConfig,
 )
 from gscompleter.geometry import inside, project
 from gscompleter.io.ply import load_ply, save_ply
@@ -85,7 +85,7 @@ def knowing(config=CompleterConfig()):
 
 
 def test_surfaces_are_supported_and_shreds_are_not():
-    evidence = gather_evidence(SCENE, VIEWS, frozen_at(VIEWS), SupportConfig())
+    evidence = gather_evidence(SCENE, VIEWS, frozen_at(VIEWS), TrustConfig())
     sums = weight_sums(AT_TARGET)
     found, drawn = support(evidence, sums, TARGET), sums > 0.1
     assert found[drawn & ~ARE_SHREDS].median() > 0.8
@@ -96,7 +96,7 @@ def test_surfaces_are_supported_and_shreds_are_not():
 @pytest.mark.parametrize("exposure", [0.8, 1.25])
 def test_another_exposure_is_no_contradiction(exposure):
     views = [replace(VIEWS[0], image=(exposure * VIEWS[0].image).clamp(0, 1)), VIEWS[1], VIEWS[2]]
-    evidence = gather_evidence(SCENE, views, frozen_at(views), SupportConfig())
+    evidence = gather_evidence(SCENE, views, frozen_at(views), TrustConfig())
     assert evidence.agreement[0, evidence.areas[0] > 0].median() > 0.8
 
 
@@ -104,7 +104,7 @@ def test_a_photograph_of_something_else_contradicts():
     image = VIEWS[1].image.clone()
     image[:, : SIZE // 4] = 0.0
     views = [VIEWS[0], replace(VIEWS[1], image=image), VIEWS[2]]
-    evidence = gather_evidence(SCENE, views, frozen_at(views), SupportConfig())
+    evidence = gather_evidence(SCENE, views, frozen_at(views), TrustConfig())
     pixels, z = project(SCENE.means, PHOTOGRAPHS[1])
     shown = (evidence.areas[1] > 0) & inside(pixels, z, PHOTOGRAPHS[1])
     left = pixels[:, 0] < SIZE // 4 - 4
@@ -158,8 +158,8 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     """Half of the room is missing in every photograph, too, so additions improve them all."""
     half = SURFACES[SURFACES.means[:, 0] < 0.3]
     paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
-    unmended = RegistrationConfig(affine=AffineConfig(bridge="none"), iterations=0)
-    config = CompleterConfig(registration=unmended)
+    unmended = AlignmentConfig(align_at="none"), RegistrationConfig(iterations=0)
+    config = CompleterConfig(alignment=unmended[0], registration=unmended[1])
     completer = GSCompleter(NearReconstructor(), paint, config=config)
     completion = completer(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
     assert len(completion.targets[0].added) > 0
@@ -204,7 +204,7 @@ def test_without_its_photographs_a_scene_is_taken_as_it_is():
 
 
 def test_unsupported_gaussians_may_be_kept():
-    config = CompleterConfig(support=SupportConfig(keep_unsupported=True))
+    config = CompleterConfig(trust_settings=TrustConfig(prune=False))
     completion = knowing(config)(VIEWS[::2], TARGET, SCENE, witnesses=())
     assert completion.set_aside is None
     assert torch.equal(completion.scene.means[: len(SCENE)], SCENE.means)
@@ -248,7 +248,7 @@ def test_what_photographs_show_by_themselves_takes_the_place_of_what_is_doubted(
     in_the_way = gaussians_of(truth, 0.8 * truth.depth)[: SIZE * SIZE // 4]
     black = sh_from_rgb(torch.zeros(len(in_the_way), 3))
     scene = merge([SURFACES, replace(in_the_way, sh=black)])
-    frozen, config = RENDERER.freeze(scene, camera), SupportConfig(max_difference=0.03)
+    frozen, config = RENDERER.freeze(scene, camera), TrustConfig(color_sigma=0.03)
     evidence, drawn = (
         gather_evidence(scene, VIEWS, frozen_at(VIEWS, scene), config),
         frozen.context,
@@ -268,7 +268,7 @@ def test_what_photographs_show_by_themselves_takes_the_place_of_what_is_doubted(
 
 def test_one_photograph_makes_no_stereo():
     drawn = RENDERER.render(SCENE, TARGET)
-    config = SupportConfig()
+    config = TrustConfig()
     assert stereo_among(VIEWS[:1], TARGET, drawn, KnowingReconstructor(), RENDERER, config) is None
 
 
@@ -325,7 +325,7 @@ def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = tmp_path / "splat.ply", tmp_path / "out"
     save_ply(splat, SCENE)
-    assert run(monkeypatch, *complete(scene, splat, out, "--keep-unsupported")) == 0
+    assert run(monkeypatch, *complete(scene, splat, out, "--no-prune")) == 0
     assert not (out / "removed.ply").exists()
     assert torch.equal(load_ply(out / "completed.ply").means[: len(SCENE)], SCENE.means)
 

@@ -271,13 +271,13 @@ def test_what_moves_on_a_real_road_does_not_count(shared, tmp_path, monkeypatch,
     root = kitti_city_segment(shared, tmp_path / "waymo", count=5, boxes=(ahead,))
     words = ("--protocol", "n-2", "--limit", 1, "--resolution", 36, 120, "--quiet")
     words = (*words, "--methods", "context")
-    for out, more in (("all", ()), ("ignoring", ("--ignore-masked",))):
+    for out, more in (("all", ()), ("ignoring", ("--use-masks",))):
         assert run(monkeypatch, "evaluate", root, *words, *more, "--out", tmp_path / out) == 0
     found = [read_json(path) for out in ("all", "ignoring") for path in row_paths(tmp_path / out)]
     every, ignoring = (row["steps"][0]["scores"] for row in found)
     assert ignoring["hole_fraction"] > every["hole_fraction"]
     bare = kitti_city_segment(shared, tmp_path / "bare", count=5)
     (bare / "lidar_box").mkdir(exist_ok=True)
-    words = (*words, "--ignore-masked", "--out", tmp_path / "bare-out")
+    words = (*words, "--use-masks", "--out", tmp_path / "bare-out")
     assert run(monkeypatch, "evaluate", bare, *words) == 2
     assert "neither masks nor boxes of what moves" in capsys.readouterr().err

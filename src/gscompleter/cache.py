@@ -1,4 +1,4 @@
-"""Where files that were fetched once are kept for all later runs."""
+"""Folder of downloaded files."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """Our cache: the folder $GSCOMPLETER_HOME, or else ~/.cache/gscompleter."""
+    """Return $GSCOMPLETER_HOME, or else ~/.cache/gscompleter."""
     home = os.environ.get("GSCOMPLETER_HOME")
     return Path(home).expanduser() if home else Path.home() / ".cache" / "gscompleter"

@@ -1,15 +1,16 @@
-"""The command line: options in, a command called, errors turned into exit codes."""
+"""Entry point of the command line: options in, a command called, exit codes out."""
 
 from __future__ import annotations
 
 import atexit
 import gc
 import os
+import select
 import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, TextIO, Union
 
 import tyro
 
@@ -43,8 +44,8 @@ from gscompleter.garbage import staying
 from gscompleter.interrupts import treat_stops_alike
 from gscompleter.threads import bound_threads
 
-# Where each command lives. Its module is imported once the arguments are known to be right, so
-# that `--help` does not wait for torch.
+# Options, module and function of each command. The module is imported after the options are
+# validated, so that `--help` does not wait for torch.
 COMMANDS: dict[str, tuple[type, str, str]] = {
     "complete": (CompleteOptions, "gscompleter.commands.complete", "run_completion"),
     "batch": (BatchOptions, "gscompleter.commands.batch", "run_batch"),
@@ -71,42 +72,64 @@ Command: Any = Union[  # noqa: UP007  (of as many as there are)
 
 
 def run() -> None:
-    """What the command `gscompleter` calls: `main`, in a process that is over with it.
+    """Run `main` and end the process at once: the command `gscompleter`.
 
-    Once all is done and said, Python would take back what it holds, torch's operators one by one,
-    which takes a fifth of a second.
+    Python would otherwise take a fifth of a second to free torch's operators.
     """
     done: list[bool] = []
-    # Whatever else is to be done at the end is registered later, and is done before.
+    # Functions that are registered later run before it.
     atexit.register(end_at_once, done)
-    main()
+    try:
+        main()
+    except BrokenPipeError:
+        if not is_closed(sys.stdout):
+            raise
+        drop(sys.stdout)
+        sys.exit(1)
     done.append(True)
 
 
 def end_at_once(done: Sequence[bool]) -> None:
-    """End the process, where what it was for is `done` and all that it said is written."""
-    if not done:
-        return
-    try:
-        sys.stdout.flush()
-        sys.stderr.flush()
-    except OSError:
-        return  # Nobody listens any more: Python says so as it always does.
-    os._exit(0)
+    """Flush the output, and end the process if it is `done`."""
+    code = 0
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            drop(stream)
+            code = 1
+        except OSError:
+            return  # Python reports it.
+    if done:
+        os._exit(code)
+
+
+def is_closed(stream: TextIO) -> bool:
+    """Return True if the reader of a pipe, such as `head`, has ended."""
+    if not hasattr(select, "poll"):  # Windows
+        return False
+    poll = select.poll()
+    poll.register(stream.fileno(), select.POLLOUT)
+    return any(events & select.POLLERR for _, events in poll.poll(0))
+
+
+def drop(stream: TextIO) -> None:
+    """Discard all further output of a stream."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def main() -> None:
-    """The command itself. Exit codes: 0 done, 2 the input is wrong, 1 anything else."""
-    # Threads of torch that spin while they wait cost a busy machine ten times the work they do.
+    """Run a command. Exit codes: 0 done, 2 wrong input, 1 anything else."""
+    # Waiting threads of torch must not spin, which slows a busy machine down ten times.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     words = sys.argv[1:]
     if words == ["--version"]:
         print(__version__)
         return
     treat_stops_alike()
-    # Python ends a second earlier where it need not search torch for garbage once more.
+    # Without a last garbage collection of torch Python ends a second earlier.
     atexit.register(gc.freeze)
-    # Pillow warns of damage in a photograph that is read all the same, or refused in a sentence.
+    # Damaged photographs are read or refused with a sentence; Pillow's warnings add nothing.
     warnings.filterwarnings("ignore", module="PIL")
     try:
         with staying():
@@ -123,11 +146,11 @@ def main() -> None:
         sys.exit(2)
     except KeyboardInterrupt as stop:
         goes_on = words[:1] in (["batch"], ["evaluate"])
-        state = "the same command goes on from here" if goes_on else "nothing was written"
+        state = "run the same command again to continue" if goes_on else "nothing was written"
         print(f"gscompleter: interrupted; {str(stop) or state}.", file=sys.stderr)
         sys.exit(130)
 
 
 def parsed(words: Sequence[str]) -> Any:
-    """The options of the command that `words` name; raises as `read_words`."""
+    """Parse the options of the command; raises as `read_words`."""
     return read_words(words, Command, COMMANDS)

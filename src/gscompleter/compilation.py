@@ -1,8 +1,7 @@
-"""Kernels compiled once for a machine, before a completion meets them one after the other.
+"""Compilation of all kernels in advance, in two processes.
 
-numba compiles one kernel at a time in a process. Two processes share the parts that have some:
-this one, and one that is begun before torch is imported here. Every command reads this file, so
-that it imports what takes long only where it needs it.
+numba compiles one kernel at a time in a process. Every command imports this module, so it imports
+slow packages only where it needs them.
 """
 
 from __future__ import annotations
@@ -18,13 +17,12 @@ from gscompleter.garbage import staying
 from gscompleter.threads import threads
 
 BROUGHT = "brought"
-"""The part that only scenes need that are brought."""
+"""Part that only input splats need."""
 DRAWING = "cpu", BROUGHT
-"""Parts that one process rehearses while another has the rest, which takes about as long."""
+"""Parts that one process compiles while another compiles the rest."""
 MODELS = "warp-inpaint", "plane-sweep"
-"""The rest. Its models draw, too, and find what drawing compiled."""
 PARTS = *DRAWING, *MODELS
-"""All parts that have kernels, in the order in which they are rehearsed."""
+"""All parts with kernels, in the order of compilation."""
 
 APART = """
 import sys
@@ -34,23 +32,20 @@ with staying():
     for part in sys.argv[1:]:
         rehearse(part)
 """
-"""What a process runs that rehearses parts; numba compiles a tenth faster in it."""
+"""Program of the second process. numba compiles a tenth faster in the block."""
 
 COMPILING = "compiling kernels for this machine, once"
-"""What it is called while it goes on."""
 SECONDS = 30
-"""About what all of them take together on one core."""
+"""Approximate seconds for all parts on one core."""
 
 Process = subprocess.Popen[bytes]
 _begun: dict[str, Process] = {}
-"""The process that rehearses each part that was begun ahead, until it is waited for."""
 
 
 def begin(names: Iterable[str]) -> None:
-    """Begin to compile, in another process, what the models of these names need and lack.
+    """Start to compile missing kernels of these models in another process.
 
-    It is to go on while torch is imported here; `compile_kernels` waits for it. It ends with this
-    process, if not before.
+    `compile_kernels` waits for it. It ends with this process at the latest.
     """
     wanted = [part for part in MODELS if part in names]
     if not wanted or threads() == 1:
@@ -65,14 +60,7 @@ def begin(names: Iterable[str]) -> None:
 
 
 def compile_kernels(names: Sequence[str]) -> float | None:
-    """Compile what the parts of these names need, where it is not there yet.
-
-    Returns:
-        The seconds that it took, or None where nothing was to be done.
-
-    Raises:
-        subprocess.CalledProcessError: where a process fails; it has said why.
-    """
+    """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
     from gscompleter.kernels.compiled import is_compiled
     from gscompleter.progress import expecting, stage
 
@@ -91,7 +79,7 @@ def compile_kernels(names: Sequence[str]) -> float | None:
 
 
 def shares_of(names: Sequence[str], count: int) -> tuple[list[str], list[str]]:
-    """What this process rehearses, and what another does where there are as many as `count`."""
+    """Split the parts between this process and another, if there are several threads."""
     own = [name for name in names if name in DRAWING]
     rest = [name for name in names if name in MODELS]
     if any(name in _begun for name in rest) or (own and count > 1):
@@ -101,7 +89,7 @@ def shares_of(names: Sequence[str], count: int) -> tuple[list[str], list[str]]:
 
 @contextmanager
 def rehearsed_apart(names: Sequence[str]) -> Iterator[None]:
-    """Rehearse parts in another process meanwhile; those that are begun there are waited for."""
+    """Compile parts in another process during the block, or wait for those started early."""
     new = [name for name in names if name not in _begun]
     processes = {_begun.pop(name) for name in names if name in _begun}
     if new:
@@ -117,12 +105,12 @@ def rehearsed_apart(names: Sequence[str]) -> Iterator[None]:
 
 
 def begun_apart(names: Sequence[str]) -> Process:
-    """A process that rehearses parts. It stands aside of Ctrl-C, for this one stops it."""
+    """Start a process that compiles parts. It ignores Ctrl-C; this process stops it."""
     command = [sys.executable, "-c", APART, *names]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
 
 
 def stopped(process: Process) -> None:
-    """Whatever it does, it is over when this returns."""
+    """Kill a process and wait for its end."""
     process.kill()
     process.wait()

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from gscompleter.config import CompleterConfig, RegistrationConfig
+from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError
 from gscompleter.frames.thinning import thinned
@@ -236,7 +236,7 @@ class GSCompleter:
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
             completion = Completion(rendered, scene, views, (), (), {}, others, proxy=proxy)
-            if witnesses is not None and self.config.support.doubts:
+            if witnesses is not None and self.config.trust == "photometric":
                 completion = self.doubted(completion)
             completion = self.judged(completion)
         return replace(completion, seconds=clock.seconds)
@@ -302,14 +302,14 @@ class GSCompleter:
             if reference is None:
                 (reference,) = self.synthesize([sight], contexts_of(frozen_views))
         result = replace(result, reference=View(sight.window.crop(reference.image), target))
-        if reference.disagrees and self.config.harm.max_loss is not None:
+        if reference.disagrees and self.config.psnr_guard.max_opacity_loss is not None:
             return replace(result, notes=(*reference.notes, NOTHING_ADDED))
         with clock("lift"):
             lifted = self.lift(sight, reference)
         with clock("register"):
             registration = self.register(sight, lifted, reference, frozen_views)
         at_anchor = frozen_views[sight.anchor.index].context
-        fit, settings = registration.affine, self.config.registration.affine
+        fit, settings = registration.affine, self.config.alignment
         pairs = compared_depths(lifted, sight.frozen.context, at_anchor, fit, settings)
         everything = registration.gaussians if self.keep_registered else None
         result = replace(result, affine=fit, pairs=pairs, registered=everything)
@@ -405,7 +405,7 @@ class GSCompleter:
 
     def lift(self, sight: Sight, reference: Synthesized) -> Lift:
         """Lift the pixels near holes to Gaussians in the antialiasing mode of the scene."""
-        radius = self.config.holes.neighbourhood
+        radius = self.config.holes.candidate_radius
         pixel_mask = None if radius is None else dilate(self.holes(sight), radius)
         lifted = lift(self.reconstructor, reference, sight.anchor_view, pixel_mask)
         scene, gaussians = sight.completion.drawn, lifted.gaussians
@@ -427,20 +427,18 @@ class GSCompleter:
             sight.anchor_view.camera,
             self.renderer,
             torch.Generator().manual_seed(self.seed),
-            self.registration(sight),
+            self.config.registration,
             self.config.holes.max_alpha,
+            self.config.alignment,
+            self.reject_below(sight),
         )
 
-    def registration(self, sight: Sight) -> RegistrationConfig:
-        """Return the settings of registration.
+    def reject_below(self, sight: Sight) -> float | None:
+        """Return the depth agreement that a target needs.
 
-        An input splat may be wrong at the target, so it rejects no depths; error budgets decide
-        there.
+        With photometric trust it needs none: where the scene is wrong, right depths differ from it.
         """
-        config = self.config.registration
-        if sight.believed is None:
-            return config
-        return replace(config, affine=replace(config.affine, min_merged=None))
+        return self.config.depth_agreement.reject_below if sight.believed is None else None
 
     def keep(
         self,
@@ -452,7 +450,7 @@ class GSCompleter:
         """Keep registered Gaussians in holes, outside of observed free space (stage 4)."""
         mask = dilate(self.holes(sight), self.config.holes.dilation)
         padded, views = sight.window.wide, sight.completion.views
-        side, earlier = self.config.exploration.side, sight.completion.targets
+        side, earlier = self.config.next_best_view.image_size, sight.completion.targets
         completed_cameras = [result.target for result in earlier if len(result.added)]
         small_cameras = [
             shrunk(camera, side) for camera in (*sight.completion.bystanders, *completed_cameras)
@@ -521,7 +519,7 @@ class GSCompleter:
                 kept, sight.frozen, reference, holes, plans, first_budgets, settings
             )
             images = [in_colours(plan, refined.sh) for plan in plans]
-        return do_no_harm(refined, frozen, budgets, config.harm, images), losses
+        return do_no_harm(refined, frozen, budgets, config.psnr_guard, images), losses
 
     def sight(self, completion: Completion, target: Camera, wide: Camera | None = None) -> Sight:
         """Render the scene at a target, padded if a hole reaches the border.
@@ -551,7 +549,7 @@ class GSCompleter:
         if config.min_overlap == 0:
             return select_anchor(target, views, config)
         cameras = [
-            shrunk(c, self.config.exploration.side)
+            shrunk(c, self.config.next_best_view.image_size)
             for c in (target, *(view.camera for view in views))
         ]
         seen, *at_views = self.small_renders(completion, cameras)
@@ -572,7 +570,7 @@ class GSCompleter:
             drawn,
             self.reconstructor,
             self.renderer,
-            self.config.support,
+            self.config.trust_settings,
         )
 
     def believed(
@@ -590,7 +588,7 @@ class GSCompleter:
         """Compute the trust of every rendered Gaussian; generated and invisible ones have 1."""
         sums, kept = weight_sums(frozen), completion.num_kept
         seen = in_context(completion, sums[:kept])
-        trust = support(evidence, seen, camera, self.config.support)
+        trust = support(evidence, seen, camera, self.config.trust_settings)
         values = torch.ones_like(sums)
         values[:kept] = of_kept(completion, trust)
         return values
@@ -599,7 +597,7 @@ class GSCompleter:
         """Add the photographs' observations of an input splat, before any target."""
         views, scene = completion.photographs, completion.drawn
         frozen_views = self.at(completion, views)
-        observations = gather_evidence(scene, views, frozen_views, self.config.support)
+        observations = gather_evidence(scene, views, frozen_views, self.config.trust_settings)
         return replace(completion, evidence=observations)
 
     def without_unsupported(self, sight: Sight) -> Sight:
@@ -607,8 +605,8 @@ class GSCompleter:
 
         Without check views nothing is pruned, as other photographs may show those Gaussians.
         """
-        completion, config = sight.completion, self.config.support
-        if completion.evidence is None or not completion.witnesses or config.keep_unsupported:
+        completion, config = sight.completion, self.config.trust_settings
+        if completion.evidence is None or not completion.witnesses or not config.prune:
             return sight
         occluders = self.unseen_in_holes(sight, completion.evidence)
         if not occluders.any():
@@ -655,7 +653,7 @@ class GSCompleter:
     def wary_of_what_moved(self, completion: Completion) -> Completion:
         """Add dynamic masks to the context views."""
         views, renders = completion.views, contexts_of(self.at(completion, completion.views))
-        masks = contradicted(views, renders, self.config.contradiction)
+        masks = contradicted(views, renders, self.config.dynamic_masks)
         return replace(
             completion,
             views=tuple(
@@ -666,8 +664,8 @@ class GSCompleter:
 
     def judged(self, completion: Completion) -> Completion:
         """Add the error budgets of all photographs, before any target."""
-        config = self.config.harm
-        tolerance = 0.0 if completion.evidence is not None else config.tolerance or 0.0
+        config = self.config.psnr_guard
+        tolerance = 0.0 if completion.evidence is not None else config.max_drop or 0.0
         renders = contexts_of(self.at(completion, completion.photographs))
         budgets = tuple(
             error_budgets(
@@ -675,7 +673,7 @@ class GSCompleter:
                 render.image,
                 hole_mask(render.alpha, self.config.holes),
                 tolerance,
-                config.ssim_tolerance,
+                config.max_ssim_drop,
             )
             for view, render in zip(completion.photographs, renders, strict=True)
         )

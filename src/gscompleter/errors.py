@@ -1,6 +1,7 @@
-"""What the user is told when the input is wrong."""
+"""Errors for the user, and the sentences that they hold."""
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -8,29 +9,27 @@ from pathlib import Path
 from reprlib import Repr
 
 PROGRAM = "gscompleter: "
-"""Printed before every error message."""
+"""Prefix of every error message."""
 LONGEST_MESSAGE = 300
-"""Characters of an error message as the command line prints it."""
+"""Most characters of an error message on the command line."""
 LONGEST_QUOTE = 60
-"""Characters of the input that a sentence quotes at most."""
+"""Most characters of a value quoted in a sentence."""
 LONGEST_PATH = 250
-"""The same of a path, which one may want to copy."""
+"""Most characters of a quoted path."""
 
 POINTER = b"version https://git-lfs"
-"""How a pointer of git-lfs begins."""
 
 
 class InputError(ValueError):
-    """The input is wrong, and the user can mend it.
+    """An error in the input, which the user can correct.
 
-    Its message is one sentence: what was given, what is needed, what to do. The command
-    line prints it without a traceback and exits with code 2. Whatever the message holds, it is
-    shown on one line, whose length with the names of program and option is `LONGEST_MESSAGE`.
+    Its message is one sentence: what was given, what is needed, what to do. The command line prints
+    it without a traceback and exits with code 2. It is shown on one line of at most
+    `LONGEST_MESSAGE` characters.
     """
 
     def __init__(self, message: str, argument: str | None = None) -> None:
-        """The `argument` of the function, or the name of the setting, that the user can mend. The
-        command line names its option of that name."""
+        """Create the error; the command line adds the option named `argument` to its sentence."""
         super().__init__(message)
         self.argument = None if argument is None else quoted(argument)
 
@@ -40,22 +39,28 @@ class InputError(ValueError):
 
 
 class OutputError(InputError):
-    """A result cannot be written: nothing else could be written there either."""
+    """An error while writing results, which affects all of them."""
+
+
+def warn_deprecated(old: str, new: str) -> None:
+    """Warn the caller of a function that used an old name of the public interface."""
+    warnings.warn(
+        f"{old} is deprecated and stops working in the next release; use {new}.",
+        DeprecationWarning,
+        stacklevel=3,
+    )
 
 
 def quoted(value: object, length: int | None = None) -> str:
-    """What was given as a sentence can hold it: on one line, its middle left out if it is long.
+    """Format a value for a sentence: on one line, with its middle left out if it is long.
 
-    A string stands in it without quotation marks; write `f"'{quoted(word)}'"` where it needs some.
-
-    Args:
-        value: Anything; strings and paths as they are, other values as Python writes them.
-        length: Most characters that are returned; if left out, as many as such a value gets.
+    Strings get no quotation marks; write `f"'{quoted(word)}'"` to add them. `length` limits the
+    characters; by default it depends on the type.
     """
     if length is None:
         length = LONGEST_PATH if isinstance(value, os.PathLike) else LONGEST_QUOTE
     text = str(value) if isinstance(value, (str, os.PathLike)) else _written(value)
-    # Twice as many characters as are wanted at either end are enough, whatever is left out.
+    # Only the ends of very long texts are processed.
     ends = text if len(text) <= 4 * length else text[: 2 * length] + text[-2 * length :]
     line = "".join(c if c.isprintable() else " " for c in ends)
     if len(text) <= length:
@@ -67,8 +72,8 @@ def quoted(value: object, length: int | None = None) -> str:
 def shortened(message: str, most: int) -> str:
     """Fit a message into one line of `most` characters.
 
-    The longest words, such as paths, are cut first, then the middle of the message. An address is
-    of no use in part, and is cut last.
+    The longest words, such as paths, are shortened first, then the middle of the message, and URLs
+    last.
     """
     line = " ".join(part.strip() for part in message.splitlines())
     words = quoted(line, 100 * most).split(" ")
@@ -82,13 +87,13 @@ def shortened(message: str, most: int) -> str:
 
 
 def names_listed(names: Sequence[object], most: int, length: int | None = None) -> str:
-    """Write the first `most` names for a sentence, each `quoted`, as in "a, b and 7 more"."""
+    """List the first `most` names, as in "a, b and 7 more"."""
     shown = ", ".join(quoted(name, length) for name in names[:most])
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
 
 def numbers_listed(numbers: Iterable[int]) -> str:
-    """Write whole numbers for a sentence, the first three runs, as in "0-39, 52 and 12 others"."""
+    """List the first three runs of numbers, as in "0-39, 52 and 12 others"."""
     found = sorted(set(numbers))
     starts = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(found)) if b != a + 1), len(found)]
     runs = [found[start:stop] for start, stop in pairwise(starts)]
@@ -98,13 +103,7 @@ def numbers_listed(numbers: Iterable[int]) -> str:
 
 
 def refuse_pointer(path: Path) -> None:
-    """Refuse what git-lfs leaves in place of a file until it is fetched.
-
-    Whatever else may be wrong with the file is left to those who read it.
-
-    Raises:
-        InputError: where the file is such a pointer.
-    """
+    """Raise InputError for a git-lfs pointer in place of the file itself."""
     if not os.path.isfile(path):
         return
     with suppress(OSError), path.open("rb") as file:
@@ -122,7 +121,6 @@ _REPR.maxlong = 4 * LONGEST_QUOTE
 
 
 def _written(value: object) -> str:
-    """Write a value as Python does, as far as a sentence can hold it."""
     if isinstance(value, int) and value.bit_length() > 4 * LONGEST_QUOTE:
         return f"an integer of about {value.bit_length() * 0.30103:,.0f} digits"
     try:

@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.completer import Clock, GSCompleter
-from gscompleter.config import ExplorationConfig
+from gscompleter.config import NextBestViewConfig
 from gscompleter.geometry import same_camera
 from gscompleter.progress import stage, track
 from gscompleter.render import each_view
@@ -58,9 +58,9 @@ class Explorer:
     completer: GSCompleter
 
     @property
-    def config(self) -> ExplorationConfig:
+    def config(self) -> NextBestViewConfig:
         """Settings of the planner."""
-        return self.completer.config.exploration
+        return self.completer.config.next_best_view
 
     def explore(
         self, completion: Completion, cameras: Sequence[Camera], count: int
@@ -154,7 +154,7 @@ class Explorer:
 
     def look(self, completion: Completion, camera: Camera) -> Look:
         """Render the scene at a camera in a small image."""
-        camera = shrunk(completion.ranged(camera), self.config.side)
+        camera = shrunk(completion.ranged(camera), self.config.image_size)
         frozen = self.completer.renderer.freeze(completion.drawn, camera)
         render, trusted = frozen.context, self.completer.believed(completion, frozen, camera)
         alpha = render.alpha if trusted is None else trusted

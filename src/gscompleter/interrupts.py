@@ -1,4 +1,4 @@
-"""Being told to stop: by Ctrl-C, by `kill`, by a scheduler, by a terminal that is closed."""
+"""Interrupts: Ctrl-C, `kill`, a scheduler, or a closed terminal."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from types import FrameType
 
 
 def treat_stops_alike() -> None:
-    """Let SIGTERM and SIGHUP raise KeyboardInterrupt, as Ctrl-C does, so that all is cleaned up.
+    """Let SIGTERM and SIGHUP raise KeyboardInterrupt, so that everything is cleaned up.
 
-    A signal that somebody ignores (`nohup`) or handles already is left as it is. Python allows
-    this in the main thread alone.
+    Signals that are ignored (`nohup`) or handled already stay so. This works in the main thread
+    only.
     """
     for name in ("SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)  # Windows has no SIGHUP
@@ -23,16 +23,9 @@ def treat_stops_alike() -> None:
 
 @contextmanager
 def stops_deferred(state: str = "") -> Iterator[None]:
-    """Let what raises KeyboardInterrupt wait until the end of the block.
+    """Defer KeyboardInterrupt to the end of the block, in the main thread.
 
-    For a few steps that belong together, such as publishing results and removing what they
-    replace. Outside of the main thread nothing is interrupted, and nothing is changed.
-
-    Args:
-        state: What the interrupt then says of the results, where it is not what is usual.
-
-    Raises:
-        KeyboardInterrupt: at the end, if there was a reason meanwhile.
+    `state` is its message, if it differs from the usual one.
     """
     came: list[int] = []
 

@@ -1,10 +1,4 @@
-"""What goes on, how far it is and how long it still takes, shown where somebody watches.
-
-The command line turns it on, a library call stays silent.
-
-A terminal has one line that lives, a log a line for each stage and one every few seconds of a long
-one. Nothing of it goes to standard output, where the results are.
-"""
+"""Progress on stderr: a live line on a terminal, otherwise log lines."""
 
 from __future__ import annotations
 
@@ -25,42 +19,39 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 LOG_SECONDS = 10.0
-"""After as many seconds a log is told again what goes on."""
+"""Seconds between log lines of a long stage."""
 REFRESHES = 4
-"""How often in a second the line on a terminal is drawn."""
 BAR_WIDTH = 24
-"""Characters of the bar on a terminal."""
 OVERDUE = 0.1
-"""What takes longer than was expected takes this share of its time more, until it is done."""
+"""Remaining share of the elapsed time if a stage takes longer than expected."""
 
 
 @dataclass(eq=False)
 class Activity:
-    """Something that goes on: a stage, or as many steps as were counted in advance."""
+    """A running stage, or a number of counted steps."""
 
     name: str
     total: int | None = None
-    """How many steps it has; None for a stage."""
+    """Number of steps; None for a stage."""
     done: int = 0
-    """Steps that are done."""
     prepares: bool = False
-    """Whether a log hears of it only where it takes long."""
+    """True if a log shows it only if it takes long."""
     begun: float = field(default_factory=lambda: time.monotonic())
     last: float = field(default_factory=lambda: time.monotonic())
-    """When the last of the steps was done, in seconds."""
+    """Time of the last finished step, in seconds."""
 
     def label(self) -> str:
-        """What it is called, and the number of the step."""
+        """Return the name, with the number of the current step."""
         if self.total is None:
             return self.name
         return f"{self.name} {min(self.done + 1, self.total)} of {self.total}"
 
     def stepped(self) -> None:
-        """One more step is done."""
+        """Count a finished step."""
         self.done, self.last = self.done + 1, time.monotonic()
 
     def left(self, now: float, expected: float | None = None) -> float | None:
-        """About how many seconds it still takes: by the steps that are done, or as `expected`."""
+        """Estimate the remaining seconds from the finished steps or from `expected`."""
         if self.total is not None and self.done > 0:
             each = (self.last - self.begun) / self.done
             return max(each * (self.total - self.done) - (now - self.last), 0.0)
@@ -70,32 +61,30 @@ class Activity:
 
 @dataclass
 class Work:
-    """All that goes on, the outermost first, and what is expected to come."""
+    """All running activities, the outermost first, and the expected stages."""
 
     going: list[Activity] = field(default_factory=list)
     expected: Sequence[tuple[str, float]] = ()
-    """Stages in their order, and the seconds that each is expected to take."""
+    """Expected stages in order, with seconds each."""
     is_timed: bool = True
-    """True if these are seconds; else only their ratios count."""
+    """True if these are seconds; otherwise relative times."""
     position: int = 0
-    """How many of these are behind."""
     planned: Activity | None = None
-    """That of them which goes on."""
     begun: float = 0.0
-    """When the first of them began to be expected, in seconds."""
+    """Start of the expected stages, in seconds."""
     pace: float = 1.0
-    """By how much longer than expected those took that are behind."""
+    """Measured relative to expected time of the finished stages."""
     reached: float = 0.0
-    """The largest share of what is expected that was told to be done: it never goes back."""
+    """Largest fraction shown so far; it never decreases."""
 
     def expect(self, expected: Sequence[tuple[str, float]], is_timed: bool = True) -> None:
-        """From now on, these stages are expected."""
+        """Set the expected stages."""
         self.is_timed = is_timed
         self.expected, self.position, self.planned = expected, 0, None
         self.begun, self.pace, self.reached = time.monotonic(), 1.0, 0.0
 
     def begin(self, activity: Activity) -> None:
-        """`activity` goes on, inside of what goes on already."""
+        """Start an activity inside the running ones."""
         self.going.append(activity)
         names = [name for name, _ in self.expected]
         if self.planned is None and activity.name in names[self.position :]:
@@ -103,7 +92,7 @@ class Work:
             self.planned = activity
 
     def end(self, activity: Activity) -> None:
-        """`activity` is over, and whatever went on inside of it."""
+        """End an activity and all inside it."""
         if activity not in self.going:
             return
         del self.going[self.going.index(activity) :]
@@ -113,7 +102,7 @@ class Work:
             self.pace = (time.monotonic() - self.begun) / behind
 
     def description(self) -> str:
-        """What goes on. Steps inside of a stage are known by its name."""
+        """Describe the running activities. Steps inside a stage are hidden."""
         return ": ".join(
             activity.label()
             for index, activity in enumerate(self.going)
@@ -121,16 +110,16 @@ class Work:
         )
 
     def counted(self) -> Activity | None:
-        """The outermost of what goes on whose steps are counted."""
+        """Return the outermost running activity with counted steps."""
         return outermost_counted(self.going)
 
     def spent(self) -> float:
-        """Seconds since it began: what was expected, or else the outermost of what goes on."""
+        """Return the seconds since the start of the expected stages or the outermost activity."""
         begun = self.begun if self.expected else self.going[0].begun
         return time.monotonic() - begun
 
     def left(self) -> float | None:
-        """About how many seconds all of it still takes; None where nothing tells."""
+        """Estimate the remaining seconds of everything, or return None if unknown."""
         now = time.monotonic()
         if not (self.expected and self.is_timed):
             counted = self.counted()
@@ -141,7 +130,7 @@ class Work:
         return sum(ahead, 0.0)
 
     def share(self) -> float | None:
-        """How much of it is done, from 0 to 1; None where nothing tells."""
+        """Estimate the finished fraction of everything, or return None if unknown."""
         if not self.expected:
             return counted_share(self.going)
         if self.is_timed:
@@ -153,7 +142,7 @@ class Work:
         return self.reached
 
     def share_of_stages(self) -> float:
-        """Return the share of the expected stages that is done, counted steps inside included."""
+        """Return the finished fraction of the expected stages, with steps inside."""
         seconds = [seconds for _, seconds in self.expected]
         done = sum(seconds[: self.position])
         if self.planned is not None:
@@ -162,43 +151,46 @@ class Work:
         return done / max(sum(seconds), 1e-9)
 
     def sentence(self) -> str:
-        """All of this in a line."""
+        """Format everything as one line."""
         left, share, spent = self.left(), self.share(), self.spent()
-        told = [
+        parts = [
             *([] if share is None else [f"{share:.0%}"]),
             *([f"{in_words(spent)} so far"] if spent >= 1 else []),
             *([] if left is None else [f"about {in_words(left)} left"]),
         ]
-        return ": ".join([self.description(), *([", ".join(told)] if told else [])])
+        return ": ".join([self.description(), *([", ".join(parts)] if parts else [])])
 
 
 def outermost_counted(activities: Sequence[Activity]) -> Activity | None:
-    """Return the outermost of `activities` whose steps are counted; None where there is none."""
+    """Return the outermost activity with counted steps, if any."""
     return next((a for a in activities if a.total is not None), None)
 
 
 def counted_share(activities: Sequence[Activity]) -> float | None:
-    """Return the share of its steps that this one has done; None where there is none."""
+    """Return the finished fraction of its steps, if any."""
     counted = outermost_counted(activities)
     return None if counted is None else counted.done / max(counted.total or 0, 1)
 
 
 @runtime_checkable
 class Display(Protocol):
-    """Shows what goes on, as long as anything does."""
+    """Display of the running activities."""
 
-    def start(self) -> None: ...
+    def start(self) -> None:
+        """Begin to show activities."""
 
-    def changed(self) -> None: ...
+    def changed(self) -> None:
+        """Show a change."""
 
-    def stop(self) -> None: ...
+    def stop(self) -> None:
+        """End the display."""
 
 
 class Line:
-    """A line of a terminal that lives until all is done, and leaves nothing behind."""
+    """A live line on a terminal, which disappears at the end."""
 
     def __init__(self, console: Console, work: Work) -> None:
-        # Here, so that what shows nothing does not wait for it.
+        # Imported here because a log does not need it.
         from rich.live import Live
         from rich.spinner import Spinner
 
@@ -212,16 +204,18 @@ class Line:
         )
 
     def start(self) -> None:
+        """Begin to show activities."""
         self._live.start()
 
     def changed(self) -> None:
+        """Show a change."""
         self._live.refresh()
 
     def stop(self) -> None:
+        """End the display."""
         self._live.stop()
 
     def _row(self) -> Table:
-        """The line: what goes on, a bar, the share, the time, and what is left of it."""
         from rich.progress_bar import ProgressBar
         from rich.table import Table
         from rich.text import Text
@@ -230,7 +224,7 @@ class Line:
         if not work.going:
             return row
         left, share = work.left(), work.share()
-        # Alone what goes on may be cut, where the terminal is narrow.
+        # On a narrow terminal only the name is shortened.
         name = Text(work.description(), no_wrap=True, overflow="ellipsis")
         cells: list[RenderableType] = [self._spinner, name]
         if share is not None:
@@ -245,7 +239,7 @@ class Line:
 
 
 class Log:
-    """Lines of a file: one for each stage, and one every `LOG_SECONDS` of a long one."""
+    """Log lines: one per stage, and one every `LOG_SECONDS`."""
 
     def __init__(self, console: Console, work: Work) -> None:
         self._console, self._work = console, work
@@ -253,16 +247,19 @@ class Log:
         self._over = Event()
 
     def start(self) -> None:
+        """Begin to show activities."""
         self._over, self._when = Event(), time.monotonic()
         Thread(target=self._repeat, args=(self._over,), daemon=True).start()
 
     def changed(self) -> None:
+        """Print a new stage."""
         description = self._work.description()
         if description != self._said and not any(a.prepares for a in self._work.going):
             self._said = description
             self._print()
 
     def stop(self) -> None:
+        """End the display."""
         self._over.set()
 
     def _print(self) -> None:
@@ -271,7 +268,6 @@ class Log:
         self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
     def _repeat(self, over: Event) -> None:
-        """Say again what goes on, until it is over."""
         while not over.wait(max(self._when + LOG_SECONDS - time.monotonic(), 0.01)):
             if time.monotonic() >= self._when + LOG_SECONDS and self._work.going:
                 self._print()
@@ -279,7 +275,7 @@ class Log:
 
 @dataclass(frozen=True)
 class Shown:
-    """What goes on, and where it is shown."""
+    """Running activities and their display."""
 
     console: Console
     work: Work
@@ -287,7 +283,7 @@ class Shown:
 
     @contextmanager
     def doing(self, activity: Activity) -> Iterator[None]:
-        """Show `activity` while it goes on."""
+        """Show an activity during the block."""
         outermost = not self.work.going
         self.work.begin(activity)
         try:
@@ -307,7 +303,7 @@ _listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener", def
 
 @contextmanager
 def shown_on(console: Console | None) -> Iterator[None]:
-    """Show what goes on inside on `console`; None hides it."""
+    """Show activities of the block on `console`; None hides them."""
     shown = None if console is None else on_console(console)
     token = _shown.set(shown)
     try:
@@ -321,7 +317,7 @@ def shown_on(console: Console | None) -> Iterator[None]:
 
 @contextmanager
 def stages_heard_by(listener: Callable[[str], None]) -> Iterator[None]:
-    """Let `listener` hear the name of each stage that begins in everything called inside."""
+    """Call `listener` with the name of each stage that begins during the block."""
     token = _listener.set(listener)
     try:
         yield
@@ -330,13 +326,13 @@ def stages_heard_by(listener: Callable[[str], None]) -> Iterator[None]:
 
 
 def on_console(console: Console) -> Shown:
-    """What shows it on a terminal, or in a log."""
+    """Choose the display for a console."""
     work, lives = Work(), console.is_terminal and not console.is_dumb_terminal
     return Shown(console, work, Line(console, work) if lives else Log(console, work))
 
 
 def stage(name: str) -> AbstractContextManager[None]:
-    """Show that what is called inside goes on, by this name, and let a listener hear of it."""
+    """Show a stage during the block, and notify the listener."""
     listener = _listener.get()
     if listener is not None:
         listener(name)
@@ -344,14 +340,13 @@ def stage(name: str) -> AbstractContextManager[None]:
 
 
 def preparing(name: str) -> AbstractContextManager[None]:
-    """Show that something is read and checked inside. A log hears of it only where it takes long:
-    of wrong input there is a sentence, and nothing else."""
+    """Show a preparation during the block; a log shows it only if it takes long."""
     return going_on(Activity(name, prepares=True))
 
 
 @contextmanager
 def going_on(activity: Activity) -> Iterator[None]:
-    """Show `activity` where anything is shown."""
+    """Show an activity during the block, if a display is active."""
     shown = _shown.get()
     if shown is None:
         yield
@@ -361,13 +356,13 @@ def going_on(activity: Activity) -> Iterator[None]:
 
 
 def track(items: Sequence[T], description: str) -> Iterable[T]:
-    """`items`, one after the other; it is shown how many are done, and how long the others take."""
+    """Show the progress while iterating over items."""
     shown = _shown.get()
     return items if shown is None else counted(items, description, shown)
 
 
 def counted(items: Sequence[T], description: str, shown: Shown) -> Iterator[T]:
-    """`items`, counted where they are shown."""
+    """Count items on a display while iterating over them."""
     activity = Activity(description, len(items))
     with shown.doing(activity):
         for item in items:
@@ -377,14 +372,13 @@ def counted(items: Sequence[T], description: str, shown: Shown) -> Iterator[T]:
 
 @contextmanager
 def expecting(seconds: Sequence[tuple[str, float]], is_timed: bool = True) -> Iterator[None]:
-    """Tell by the stages that are to come how much is done, and how long all of them take.
+    """Set the expected stages of the block, to estimate the remaining time.
 
     Args:
-        seconds: By their names, the stages or counted steps that follow inside, in their order,
-            and about how many seconds each takes; one that is left out takes none. Once some are
-            over, the others are taken to be as much faster or slower. Empty where nothing tells.
-        is_timed: Whether these are seconds. Else only their ratios count, for the share that is
-            done, and counted steps alone show how long it takes.
+        seconds: Names of stages or counted steps in order, with seconds each. The times of finished
+            stages scale the others. Empty if unknown.
+        is_timed: True if these are seconds; otherwise relative times, which yield only the finished
+            fraction.
     """
     shown = _shown.get()
     if shown is not None:
@@ -397,7 +391,7 @@ def expecting(seconds: Sequence[tuple[str, float]], is_timed: bool = True) -> It
 
 
 def in_words(seconds: float) -> str:
-    """A time as one says it: `8 s`, `2 min 5 s`, `1 h 20 min`."""
+    """Format a duration: `8 s`, `2 min 5 s`, `1 h 20 min`."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

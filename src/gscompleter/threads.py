@@ -1,4 +1,4 @@
-"""How many threads compute: torch, numba, OpenCV and our own share the same cores."""
+"""Number of CPU threads of torch, numba and OpenCV."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 LIBRARIES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-"""What torch, numba (which our own threads follow) and OpenCV read once, when they are imported."""
+"""Environment variables that torch, numba and OpenCV read on import."""
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
-"""Where Linux says what share of its cores a container may use: microseconds of each period."""
+"""File of a Linux container's CPU quota: microseconds per period."""
 
 
 def bound_threads(count: int | None) -> None:
-    """Let every library compute with `count` threads, and the processes that are started too.
+    """Limit the threads of all libraries and of new processes.
 
-    None takes the usable cores, and leaves alone what the environment says already. torch, numba
-    and OpenCV are not to be imported before.
+    None means all usable cores, unless the environment has a number. Call it before the libraries
+    are imported.
     """
     for name in LIBRARIES:
         if count is not None or name not in os.environ:
@@ -27,17 +27,16 @@ def bound_threads(count: int | None) -> None:
 
 
 def threads() -> int:
-    """How many threads compute, as `bound_threads` or the environment says."""
-    told = os.environ.get(LIBRARIES[0], "")
-    return int(told) if told.isdecimal() and int(told) > 0 else usable_cores()
+    """Return the number of threads."""
+    value = os.environ.get(LIBRARIES[0], "")
+    return int(value) if value.isdecimal() and int(value) > 0 else usable_cores()
 
 
 @contextmanager
 def torch_on_one_thread() -> Iterator[None]:
-    """torch computes with one thread meanwhile.
+    """Let torch compute with one thread inside the block.
 
-    Between two of its loops its other threads spin, and where the loops are short and take turns
-    with kernels of our own, that takes more time from these than the threads save.
+    Its waiting threads otherwise slow down our own kernels, which run between short torch loops.
     """
     import torch
 
@@ -50,14 +49,14 @@ def torch_on_one_thread() -> Iterator[None]:
 
 
 def usable_cores() -> int:
-    """The cores that this process may run on, or as many as its share of their time amounts to."""
+    """Count the cores of this process, limited by its CPU quota."""
     pinned = hasattr(os, "sched_getaffinity")  # Windows and macOS have none
     cores = len(os.sched_getaffinity(0)) if pinned else os.cpu_count() or 1
     return max(1, round(min(cores, granted(QUOTA))))
 
 
 def granted(file: Path) -> float:
-    """The time that a container may use, in cores; infinite where the file sets no bound."""
+    """Read a CPU quota in cores; infinite if there is none."""
     words = file.read_text().split() if file.is_file() else []
     bounded = len(words) == 2 and all(word.isdecimal() for word in words)
     return int(words[0]) / int(words[1]) if bounded else math.inf

@@ -1,4 +1,4 @@
-"""The command `batch`: many completions, shared among processes and machines, and a page on all."""
+"""The command `batch`: many completions on several processes and machines."""
 
 from __future__ import annotations
 
@@ -20,55 +20,53 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions(EngineOptions):
-    """Complete many scenes: each once, whatever is stopped or killed meanwhile.
+    """Complete many scenes, on several processes or machines.
 
-    Run again, also on other machines at the same time, it goes on with what is left. A scene that
-    cannot be completed is a row with its reason. OUT has a folder for each job in jobs/, table.csv
-    and index.html.
+    Run the same command again, also on other machines, to continue. A scene that cannot be
+    completed is listed with its reason. OUT contains a folder per scene in jobs/, table.csv and
+    index.html.
     """
 
     manifest: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MANIFEST")]
-    """What to complete: a .csv or .jsonl whose rows have options of `complete` by their names, and
-    `folder` for SCENE; or a folder whose folders are scenes. A row may have a `name`. Paths are
-    relative to the manifest, or addresses such as s3://bucket/scene."""
+    """Scenes to complete: a .csv or .jsonl file with a row per scene, whose columns are `folder`
+    (SCENE), `name` and options of `complete`; or a folder of scenes. Paths are relative to the
+    manifest, or addresses such as s3://bucket/scene."""
     out: str
-    """Folder for the results, a new one or that of an earlier run to go on with; or an address."""
+    """Folder or address for the results; a folder of an earlier run is continued."""
     engine: EngineName = "local"
-    """Who does the work: processes of this machine, tasks of Ray, or jobs of SLURM by submitit."""
+    """Engine that runs the jobs: processes of this machine, Ray, or SLURM (submitit)."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 2
-    """How often a job is tried again whose process was killed, or that failed with anything but a
-    sentence on its input."""
-    again: Literal["nothing", "failures"] = "nothing"
-    """What of an earlier run is done once more: jobs that failed."""
+    """Further attempts for a job that was killed or that failed unexpectedly."""
+    rerun: Literal["nothing", "failures"] = "nothing"
+    """Jobs of an earlier run to repeat: none, or those that failed."""
     each: tuple[str, ...] = ()
-    """Options of `complete` for every row that has not its own, as in --each resolution=256."""
+    """Options of `complete` for every row that does not set them, as in --each resolution=256."""
     shard: str | None = None
-    """i/n does every n-th job from the i-th on; auto takes both from an array of SLURM."""
+    """Run every n-th job from the i-th on, given as i/n with i from 0; `auto` takes both from a
+    SLURM array."""
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What a call did, in jobs."""
+    """Numbers of jobs of one call."""
 
     done: int
     failed: int
-    """Of those that have a row now, how many say why they came to nothing."""
     skipped: int
-    """Had a row before."""
     skipped_failed: int = 0
-    """Those of them whose row records a failure."""
+    """Skipped jobs whose row records a failure."""
 
     def sentence(self) -> str:
-        """Summarize the counts, and name the option that retries what failed before."""
-        before = f"there before {self.skipped}"
+        """Summarize the counts, and name the option that retries earlier failures."""
+        before = f"done earlier {self.skipped}"
         if self.skipped_failed:
-            before += f", {self.skipped_failed} of them failed (--again failures does these again)"
+            before += f", {self.skipped_failed} of them failed (--rerun failures repeats them)"
         return f"Done {self.done}, failed {self.failed}, {before}."
 
 
 def run_batch(options: BatchOptions) -> None:
-    """Complete what the manifest names, write the table and the page, and say what was done."""
-    # Here, so that `--help` answers at once.
+    """Complete the scenes of a manifest, and write the table and the page."""
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.batch.jobs import claim_folder, missing
@@ -88,7 +86,7 @@ def run_batch(options: BatchOptions) -> None:
             engine = engine_for(options, place.name)
             claim_folder(place)
             share = jobs[number::count]
-            left = missing(share, place, options.again == "failures")
+            left = missing(share, place, options.rerun == "failures")
             names = {job.name for job in left}
             failed_before = count_failed(place, [job for job in share if job.name not in names])
         rounds = Rounds(place, BatchRows(place), left, options.retries)
@@ -105,7 +103,7 @@ def run_batch(options: BatchOptions) -> None:
 
 
 def count_failed(place: Place, jobs: Iterable[Job]) -> int:
-    """Count the jobs whose row says that they came to nothing."""
+    """Count the jobs whose row records a failure."""
     from gscompleter.batch.jobs import read_row
 
     rows = (read_row(place, job.name) for job in jobs)
@@ -113,12 +111,12 @@ def count_failed(place: Place, jobs: Iterable[Job]) -> int:
 
 
 def absolute(out: str) -> str:
-    """A path as workers elsewhere understand it; an address as it is."""
+    """Make a path absolute for workers elsewhere; addresses stay as they are."""
     return out if "://" in out else os.path.abspath(out)
 
 
 def followed(outcomes: Iterable[Outcome], total: int) -> Iterator[Outcome]:
-    """`outcomes`, shown as they come: how many, how fast, and how long the others take."""
+    """Show the progress and the rate while iterating over outcomes."""
     from gscompleter.progress import Activity, going_on
 
     if not total:
@@ -133,8 +131,7 @@ def followed(outcomes: Iterable[Outcome], total: int) -> Iterator[Outcome]:
 
 
 def show(place: Place, jobs: Sequence[Job]) -> None:
-    """Write the table and the page on all rows that are there, and once more where others came
-    meanwhile: of shards that end at the same moment, one sees the rows of all."""
+    """Write the table and the page, repeatedly while other shards add rows."""
     from gscompleter.batch.jobs import ROWS
     from gscompleter.reports.batch_page import write_overview
 
@@ -146,10 +143,9 @@ def show(place: Place, jobs: Sequence[Job]) -> None:
 
 @dataclass(frozen=True)
 class CompletingJob:
-    """Completes the scene of a job, in whatever process it is called."""
+    """A callable that completes the scene of a job, in any process."""
 
     out: str
-    """The folder of the batch."""
     retries: int
 
     def __call__(self, job: Job) -> Outcome:
@@ -161,10 +157,7 @@ class CompletingJob:
 
 
 def completed(job: Job, place: Place) -> dict[str, Any]:
-    """Complete the scene of a job; returns what its row says of it.
-
-    Models with weights are kept by those who load them, so that a worker loads each once.
-    """
+    """Complete the scene of a job and return its row."""
     import warnings
 
     from gscompleter.batch.costs import metered
@@ -190,7 +183,7 @@ def completed(job: Job, place: Place) -> dict[str, Any]:
 
 
 def cost_of(stages: Mapping[str, Any]) -> dict[str, Any]:
-    """What a job cost, stage by stage and in all."""
+    """Sum the costs of a job over its stages."""
     from dataclasses import asdict
 
     total = {

@@ -1,4 +1,4 @@
-"""The command `bench`: what completions take on this machine, and how that grows."""
+"""The command `bench`: measure completions and how their time grows."""
 
 from __future__ import annotations
 
@@ -45,30 +45,29 @@ from gscompleter.reports.plots import PlotsNotAvailable
 from gscompleter.runs.methods import Models
 
 BEYOND = (1.0, 1.25, 1.5, 1.75)
-"""How far the targets of the demo's pair lie beyond its two cameras, in baselines."""
+"""Distances of the demo's targets from its two cameras, in baselines."""
 QUICK_ITERATIONS = 2
-"""Of the baselines, where the bench is only to be tried."""
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What all measurements share."""
+    """Shared input of all measurements."""
 
     options: BenchOptions
     device: str
     models: Models
     yardstick: Yardstick
     folder: Path
-    """Where processes write, and scenes lie that they are given."""
+    """Folder for temporary scenes and results."""
 
     def complete(self, case: BenchCase) -> Sample:
-        """A case in a process of its own."""
+        """Complete a case in a process of its own."""
         out = self.folder / "completion"
         scene = brought(case, self.folder, self.models, self.device)
         return completed(self.words(case, scene, out), out, self.yardstick)
 
     def words(self, case: BenchCase, scene: Path | None, out: Path) -> list[str]:
-        """What the command line is told to complete a case."""
+        """Write the command line that completes a case."""
         planes = {"--near": case.near, "--far": case.far, "--scene": scene}
         given = [(flag, value) for flag, value in planes.items() if value is not None]
         return [
@@ -81,11 +80,7 @@ class Bench:
 
 
 def run_bench(options: BenchOptions) -> None:
-    """Measure what the options name, and print or write the tables.
-
-    Raises:
-        InputError: where a scene, a case or a method is not there, before anything is measured.
-    """
+    """Measure the cases and methods, and print or write the tables."""
     check_asked(options)
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
@@ -100,11 +95,7 @@ def run_bench(options: BenchOptions) -> None:
 
 
 def check_asked(options: BenchOptions) -> None:
-    """Refuse what cannot be measured, or could not be written.
-
-    Raises:
-        InputError: with the reason.
-    """
+    """Refuse impossible options."""
     check_compared(options.methods)
     if options.folder is not None and options.cases is not None:
         raise InputError("A scene and a file of cases are both named; name one.", "cases")
@@ -113,12 +104,12 @@ def check_asked(options: BenchOptions) -> None:
 
 
 def told_on(console: Console) -> Callable[[str], None]:
-    """What writes a line there, whatever brackets are in it."""
+    """Return a function that prints lines without markup."""
     return lambda line: console.print(line, markup=False, soft_wrap=True)
 
 
 def manifest_of(options: BenchOptions, folder: Path) -> Manifest:
-    """What is measured: the cases of a file, a scene that is named, or the demo's pair."""
+    """Collect the cases of a file, a scene or the demo's pair."""
     if options.cases is not None:
         return read_manifest(options.cases)
     if options.folder is not None:
@@ -129,15 +120,10 @@ def manifest_of(options: BenchOptions, folder: Path) -> Manifest:
 
 
 def scene_case(options: BenchOptions, scene: Path) -> BenchCase:
-    """The case of a scene that is named.
-
-    Raises:
-        InputError: where the frames to start from or the targets are not named.
-    """
+    """Create the case of a scene."""
     if not options.context or not options.target:
         raise InputError(
-            "The bench needs to be told the frames to start from and those to complete the scene "
-            "for, as in --context 0 4 --target 8.",
+            "A scene needs context frames and targets; name them, as in --context 0 4 --target 8.",
         )
     name = scene.resolve().name
     planes = options.near, options.far
@@ -145,7 +131,7 @@ def scene_case(options: BenchOptions, scene: Path) -> BenchCase:
 
 
 def demo_case(options: BenchOptions, folder: Path) -> BenchCase:
-    """The demo's pair in `folder`, with targets beyond its cameras that have no photograph."""
+    """Write the demo's pair to `folder` with targets beyond its cameras."""
     write_motorcycle_scene(folder)
     left, right = motorcycle_cameras(741, 500)
     beyond = [
@@ -161,17 +147,13 @@ def demo_case(options: BenchOptions, folder: Path) -> BenchCase:
 
 
 def chosen(manifest: Manifest, options: BenchOptions) -> Manifest:
-    """What of a manifest the options ask for, once its frames are seen to be there.
-
-    Raises:
-        InputError: where a case is named that it does not have, or one cannot be opened.
-    """
+    """Select the cases of the options, and check their frames."""
     cases = [case for case in manifest.cases if not options.only or case.name in options.only]
     unknown = set(options.only) - {case.name for case in cases}
     if unknown:
         known = ", ".join(case.name for case in manifest.cases)
         raise InputError(
-            f"There is no case '{quoted(min(unknown))}' to measure; choose of {known}.", "only"
+            f"There is no case '{quoted(min(unknown))}' to measure; choose one of {known}.", "only"
         )
     axes: set[str] = set() if options.quick else {*options.growth}
     growth = {axis: found for axis, found in manifest.growth.items() if axis in axes}
@@ -182,7 +164,7 @@ def chosen(manifest: Manifest, options: BenchOptions) -> Manifest:
 
 
 def prepared(options: BenchOptions, folder: Path) -> Bench:
-    """Models and the yardstick, compiled."""
+    """Load the models and the yardstick, compiled."""
     device = choose_device(options.device)
     renderer = load_renderer(device)
     models = Models(
@@ -196,11 +178,11 @@ def prepared(options: BenchOptions, folder: Path) -> Bench:
 
 
 def measured(bench: Bench, manifest: Manifest, tell: Callable[[str], None]) -> Report:
-    """All of a manifest, in rounds. What compiles has run once before, uncounted."""
+    """Run all measurements in rounds, after a first run that is not counted."""
     growing = [case for found in manifest.growth.values() for case in found]
     names = names_of([*manifest.cases, *growing])
     if not bench.options.quick:
-        tell(f"{manifest.cases[0].name}: once, uncounted")
+        tell(f"{manifest.cases[0].name}: first run, not counted")
         with stage("warming up"):
             bench.complete(manifest.cases[0])
     methods = method_tasks(bench, manifest.cases[0])
@@ -223,7 +205,7 @@ def measured(bench: Bench, manifest: Manifest, tell: Callable[[str], None]) -> R
 
 
 def names_of(cases: Sequence[BenchCase]) -> dict[BenchCase, str]:
-    """By all but its name, what each case is called first: none is measured twice."""
+    """Map each different case to the first of its names."""
     names: dict[BenchCase, str] = {}
     for case in cases:
         names.setdefault(nameless(case), case.name)
@@ -231,12 +213,12 @@ def names_of(cases: Sequence[BenchCase]) -> dict[BenchCase, str]:
 
 
 def nameless(case: BenchCase) -> BenchCase:
-    """What a case is, whatever it is called."""
+    """Remove the name of a case."""
     return replace(case, name="")
 
 
 def case_tasks(bench: Bench, names: dict[BenchCase, str]) -> list[Task]:
-    """Each of the cases, completed by the command line."""
+    """Create the tasks that complete cases through the command line."""
     repeats = repeats_of(bench.options)
 
     def task(case: BenchCase, name: str) -> Task:
@@ -246,12 +228,10 @@ def case_tasks(bench: Bench, names: dict[BenchCase, str]) -> list[Task]:
 
 
 METHOD = "method "
-"""Tells the tasks of methods from those of cases."""
 
 
 def method_tasks(bench: Bench, case: BenchCase) -> list[Task]:
-    """Each of the methods at the first target of `case`. What they share has run once before,
-    uncounted."""
+    """Create the tasks that compare methods at the first target of `case`."""
     if not bench.options.methods:
         return []
     start = start_of(case, bench.models, bench.device)
@@ -269,16 +249,17 @@ def method_tasks(bench: Bench, case: BenchCase) -> list[Task]:
 
 
 def method_named(found: Measured) -> Measured:
-    """What was measured of a method, by its own name."""
+    """Remove the prefix from the name of a measurement."""
     return replace(found, name=found.name.removeprefix(METHOD))
 
 
 def repeats_of(options: BenchOptions) -> int:
+    """Return the number of repetitions."""
     return 1 if options.quick else options.repeats
 
 
 def settings_of(bench: Bench) -> dict[str, int | None]:
-    """What decides the numbers besides the machine."""
+    """Describe the settings that determine the numbers."""
     options = bench.options
     return {
         "seed": options.seed,
@@ -289,7 +270,7 @@ def settings_of(bench: Bench) -> dict[str, int | None]:
 
 
 def write(report: Report, out: Path, overwrite: bool, console: Console) -> None:
-    """bench.json, tables.md and, where anything grew, growth.png."""
+    """Write bench.json, tables.md and growth.png."""
     with output_folder(out, overwrite) as folder:
         (folder / "bench.json").write_text(json.dumps(content(report), indent=1) + "\n")
         (folder / "tables.md").write_text(report_markdown(report))

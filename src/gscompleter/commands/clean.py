@@ -1,4 +1,4 @@
-"""The command `clean`: a splat and its photographs in, the splat without its floaters out."""
+"""The command `clean`: remove floaters from a splat."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from gscompleter.types import Gaussians
 
 
 def run_clean(options: CleanOptions) -> None:
-    """Clean the splat of `options.scene`, write `options.out` and say what was done."""
+    """Clean the splat, and print a summary."""
     with saying_what_stays(options.out):
         summary = clean_splat(options)
         if not options.quiet:
@@ -52,12 +52,7 @@ def run_clean(options: CleanOptions) -> None:
 
 
 def clean_splat(options: CleanOptions) -> dict[str, Any]:
-    """Clean the splat of `options.scene` and write `options.out`; also returns the summary.
-
-    Raises:
-        InputError: anything about the input that the user can mend; nothing is written then but
-            cameras that were found.
-    """
+    """Clean the splat, write `options.out`, and return the summary."""
     console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, replaceable(options))
     check_context(options)
@@ -70,31 +65,31 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
         with preparing("reading the scene"):
             given = load_splat(options.scene, options.drop_nonfinite)
         compile_kernels([device])
-        with preparing("placing the scene"):
+        with preparing("aligning the scene"):
             task = in_frame_of_splat(task, given, options.scene, options, opened)
         task = with_working_range(task, renderer)
-        plan = f"judged by {len(task.views)} photographs on {device}"
+        plan = f"compared with {len(task.views)} photographs on {device}"
         plan += f", written to {quoted(options.out)}"
         say(console, *found_out(options, opened, task), f"To do: {plan}.")
         with output_folder(options.out, replaceable(options)) as folder:
             with clock("clean"):
-                taken = superfluous(splat_of(task), task.views, renderer, options.config)
+                removed = superfluous(splat_of(task), task.views, renderer, options.config)
             settings = settings_of(options, options.config, targets={}, models={})
-            said = {"settings": settings, "device": device, **opened_as(options, opened, task)}
-            summary = said | scores(task, taken, renderer) | {"seconds": clock.seconds}
+            facts = {"settings": settings, "device": device, **opened_as(options, opened, task)}
+            summary = facts | scores(task, removed, renderer) | {"seconds": clock.seconds}
             with stage("writing"):
-                write(folder, task, taken, {"version": __version__, **summary})
+                write(folder, task, removed, {"version": __version__, **summary})
     return summary
 
 
 def splat_of(task: Task) -> Gaussians:
-    """The splat that was brought."""
+    """Return the input splat."""
     assert task.scene is not None
     return task.scene
 
 
 def scores(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str, Any]:
-    """How many Gaussians were taken out, and PSNR (dB) at the photographs before and after."""
+    """Count the removed Gaussians, and compute PSNR (dB) before and after."""
     given = splat_of(task)
     rows = []
     for view in track(task.views, "scores"):
@@ -109,16 +104,12 @@ def scores(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str
 
 
 def write(folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[str, Any]) -> None:
-    """Write the splat without what is `taken`, what was taken, and the summary.
-
-    Raises:
-        InputError: where nothing would be left, or a file cannot be written.
-    """
+    """Write the cleaned splat, the removed Gaussians and the summary."""
     given = splat_of(task)
     if taken.all():
         raise InputError(
-            "The photographs are better without any Gaussian of the splat; check that they show "
-            "the same scene."
+            "Every Gaussian of the splat makes the photographs worse; check that they show the "
+            "same scene."
         )
     assert task.brought is not None
     save_brought(folder, given, taken, given[:0], task.brought)
@@ -126,14 +117,14 @@ def write(folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[s
 
 
 def tell(summary: Mapping[str, Any], out: Path) -> None:
-    """Say how much was taken out, what that did to the photographs, and where it lies."""
+    """Print the numbers of Gaussians and the change of PSNR."""
     rows, counts = summary["photographs"], summary["gaussians"]
     before, after = (
         torch.tensor([row[f"psnr_{when}"] for row in rows]) for when in ("before", "after")
     )
     print(
-        f"{counts['removed']:,} of {counts['given']:,} Gaussians taken out in "
-        f"{summary['seconds']['total']:.1f} s; the photographs went from {before.mean():.2f} to "
-        f"{after.mean():.2f} dB, at worst by {(after - before).min():+.3f} dB: "
+        f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in "
+        f"{summary['seconds']['total']:.1f} s; mean PSNR of the photographs {before.mean():.2f} dB "
+        f"before, {after.mean():.2f} dB after, worst change {(after - before).min():+.3f} dB: "
         f"{out / 'completed.ply'}"
     )

@@ -1,4 +1,4 @@
-"""The command `complete`: a scene folder in, a completed scene and its report out."""
+"""The command `complete`: complete a scene and report the result."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ from gscompleter.types import Camera, Completion, View
 
 
 def run_completion(options: CompleteOptions) -> None:
-    """Complete the scene of `options.folder`, write `options.out` and say what was done."""
+    """Complete the scene, and print a summary."""
     with saying_what_stays(options.out):
         if options.dry_run:
             plan_folder(options)
@@ -80,13 +80,8 @@ def run_completion(options: CompleteOptions) -> None:
 
 
 def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completion]:
-    """Complete the scene of `options.folder` and write `options.out`; also returns the summary.
-
-    Raises:
-        InputError: anything about the input that the user can mend; nothing is written then but
-            cameras that were found.
-    """
-    if options.film:
+    """Complete the scene, write `options.out`, and return the summary."""
+    if options.video:
         check_writer()
     console = Console(stderr=True, quiet=options.quiet)
     with shown_on(None if options.quiet else console):
@@ -101,7 +96,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
                 done = Done(opened, task, cameras, completion)
                 summary = write_done(folder, options, done, explorer)
                 write_targets(folder, task)
-            if options.film:
+            if options.video:
                 photographs = list(cameras.values())
                 write_film(folder, completion, photographs, explorer.completer.renderer)
     return summary, completion
@@ -109,34 +104,28 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
 
 @dataclass(frozen=True)
 class Done:
-    """What was completed, and of what."""
+    """A finished completion and its input."""
 
     opened: Opened
     task: Task
-    """With the targets that it was completed for."""
     cameras: Mapping[int, Camera]
-    """Those of all photographs that can be used, by their frames, in the frame of the result."""
+    """Cameras of all usable photographs by frame, in the frame of the result."""
     completion: Completion
 
 
 def write_done(
     folder: Path, options: CompleteOptions, done: Done, explorer: Explorer
 ) -> dict[str, Any]:
-    """Write everything into `folder` but the cameras of the targets and the film; returns the
-    summary.
-
-    Raises:
-        InputError: where a file cannot be written.
-    """
+    """Write all results but the targets and the video, and return the summary."""
     task, cameras = done.task, tuple(done.cameras.values())
-    said = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
+    facts = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
     with meanwhile(looks_around, options, done.completion, cameras, explorer) as looks:
         summary = write_report(
             folder,
             done.completion,
             task.targets,
             explorer.completer,
-            said,
+            facts,
             task.brought,
             lambda: Around(tuple(looks()), cameras),
             read_held_out(options, done.opened, task, done.cameras),
@@ -146,11 +135,7 @@ def write_done(
 
 
 def plan_folder(options: CompleteOptions) -> None:
-    """Show what completing the scene of `options.folder` would do, and write the targets alone.
-
-    Raises:
-        InputError: as `complete_folder`.
-    """
+    """Write the targets and print the plan, without completing the scene."""
     console = Console(stderr=True, quiet=options.quiet)
     with shown_on(None if options.quiet else console):
         opened, task, explorer, _ = prepared(options, console)
@@ -166,11 +151,7 @@ def plan_folder(options: CompleteOptions) -> None:
 def prepared(
     options: CompleteOptions, console: Console
 ) -> tuple[Opened, Task, Explorer, Mapping[str, float]]:
-    """What is opened, what is to be done, by what, and the seconds that it took to find out.
-
-    Raises:
-        InputError: as `complete_folder`.
-    """
+    """Open the scene and load the models; also returns the seconds that this took."""
     check_output(options.out, replaceable(options))
     check_context(options)
     check_targets(options)
@@ -198,14 +179,14 @@ def prepared(
 def with_splat(
     task: Task, path: Path, options: CompleteOptions, opened: Opened, parts: Sequence[str]
 ) -> Task:
-    """`task` with the splat that was brought, once the kernels of these parts are compiled."""
+    """Compile the kernels, and add the input splat to the task."""
     with preparing("reading the scene"):
         task = with_witnesses(task, opened.photographs)
         given = load_splat(path, options.drop_nonfinite)
         if "cpu" in parts:
             check_scene(task, given)
     compile_kernels([*parts, *([BROUGHT] if "cpu" in parts else [])])
-    with preparing("placing the scene"):
+    with preparing("aligning the scene"):
         order = order_nearby(given) if len(given) >= WORTH else None
         given = given if order is None else given[order]
         return in_frame_of_splat(task, given, path, options, opened, order)
@@ -214,7 +195,7 @@ def with_splat(
 def said_in_advance(
     options: CompleteOptions, opened: Opened, task: Task, device: str
 ) -> dict[str, Any]:
-    """What `summary.json` says of a completion besides its scores."""
+    """Describe the input and the settings for `summary.json`."""
     auto = None if options.target else most(options)
     targets = {"target": list(options.target), "auto": auto}
     return {
@@ -226,7 +207,7 @@ def said_in_advance(
 
 
 def completer_for(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
-    """The models that the options name, and the settings of the stages."""
+    """Load the models of the options."""
     photographs = [
         View(target.photograph, target.camera, target.frame)
         for target in targets
@@ -243,15 +224,15 @@ def completer_for(options: CompleteOptions, targets: Sequence[Target], device: s
 
 
 def stages_of(options: CompleteOptions) -> CompleterConfig:
-    """The settings of the stages, with what has an option of its own."""
-    if not options.keep_unsupported:
+    """Return the settings, changed by options that have a name of their own."""
+    if not options.no_prune:
         return options.config
-    support = replace(options.config.support, keep_unsupported=True)
-    return replace(options.config, support=support)
+    settings = replace(options.config.trust_settings, prune=False)
+    return replace(options.config, trust_settings=settings)
 
 
 def models_of(options: CompleteOptions) -> dict[str, Any]:
-    """The models that decided the result, for `summary.json`."""
+    """Describe the models for `summary.json`."""
     return {
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
@@ -261,7 +242,7 @@ def models_of(options: CompleteOptions) -> dict[str, Any]:
 
 
 def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOptions) -> None:
-    """Say what was done: a row per camera, and where it lies."""
+    """Print the scores per camera, the notes, and the location of the results."""
 
     def cell(value: float | None) -> str:
         return "–" if value is None else f"{value:.2f}"
@@ -272,7 +253,7 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         table.add_row(name, "", cell(row["psnr_before"]), cell(row["psnr_after"]), "")
     notes = []
     for row, target in zip(summary["targets"], completion.targets, strict=True):
-        name = name_of(row["frame"], row["near"])
+        name = name_of(row["frame"], row["derived_from"])
         notes += [f"{name}: {note}" for note in target.notes]
         hole = f"{100 * row['hole_fraction']:.1f} %"
         scores = cell(row["psnr_before"]), cell(row["psnr_after"])
@@ -281,26 +262,26 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
     console.print(table)
     for note in notes:
         console.print(note)
-    gains = [row["gain"] for row in summary["context"]]
-    contradicted = {row["frame"]: row["contradicted"] for row in summary["context"]}
+    gains = [row["exposure_gain"] for row in summary["context"]]
+    contradicted = {row["frame"]: row["dynamic_fraction"] for row in summary["context"]}
     carried = left_out(row["ignored"] for row in summary["context"])
     for sentence in filter(None, (exposures(gains), moved(contradicted), carried)):
         console.print(sentence, soft_wrap=True)
     origin = summary["frame"]["origin"]
     if any(origin):
         console.print(
-            f"The coordinates are large against the baselines, so the result is relative to "
+            f"The coordinates are very large, so the result has its origin at "
             f"{' '.join(map(str, origin))}; summary.json has the transform.",
             soft_wrap=True,
         )
     if not summary["targets"]:
         console.print(NO_TARGET)
-    elif options.film:
-        console.print(f"On the way through the holes: {options.out / FILM}", soft_wrap=True)
+    elif options.video:
+        console.print(f"Video: {options.out / FILM}", soft_wrap=True)
     covered = summary["coverage"]
     console.print(
-        f"From around the photographs {100 * covered['before']:.1f} % was covered before, and "
-        f"{100 * covered['after']:.1f} % is now.",
+        f"Coverage around the photographs: {100 * covered['before']:.1f} % before, "
+        f"{100 * covered['after']:.1f} % after.",
         soft_wrap=True,
     )
     unused = summary["held_out"]
@@ -308,8 +289,8 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         before = fmean(row["psnr_before"] for row in unused)
         after = fmean(row["psnr_after"] for row in unused)
         console.print(
-            f"At photographs that were not used ({len(unused)} scored) the mean PSNR was "
-            f"{before:.2f} dB before, and is {after:.2f} dB now.",
+            f"Mean PSNR of {len(unused)} photographs that were not used: {before:.2f} dB before, "
+            f"{after:.2f} dB after.",
             soft_wrap=True,
         )
     counts = summary["gaussians"]
@@ -319,4 +300,4 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         f"{options.out / 'completed.ply'}",
         soft_wrap=True,
     )
-    console.print(f"Before and after, on a page: {options.out / PAGE}", soft_wrap=True)
+    console.print(f"Report: {options.out / PAGE}", soft_wrap=True)

@@ -17,31 +17,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertOptions(Settings):
-    """Write a scene of Gaussians in another format: by its name .ply, .compressed.ply, .spz or
-    .splat. Read are these, .ksplat, .sog (a bundle or its folder) and .glb."""
+    """Convert a file of Gaussians to .ply, .compressed.ply, .spz or .splat, by the name of B.
+
+    It also reads .ksplat, .sog (a bundle or its folder) and .glb.
+    """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
-    """The file to read, or the folder of a .sog."""
+    """File to read, or the folder of a .sog."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
-    """The file to write."""
+    """File to write."""
     drop_nonfinite: bool = False
-    """Leave out Gaussians that hold NaN or infinity."""
+    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     plain: bool = False
-    """Write all Gaussians without labels of which were generated: a .ply without the property
-    `generated`, which some programs misread, and no file of labels beside other formats."""
+    """Write no labels of generated Gaussians: no property `generated` in a .ply, which some
+    programs misread, and no file of labels beside other formats. All Gaussians are kept."""
     overwrite: bool = False
-    """Replace the file where there is one."""
+    """Replace an existing file."""
     quiet: bool = False
-    """Say nothing but errors."""
+    """Print errors only."""
 
 
 def run_convert(options: ConvertOptions) -> None:
-    """Read A, write B, and say how much that is.
-
-    Raises:
-        InputError: where A cannot be read, or B cannot be written or is there already.
-    """
-    # Here, so that `--help` does not wait for torch.
+    """Convert A to B, and print the number of Gaussians."""
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.io.ply import note_infinite_opacities
@@ -64,15 +62,11 @@ def run_convert(options: ConvertOptions) -> None:
 
 
 def unlabelled(gaussians: Gaussians) -> Gaussians:
-    """Drop the labels of what was generated; all Gaussians stay."""
+    """Drop the labels of generated Gaussians; all Gaussians stay."""
     return replace(gaussians, generated=gaussians.generated.new_zeros(len(gaussians)))
 
 
 def check_free(path: Path, overwrite: bool) -> None:
-    """Refuse to replace a file unasked.
-
-    Raises:
-        InputError: where `path` is there and `overwrite` is off.
-    """
+    """Refuse to replace a file unless `overwrite` is set."""
     if path.exists() and not overwrite:
-        raise InputError(f"{path} is there already; name another file, or use --overwrite.")
+        raise InputError(f"{path} exists; name another file, or use --overwrite.")

@@ -1,8 +1,7 @@
-"""The command `demo`: complete a real stereo pair that scikit-image carries.
+"""The command `demo`: complete the stereo pair that scikit-image contains.
 
-The Middlebury 2014 motorcycle pair, downsampled by four, with its calibration (Scharstein et al.,
-GCPR 2014). The completion sees both photographs and is asked for a view beyond each of them,
-where neither camera has looked.
+It is the Middlebury 2014 motorcycle pair, downsampled by four, with its calibration (Scharstein et
+al., GCPR 2014).
 """
 
 from __future__ import annotations
@@ -25,16 +24,14 @@ from gscompleter.types import Camera
 FOCAL_PX = 994.978
 PRINCIPAL_POINT_PX = (311.193, 254.877)
 PRINCIPAL_POINT_DX_PX = 31.086
-"""How much further right the principal point of the right image lies."""
+"""Offset of the right image's principal point, in pixels."""
 BASELINE_M = 0.193001
 BEYOND = 1.0
-"""How far the targets lie beyond the two cameras, in baselines."""
 RESOLUTION = (250, 370)
-"""Half the size of the photographs, which keeps the demo short."""
 
 
 def motorcycle_cameras(width: int, height: int) -> tuple[Camera, Camera]:
-    """The left and the right camera, in metres; the left one is the world frame."""
+    """Return the left and right camera in metres; the left one is the world frame."""
     K = torch.diag(torch.tensor([FOCAL_PX, FOCAL_PX, 1.0]))
     K[:2, 2] = torch.tensor(PRINCIPAL_POINT_PX)
     left = Camera(torch.eye(4), K, width, height)
@@ -44,14 +41,14 @@ def motorcycle_cameras(width: int, height: int) -> tuple[Camera, Camera]:
 
 
 def moved(camera: Camera, x: float) -> Camera:
-    """`camera` moved by `x` metres to the right."""
+    """Move a camera by `x` metres to the right."""
     c2w = camera.c2w.clone()
     c2w[0, 3] += x
     return replace(camera, c2w=c2w)
 
 
 def write_motorcycle_scene(folder: Path) -> None:
-    """Write the pair as a scene folder and `targets.json` beyond its cameras."""
+    """Write the pair as a scene folder with `targets.json`."""
     left_image, right_image, _ = stereo_motorcycle()
     height, width = left_image.shape[:2]
     left, right = motorcycle_cameras(width, height)
@@ -66,11 +63,11 @@ def write_motorcycle_scene(folder: Path) -> None:
 
 
 def run_demo(options: DemoOptions) -> None:
-    """Write the scene, complete it for both targets, and put before and after side by side."""
+    """Write the scene, complete it for both targets, and join before and after."""
     with output_folder(options.out, options.overwrite) as folder:
         scene = folder / "scene"
         write_motorcycle_scene(scene)
-        asked = CompleteOptions(
+        complete_options = CompleteOptions(
             folder=scene,
             context=(0, 1),
             target=(str(scene / "targets.json"),),
@@ -80,13 +77,13 @@ def run_demo(options: DemoOptions) -> None:
             seed=options.seed,
             quiet=options.quiet,
         )
-        summary, completion = complete_folder(asked)
+        summary, completion = complete_folder(complete_options)
         images = folder / "completion" / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
         shown = strip([read_image(images / f"{name}.png") for name in names])
         write_image(folder / "before_after.png", shown)
     if not options.quiet:
-        tell(summary, completion, replace(asked, out=options.out / "completion"))
+        tell(summary, completion, replace(complete_options, out=options.out / "completion"))
         Console(highlight=False).print(
             f"Before and after, beyond the left and the right camera: "
             f"{options.out / 'before_after.png'}",

@@ -1,4 +1,4 @@
-"""The command `doctor`: what is on this machine, and what cannot be done for want of what."""
+"""The command `doctor`: the state of the installation and what is missing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ if TYPE_CHECKING:  # every command reads this file, and only this one needs it
     from packaging.requirements import Requirement
 
 DISTRIBUTION = "gscompleter"
-"""What pip calls the package."""
 
 PURPOSES = {
     "cuda": "rendering on an NVIDIA GPU",
@@ -25,41 +24,39 @@ PURPOSES = {
     "fid": "tables --fid",
     "live": "completing in the browser with gscompleter live",
     "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
-    "film": "complete --film",
+    "film": "complete --video",
     "ray": "batch --engine ray",
     "slurm": "batch --engine submitit",
     "waymo": "the Waymo Open Dataset 2, whose tables are parquet",
 }
-"""What each extra is for. Those for developers (`test`, `dev`, `docs`) are not looked for."""
+"""Purpose of each extra. Those for developers (`test`, `dev`, `docs`) are not listed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions(Settings):
-    """Say what is there (device, renderers, packages, extras, weights, caches), and what cannot be
-    done for want of what.
+    """Print what is installed (device, renderers, packages, extras, weights, caches).
 
-    Nothing is downloaded or changed. What is missing is missing for something: the embedded models
-    need the packages alone.
+    For everything that is missing it prints the purpose and what to do. Nothing is downloaded or
+    changed. The default models need the packages only.
     """
 
     json: bool = False
-    """Print it as JSON."""
+    """Print the result as JSON."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """One thing that was looked for."""
+    """One line of the result."""
 
     kind: str
-    """What it is one of: the heading that it stands under."""
     name: str
     there: bool
     told: str
-    """Versions and places of what is there; of what is missing, what it is for and what to do."""
+    """Versions and locations, or the purpose of a missing part and what to do."""
 
 
 def run_doctor(options: DoctorOptions) -> None:
-    """Look at everything and print it."""
+    """Inspect the installation and print the result."""
     found = list(examined())
     if options.json:
         print(json.dumps([asdict(one) for one in found], indent=2))
@@ -68,7 +65,7 @@ def run_doctor(options: DoctorOptions) -> None:
 
 
 def tell(found: list[Found]) -> None:
-    """Print what was found, by kinds, a line each."""
+    """Print the result, grouped by kind."""
     width = max(len(one.name) for one in found)
     kinds = dict.fromkeys(one.kind for one in found)
     for kind in kinds:
@@ -79,7 +76,7 @@ def tell(found: list[Found]) -> None:
 
 
 def examined() -> Iterator[Found]:
-    """All that is looked for, in the order in which it is told."""
+    """Inspect all parts, in the order of the result."""
     yield from machine_facts()
     yield from packages()
     yield from extras()
@@ -90,8 +87,8 @@ def examined() -> Iterator[Found]:
 
 
 def machine_facts() -> Iterator[Found]:
-    """Versions, processor, memory and the device that is computed on."""
-    # Here and below, so that `--help` does not wait for torch.
+    """Inspect versions, processor, memory and device."""
+    # Imported here so that `--help` does not wait for torch.
     from gscompleter.benchmark.machine import machine
     from gscompleter.render import choose_device
 
@@ -103,18 +100,18 @@ def machine_facts() -> Iterator[Found]:
 
 
 def packages() -> Iterator[Found]:
-    """The packages that everything needs."""
+    """Inspect the packages that everything needs."""
     for requirement in required():
         there = installed(requirement)
-        told = there or f"{requirement}, without which nothing runs; pip install '{requirement}'"
-        yield Found("packages", requirement.name, there is not None, told)
+        details = there or f"{requirement}, which every command needs; pip install '{requirement}'"
+        yield Found("packages", requirement.name, there is not None, details)
 
 
 def extras() -> Iterator[Found]:
-    """What `pip install 'gscompleter[EXTRA]'` adds."""
+    """Inspect the extras."""
     for extra, purpose in PURPOSES.items():
         if not required(extra):
-            why = f"what is installed is older than this extra, or this Python is; for {purpose}"
+            why = f"the installed version or this Python is older than this extra; for {purpose}"
             yield Found("extras", extra, False, why)
             continue
         versions = {requirement.name: installed(requirement) for requirement in required(extra)}
@@ -125,11 +122,7 @@ def extras() -> Iterator[Found]:
 
 
 def required(extra: str = "") -> list[Requirement]:
-    """What the package needs, or what an extra adds to that.
-
-    Raises:
-        InputError: where pip knows nothing of the package.
-    """
+    """List the requirements of the package, or those that an extra adds."""
     from importlib.metadata import PackageNotFoundError, requires
 
     from packaging.requirements import Requirement
@@ -138,21 +131,21 @@ def required(extra: str = "") -> list[Requirement]:
         all_of_them = [Requirement(line) for line in requires(DISTRIBUTION) or []]
     except PackageNotFoundError:
         raise InputError(
-            f"What {DISTRIBUTION} needs is told by its installation, and there is none; run "
-            "`pip install .` in the folder of its sources."
+            f"{DISTRIBUTION} is not installed, so its requirements are unknown; run "
+            "`pip install .` in its source folder."
         ) from None
     return [r for r in all_of_them if is_for(extra, r)]
 
 
 def is_for(extra: str, requirement: Requirement) -> bool:
-    """Whether an extra adds this requirement; without a name, whether all need it."""
+    """Return True if an extra adds this requirement; without a name, if all need it."""
     if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
         return not extra
     return bool(extra) and requirement.marker.evaluate({"extra": extra})
 
 
 def installed(requirement: Requirement) -> str | None:
-    """The version that is here, where it is one that will do."""
+    """Return the installed version if it satisfies the requirement."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -163,7 +156,7 @@ def installed(requirement: Requirement) -> str | None:
 
 
 def renderers() -> Iterator[Found]:
-    """Which renderers can draw here, and whether the kernels are compiled."""
+    """Inspect the renderers and the compiled kernels."""
     from gscompleter.compilation import PARTS
     from gscompleter.kernels.compiled import is_compiled
     from gscompleter.render import load_renderer
@@ -181,7 +174,7 @@ def renderers() -> Iterator[Found]:
 
 
 def weights() -> Iterator[Found]:
-    """Weights that others publish: those of Ψ, and of LPIPS."""
+    """Inspect the published weights of reconstructors and LPIPS."""
     from gscompleter.metrics.lpips import NETWORKS
     from gscompleter.metrics.lpips import place_of as place_of_lpips
     from gscompleter.weights.fetching import cached
@@ -193,12 +186,14 @@ def weights() -> Iterator[Found]:
     for name, network in NETWORKS.items():
         places = [place_of_lpips(file, None) for file in (network.backbone, network.linear)]
         there = all(place.is_file() for place in places)
-        told = "for LPIPS in the tables of evaluate" + ("" if there else "; load_lpips fetches it")
-        yield Found("weights", f"lpips-{name}", there, told)
+        details = "for LPIPS in the tables of evaluate" + (
+            "" if there else "; load_lpips fetches it"
+        )
+        yield Found("weights", f"lpips-{name}", there, details)
 
 
 def viewer() -> Iterator[Found]:
-    """The JavaScript that pages need: in the wheel, in our cache, or to be fetched."""
+    """Inspect the JavaScript libraries of the pages."""
     from gscompleter.viewer.packages import BUILT, LOCK, place_of, read_lock
 
     if BUILT.is_file():
@@ -211,7 +206,7 @@ def viewer() -> Iterator[Found]:
 
 
 def caches() -> Iterator[Found]:
-    """Where files are kept for later runs."""
+    """Inspect the cache folders."""
     import torch
 
     from gscompleter.cache import cache_folder

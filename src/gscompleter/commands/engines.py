@@ -1,4 +1,4 @@
-"""The engine that a command's options name."""
+"""The engine selected by a command's options."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gscompleter.threads import bound_threads, usable_cores
 
 
 def pairs(words: Sequence[str], option: str) -> dict[str, str]:
-    """`NAME=VALUE` as a mapping; an InputError where a word is none."""
+    """Parse `NAME=VALUE` words."""
     for word in words:
         if not word.partition("=")[0] or "=" not in word:
             raise InputError(f"'{quoted(word)}' is not NAME=VALUE, as in resolution=256.", option)
@@ -25,8 +25,7 @@ def pairs(words: Sequence[str], option: str) -> dict[str, str]:
 
 
 def engine_for(options: EngineOptions, out: str) -> Engine:
-    """The engine that the options name. On this machine, how many threads compute is settled here,
-    as the workers inherit it."""
+    """Create the engine. On this machine it also sets the threads, which workers inherit."""
     if options.engine is None:
         return in_this_process
     threads = options.threads or 1

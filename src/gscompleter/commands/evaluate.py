@@ -43,9 +43,9 @@ from gscompleter.runs.tasks import Task, task_of, tasks_of
 
 
 def run_evaluation(options: EvaluateOptions) -> None:
-    """Run the methods on the cases, write rows, tables and plots, and say what was done."""
+    """Run and score the methods on the cases, and write the tables."""
     if not options.paths:
-        raise InputError("No data was named; give a cases.json, or scenes with --protocol.")
+        raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     methods = methods_named(options.methods)
     shard = parse_shard(options.shard, os.environ)
@@ -71,38 +71,37 @@ def run_evaluation(options: EvaluateOptions) -> None:
     engine = engine_for(options, str(options.out.resolve()))
     with shown_on(shown):
         compile_kernels((config.device, config.reconstructor, config.generator))
-        counts = evaluate(tasks, methods, options.out, config, shard, options.again, engine)
-        told = f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}."
-        console.print(told)
-        # An empty shard, where there are more shards than cases, has nothing to show.
+        counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
+        line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
+        console.print(line)
+        # A shard without cases has no tables.
         if counts.done + counts.failed + counts.skipped > 0:
             show(options.out, options.quiet, num_rows=len(tasks) * len(methods))
 
 
 def source_of(options: EvaluateOptions) -> dict[str, Any]:
-    """Where the cases come from, as a folder of results remembers it."""
+    """Describe the cases, as an output folder records them."""
     size = resolution_of(options) if options.protocol else options.resolution
     return {
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
         "resolution": list(size) if isinstance(size, tuple) else size,
-        **({"ignore_masked": True} if options.ignore_masked else {}),
+        **({"ignore_masked": True} if options.use_masks else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
         **({} if options.ego_mask else {"ego_mask": False}),
     }
 
 
 def run_tables(options: TablesOptions) -> None:
-    """Write the tables and plots of a run and print them."""
+    """Write the tables and plots of an evaluation, and print the tables."""
     with shown_on(None if options.quiet else Console(stderr=True)):
         show(options.out, options.quiet, options.fid)
 
 
 def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> None:
-    """Write the tables, plots and page of a run, and print the former unless `quiet`.
+    """Write the tables, plots and page of an evaluation, and print the tables unless `quiet`.
 
-    Where other shards finished meanwhile and all `num_rows` rows are there, it does so once more:
-    of shards that end at the same moment, none can leave tables behind that lack rows of another.
+    It repeats this if other shards added rows meanwhile and all `num_rows` are there.
     """
     seen, there = None, rows_there(out)
     while seen is None or (there != seen and len(there) >= num_rows):
@@ -117,12 +116,12 @@ def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> N
 
 
 def rows_there(out: Path) -> dict[Path, int]:
-    """The rows of a run, and when each was written."""
+    """Return the files of scores with their modification times."""
     return {path: path.stat().st_mtime_ns for path in row_paths(out)}
 
 
 def draw(summary: Summary, out: Path, quiet: bool) -> None:
-    """Draw the plots of a run, or say what they need."""
+    """Draw the plots, or print the missing requirement."""
     try:
         plots(summary, out)
     except PlotsNotAvailable as missing:
@@ -131,7 +130,7 @@ def draw(summary: Summary, out: Path, quiet: bool) -> None:
 
 
 def run_index(options: IndexOptions) -> None:
-    """Write the evaluation index of a protocol on a data set."""
+    """Write the evaluation index of a protocol for a data set."""
     if options.out.exists() and not options.overwrite:
         raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
     skipped: list[Skipped] = []
@@ -151,13 +150,12 @@ def run_index(options: IndexOptions) -> None:
 
 
 def resolution_of(options: EvaluateOptions) -> Size:
-    """What scenes are worked at."""
+    """Return the working size of scenes."""
     return LONG_SIDE if options.resolution is None else options.resolution
 
 
 def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped], notes: list[str]) -> list[Task]:
-    """The tasks that the options ask for; clips that are left out go to `skipped`, and what was
-    said of those that were opened to `notes`."""
+    """Collect the tasks of the options, and append to `skipped` and `notes`."""
     if not options.protocol:
         files = [cases_file(path) for path in options.paths]
         cases = [case for file in files for case in read_cases(file)]
@@ -168,7 +166,7 @@ def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped], notes: list[s
         if options.resolution is not None:
             size = working_size(options.resolution)
             cases = [replace(case, resolution=size) for case in cases]
-        if options.ignore_masked:
+        if options.use_masks:
             cases = [replace(case, ignore_masked=True) for case in cases]
         cases = [replace(case, ego_mask=options.ego_mask) for case in cases]
         return [task_of(case) for case in cases]
@@ -184,7 +182,7 @@ def first_of_each_scene(cases: Sequence[Case]) -> list[Case]:
 
 
 def notes_of(cases: Sequence[Case]) -> Iterator[str]:
-    """What is to be said of the scenes of cases. One that cannot be opened fails in its rows."""
+    """Collect the notes on the scenes of cases. Scenes that cannot be opened have none."""
     for scene in dict.fromkeys(case.scene for case in cases):
         try:
             yield from open_photographs(scene).notes
@@ -195,27 +193,27 @@ def notes_of(cases: Sequence[Case]) -> Iterator[str]:
 def tasks_in_clips(
     options: EvaluateOptions, skipped: list[Skipped], notes: list[str]
 ) -> Iterator[Task]:
-    """The tasks that the protocols find in the data, clip by clip."""
+    """Iterate over the tasks of the protocols, clip by clip."""
     protocols = [parse_protocol(text) for text in options.protocol]
     for path in options.paths:
         for clip in usable(open_clips(path), skipped):
             notes += clip.notes
-            if options.ignore_masked and not clip.has_masks:
+            if options.use_masks and not clip.has_masks:
                 raise InputError(
-                    f"Nothing says what is to be ignored in {clip.name}: it has neither masks nor "
-                    "boxes of what moves; leave --ignore-masked out."
+                    f"{clip.name} has neither masks nor boxes of moving objects; leave --use-masks "
+                    "out."
                 )
             clip = clip if options.ego_mask else clip.with_ego_vehicle()
             for protocol in protocols:
                 if isinstance(protocol, ViewByView) and (reason := protocol.reason_to_skip(clip)):
                     skipped.append(Skipped(clip.name, reason))
                 size = working_size(resolution_of(options))
-                tasks = tasks_of(protocol, clip, size, options.ignore_masked)
+                tasks = tasks_of(protocol, clip, size, options.use_masks)
                 yield from tasks[:1] if options.one_per_scene else tasks
 
 
 def cases_file(path: Path) -> Path:
-    """The cases.json that `path` is or holds."""
+    """Find the cases.json that `path` is or contains."""
     if not os.path.exists(path):
         raise InputError(
             f"There is no '{quoted(path)}'; name a cases.json, or scenes with --protocol."
@@ -223,20 +221,19 @@ def cases_file(path: Path) -> Path:
     file = path / "cases.json" if os.path.isdir(path) else path
     if file.suffix != ".json" or not os.path.isfile(file) or file.name == "transforms.json":
         raise InputError(
-            f"{path} says not which frames are given and which are the target; add --protocol, as "
-            "in --protocol n-10."
+            f"{path} defines no context and target frames; add --protocol, as in --protocol n-10."
         )
     return file
 
 
 def tell_skipped(skipped: Sequence[Skipped], console: Console) -> None:
-    """Say which clips were left out, and why."""
+    """Print the skipped clips with the reasons."""
     for clip in skipped:
-        console.print(f"Left out {clip.name}: {clip.reason}.")
+        console.print(f"Skipped {clip.name}: {clip.reason}.")
 
 
 def tell(summary: Summary, out: Path) -> None:
-    """Print the tables, turned on their side: a column per method."""
+    """Print the tables, transposed: one column per method."""
     table = Table("", *summary.methods, box=None)
     columns = summary.present(summary.columns)
     cells = score_cells(summary, columns)

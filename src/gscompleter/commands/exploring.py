@@ -1,4 +1,4 @@
-"""Targets that nobody names: found, completed or only shown, and written down."""
+"""Next-best target cameras: found, completed or only planned, and written."""
 
 from __future__ import annotations
 
@@ -25,28 +25,24 @@ from gscompleter.stages.exploration import Choice
 from gscompleter.types import Camera, Completion
 
 LIFTED_VIEWS = 3
-"""What completing a camera takes, in photographs of the context: its wider image and the anchor's
-are reconstructed, and the result is registered and fitted. 1.8 to 3.3 were measured
+"""Time to complete a target, relative to the reconstruction of one photograph. Measured: 1.8 to 3.3
 (docs/performance.md)."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a completion would do."""
+    """Targets and the estimated time of a completion."""
 
     task: Task
-    """With the targets it would be done for."""
     holes: tuple[float, ...]
-    """Share of the image of each target that is a hole, once those before are completed."""
+    """Hole fraction of each target, after completion of the previous ones."""
     seconds: float | None
-    """About what each takes; None where nothing tells."""
+    """Estimated seconds per target, or None if unknown."""
     context_seconds: float
-    """What the context took."""
 
 
 def cameras_of(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:
-    """By their frames, the cameras of all photographs that can be used, in the frame of the result
-    and with the depth range that is worked in."""
+    """Return the cameras of all usable photographs by frame, in the frame of the result."""
     given = opened.photographs
     transform = task.frame @ frame_from_photographs(-given.origin)
     known, device = task.views[0].camera, task.views[0].image.device
@@ -58,8 +54,7 @@ def cameras_of(options: CompleteOptions, opened: Opened, task: Task) -> dict[int
 def completed(
     options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: Explorer
 ) -> tuple[Completion, Task]:
-    """The scene completed for the targets of `task`; where it has none, for those that are found
-    among the moves of `cameras`, and `task` with them."""
+    """Complete the scene for the targets of `task`, or for targets that it finds."""
     completer = explorer.completer
     if task.targets:
         targets = [target.camera.to(task.views[0].image.device) for target in task.targets]
@@ -73,7 +68,7 @@ def completed(
 def planned(
     options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: Explorer
 ) -> Plan:
-    """What `completed` would do, about; nothing is completed."""
+    """Plan the completion without running it."""
     begun = explorer.completer.begin(task.views, task.scene, task.witnesses)
     if task.targets:
         targets = [target.camera.to(task.views[0].image.device) for target in task.targets]
@@ -86,15 +81,14 @@ def planned(
 
 
 def seconds_of(options: CompleteOptions, begun: Completion) -> float | None:
-    """About how many seconds a target takes, judged by what Ψ took for the context; None where it
-    took nothing, or Φ may take any time."""
+    """Estimate the seconds per target from the context's, or return None if unknown."""
     if options.scene is not None or options.synthesis.name != "warp-inpaint":
         return None
     return LIFTED_VIEWS * begun.seconds["context"] / len(begun.views)
 
 
 def tell_plan(options: CompleteOptions, plan: Plan) -> None:
-    """Show the cameras, their holes, and how long it takes to complete them."""
+    """Print the targets, their holes and the estimated time."""
     table = Table("camera", "hole", box=None)
     for number, (target, hole) in enumerate(zip(plan.task.targets, plan.holes, strict=True)):
         table.add_row(f"{number + 1}: {name_of(target.frame, target.near)}", f"{100 * hole:.1f} %")
@@ -104,39 +98,34 @@ def tell_plan(options: CompleteOptions, plan: Plan) -> None:
 
 
 def sentence_of(plan: Plan, out: Path) -> str:
-    """How many cameras are to be completed, how long that takes, and where they can be edited."""
+    """Write the sentence on the number of targets and the estimated time."""
     number = len(plan.holes)
     if number == 0:
-        return "No camera was found that has much to gain; nothing is to be completed."
-    said = "how long that takes shows only then"
+        return "No camera has much to gain; there is nothing to complete."
+    duration = "in a time that is not known in advance"
     if plan.seconds is not None:
-        said = (
-            f"which takes about {plan.seconds * number:.0f} s after the context, which took "
-            f"{plan.context_seconds:.0f} s"
+        duration = (
+            f"in about {plan.seconds * number:.0f} s after the context "
+            f"({plan.context_seconds:.0f} s)"
         )
     counted = "1 camera" if number == 1 else f"{number} cameras"
-    return f"To complete: {counted}, {said}. Edit them in {quoted(out / TARGETS)}."
+    return f"To complete: {counted}, {duration}. Edit the cameras in {quoted(out / TARGETS)}."
 
 
 def name_of(frame: int | None, near: int | None) -> str:
-    """What a table calls a target: by its own frame, or the one that it was derived from."""
+    """Name a target for tables."""
     if near is not None:
         return f"target near {near}"
     return "target" if frame is None else f"target {frame}"
 
 
 def targets_of(choices: Iterable[Choice], frames: Sequence[int]) -> list[Target]:
-    """Cameras that were chosen, each with the frame that it was derived from."""
+    """Turn chosen candidates into targets."""
     return [Target(c.camera, near=frames[c.candidate.base]) for c in choices]
 
 
 def write_targets(folder: Path, task: Task) -> None:
-    """Write the cameras of the targets, if any, as `--target` takes them: in the frame of the
-    photographs.
-
-    Raises:
-        InputError: where the file cannot be written.
-    """
+    """Write the target cameras in the frame of the photographs, as `--target` reads them."""
     if not task.targets:
         return
     back = np.linalg.inv(task.frame)
@@ -146,6 +135,6 @@ def write_targets(folder: Path, task: Task) -> None:
 def looks_around(
     options: CompleteOptions, completion: Completion, cameras: Iterable[Camera], explorer: Explorer
 ) -> list[Look]:
-    """The scene before and after, as cameras around `cameras` see it."""
+    """Render the scene before and after at cameras around the photographs."""
     aside = held_out_cameras(list(cameras), options.seed)
     return looks_of(completion, aside, explorer.completer.renderer)

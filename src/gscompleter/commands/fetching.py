@@ -1,4 +1,4 @@
-"""Inputs of a job that lie in a store, fetched while the job needs them."""
+"""Download of a job's inputs from object stores."""
 
 from __future__ import annotations
 
@@ -14,17 +14,13 @@ from gscompleter.errors import InputError, quoted
 
 @contextmanager
 def fetched(options: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """The options of a row with addresses replaced by files of this machine, as long as it lasts.
-
-    Raises:
-        InputError: where there is nothing at an address.
-    """
+    """Replace addresses in the options of a row by downloaded files, inside the block."""
     with TemporaryDirectory(prefix="gscompleter-") as folder:
         yield {key: local(value, Path(folder) / key) for key, value in options.items()}
 
 
 def local(value: Any, folder: Path) -> Any:
-    """`value`, or what lies at the address that it is, copied into `folder`."""
+    """Download a value if it is an address."""
     if isinstance(value, list):
         return [local(item, folder / str(number)) for number, item in enumerate(value)]
     if not isinstance(value, str) or not is_address(value):
@@ -37,5 +33,5 @@ def local(value: Any, folder: Path) -> Any:
         path.parent.mkdir(parents=True, exist_ok=True)
         store.get(value.rstrip("/") + ("/" if found[0] else ""), str(path), recursive=found[0])
     except OSError as error:
-        raise ConnectionError(f"{value} cannot be fetched: {error}") from error
+        raise ConnectionError(f"{value} cannot be downloaded: {error}") from error
     return str(path)

@@ -1,4 +1,4 @@
-"""`--generator NAME` and `--generator-SETTING VALUE`, derived from each generator's settings."""
+"""Options `--generator NAME` and `--generator-SETTING VALUE`."""
 
 from __future__ import annotations
 
@@ -22,62 +22,59 @@ DEFAULT = "warp-inpaint"
 
 @dataclass(frozen=True)
 class GeneratorOptions:
-    """How the image at a target comes about."""
+    """Choice of the generator."""
 
     name: str = DEFAULT
-    """The generator."""
     given: Mapping[str, Any] = field(default_factory=dict)
-    """Those of its settings that were given."""
 
     def settings(self) -> GeneratorSettings:
-        """The settings of the generator with what was given.
-
-        Raises:
-            InputError: where there is no such generator, or it knows no such setting.
-        """
+        """Return the settings, or raise InputError if one is unknown to the generator."""
         kind = settings_class(self.name)
         for setting, value in self.given.items():
             knowing = [name for name, kind in GENERATORS.items() if hasattr(kind, setting)]
             if self.name not in knowing:
                 raise InputError(
-                    f"The generator {self.name!r} knows no {setting} ({quoted(value)}); leave that "
-                    f"out, or choose {' or '.join(knowing)}.",
+                    f"The generator {self.name!r} has no setting {setting} ({quoted(value)}); "
+                    f"leave it out, or choose {' or '.join(knowing)}.",
                     PREFIX + setting,
                 )
         return kind(**self.given)
 
     def as_summary(self) -> dict[str, Any]:
-        """The generator and all its settings, for `summary.json`."""
+        """Describe the generator for `summary.json`."""
         settings = asdict(self.settings())
         return {"generator": self.name, **{PREFIX + name: settings[name] for name in settings}}
 
 
 def generator_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """How tyro reads GeneratorOptions: by name, and by the settings that any generator knows."""
+    """Tell tyro to read GeneratorOptions as the union of all generators' settings."""
     if info.type is not GeneratorOptions:
         return None
-    kinds = "; ".join(f"{name}: {kind.__doc__}" for name, kind in GENERATORS.items())
-    sentence = f"What synthesizes the image at a target. {kinds}."
     known: dict[str, list[tuple[str, StructFieldSpec]]] = {}
     for name, kind in GENERATORS.items():
         for spec in specs_of(kind):
             known.setdefault(spec.name, []).append((name, spec))
-    chosen = StructFieldSpec("generator", str, DEFAULT, sentence)
-    return StructConstructorSpec(options_from, (chosen, *map(flag, known.values())))
+    return StructConstructorSpec(options_from, (generator_field(), *map(flag, known.values())))
+
+
+def generator_field() -> StructFieldSpec:
+    """Return the option `--generator`."""
+    kinds = "; ".join(
+        f"{name}: {(kind.__doc__ or '').rstrip('.')}" for name, kind in GENERATORS.items()
+    )
+    sentence = f"Model that synthesizes the image at a target. {kinds}."
+    return StructFieldSpec("generator", str, DEFAULT, sentence)
 
 
 def specs_of(kind: type[GeneratorSettings]) -> tuple[StructFieldSpec, ...]:
-    """Name, type, default and sentence of each setting of a class."""
+    """Return the fields of a class of settings."""
     spec = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(kind, kind(), False))
     assert isinstance(spec, StructConstructorSpec)
     return spec.fields
 
 
 def flag(known: Sequence[tuple[str, StructFieldSpec]]) -> StructFieldSpec:
-    """The flag for a setting. Each generator that knows it has a sentence and a default of its own.
-
-    The flag's own default is None, or False for a switch, which leaves it to the generator.
-    """
+    """Merge the fields of several generators with one name into one optional option."""
     first = known[0][1]
     sentences: dict[str, list[str]] = {}
     for name, spec in known:
@@ -94,7 +91,7 @@ def flag(known: Sequence[tuple[str, StructFieldSpec]]) -> StructFieldSpec:
 
 
 def options_from(generator: str, **values: Any) -> GeneratorOptions:
-    """The options with those values that were given."""
+    """Create the options from those values that were given."""
     given = {
         name.removeprefix(PREFIX): value
         for name, value in values.items()

@@ -1,4 +1,4 @@
-"""The command `live`: a scene in the browser, completed for what the browser shows."""
+"""The command `live`: complete a scene in the browser."""
 
 from __future__ import annotations
 
@@ -37,39 +37,32 @@ if TYPE_CHECKING:
     from gscompleter.live.page import Page
 
 SHOWN = 40
-"""Photographs that the page shows at most, besides those that the work starts from."""
+"""Most photographs on the page, in addition to the context."""
 THUMBNAIL = 160
-"""Their longer side, in pixels."""
 CLASSIC = (
-    "The page renders antialiased Gaussians as classic ones, small ones too opaque; what is saved "
-    "is right, and `view` shows it as it is."
+    "The page renders antialiased Gaussians as classic ones, small ones too opaque; saved files "
+    "are correct, and so is `gscompleter view`."
 )
-"""Note on the page, which viser renders, for an antialiased scene."""
+"""Note on the page for antialiased scenes, which viser renders differently."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """All that is there before anything is completed."""
+    """Everything that is loaded before the first completion."""
 
     options: CompleteOptions
-    """What `complete` would be told, with the frames that the work starts from."""
     opened: Opened
     task: Task
     explorer: Explorer
     cameras: Mapping[int, Camera]
-    """Those of all photographs that can be used, by their frames, in the frame of the result."""
+    """Cameras of all usable photographs by frame, in the frame of the result."""
     seconds: Mapping[str, float]
-    """What it took to find out."""
 
 
 def run_live(options: LiveOptions) -> None:
-    """Serve the page until Ctrl-C.
-
-    Raises:
-        InputError: anything about the input that the user can mend.
-    """
+    """Serve the page until Ctrl-C."""
     check_viser()
-    # Here, so that its want is a sentence.
+    # Imported here because viser may be missing.
     from gscompleter.live.page import Page, Subject
 
     console = Console(stderr=True, quiet=options.quiet)
@@ -85,11 +78,7 @@ def run_live(options: LiveOptions) -> None:
 
 
 def check_viser() -> None:
-    """Refuse to go on without viser.
-
-    Raises:
-        InputError: where it is not installed.
-    """
+    """Refuse to continue without viser."""
     if find_spec("viser") is None:
         raise InputError(
             "The live page needs viser, which is not installed; run "
@@ -98,38 +87,39 @@ def check_viser() -> None:
 
 
 def prepare(options: LiveOptions, console: Console) -> Prepared:
-    """Open the scene as `complete` does.
-
-    Raises:
-        InputError: as `complete_folder`.
-    """
-    asked = as_complete(options)
-    opened, task, explorer, seconds = prepared(asked, console)
-    say(console, *found_out(asked, opened, task))
+    """Open the scene as `complete` does."""
+    as_complete_options = as_complete(options)
+    opened, task, explorer, seconds = prepared(as_complete_options, console)
+    say(console, *found_out(as_complete_options, opened, task))
     if task.scene is not None and task.scene.is_antialiased:
         say(console, CLASSIC)
     frames = frames_of(task)
-    asked = replace(asked, context=frames, target=(str(options.out / TARGETS),))
-    return Prepared(asked, opened, task, explorer, cameras_of(asked, opened, task), seconds)
+    as_complete_options = replace(
+        as_complete_options, context=frames, target=(str(options.out / TARGETS),)
+    )
+    return Prepared(
+        as_complete_options,
+        opened,
+        task,
+        explorer,
+        cameras_of(as_complete_options, opened, task),
+        seconds,
+    )
 
 
 def as_complete(options: LiveOptions) -> CompleteOptions:
-    """What `complete` would be told."""
+    """Convert the options to those of `complete`."""
     shared = {field.name: getattr(options, field.name) for field in fields(CompletingOptions)}
     return CompleteOptions(**shared)
 
 
 def frames_of(task: Task) -> tuple[int, ...]:
-    """The numbers of the photographs that the work starts from."""
+    """Return the frame numbers of the context."""
     return tuple(view.frame for view in task.views if view.frame is not None)
 
 
 def begin(ready: Prepared) -> Session:
-    """The session before anything is completed.
-
-    Raises:
-        InputError: as `GSCompleter.begin`.
-    """
+    """Start the session."""
     task, completer = ready.task, ready.explorer.completer
     origin, resolution = ready.opened.photographs.origin, working_size(ready.options.resolution)
     begun = completer.begin(task.views, task.scene, task.witnesses)
@@ -137,8 +127,7 @@ def begin(ready: Prepared) -> Session:
 
 
 def photographs_of(ready: Prepared) -> list[View]:
-    """Small photographs for the page: those that the work starts from, and others that lie far
-    apart; none that cannot be read."""
+    """Read small photographs for the page: the context and others far apart."""
     cameras = [view.camera for view in ready.task.views]
     known = dict(zip(frames_of(ready.task), cameras, strict=True))
     others = [frame for frame in ready.cameras if frame not in known]
@@ -154,26 +143,22 @@ def photographs_of(ready: Prepared) -> list[View]:
 
 
 def hole_of(ready: Prepared, completion: Completion) -> Camera | None:
-    """The camera that the scene is most worth completing for, as `complete` finds it."""
+    """Find the next-best target camera."""
     choices = ready.explorer.plan(completion, list(ready.cameras.values()), 1)
     return choices[0].camera if choices else None
 
 
 class Saver:
-    """Writes OUT; what it wrote itself it may replace."""
+    """Saver of the session. It may replace its own results."""
 
     def __init__(self, ready: Prepared) -> None:
         self._ready, self._wrote = ready, False
 
     def save(self, session: Session) -> str:
-        """Write what `complete` writes; returns a sentence.
-
-        Raises:
-            InputError: where nothing was completed, or OUT cannot be written.
-        """
+        """Write the results of `complete`, and return a sentence."""
         options = self._ready.options
         if not session.steps:
-            raise InputError("Nothing has been completed; there is nothing to save.")
+            raise InputError("There is nothing to save; complete a hole first.")
         with output_folder(options.out, self._wrote or replaceable(options)) as folder:
             write_done(folder, options, done(self._ready, session), self._ready.explorer)
             write_cameras(folder / TARGETS, [step.told for step in session.steps])
@@ -182,7 +167,7 @@ class Saver:
 
 
 def done(ready: Prepared, session: Session) -> Done:
-    """What `complete` would have done."""
+    """Describe the session as a finished completion."""
     now = session.now
     completion = replace(now, seconds=total(now.seconds, ready.seconds))
     targets = [Target(result.target) for result in now.targets]
@@ -190,9 +175,9 @@ def done(ready: Prepared, session: Session) -> Done:
 
 
 def serve(page: Page, options: LiveOptions) -> None:
-    """Say where the page is, open it, and do what it asks for until Ctrl-C."""
+    """Print the address, open the page, and work until Ctrl-C."""
     address = f"http://{options.host}:{page.server.get_port()}/"
-    # Whoever waits for this line finds the server listening.
+    # Printed once the server listens.
     print(f"{address} (Ctrl-C ends it)", flush=True)
     if not options.no_open:
         webbrowser.open(address)

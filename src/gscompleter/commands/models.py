@@ -1,4 +1,4 @@
-"""The command `models`: the published weights as a table, or as JSON for machines."""
+"""The command `models`: published weights as a table or JSON."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from gscompleter.weights.fetching import INSTALL, cached, hub_is_installed, plac
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
 WIDEST = 1000
-"""Characters in a line where no terminal limits them."""
 
 
 def run_models(options: ModelsOptions) -> None:
-    """Print what weights are published and which are on this machine."""
+    """Print the published weights and their location on this machine."""
     found = {name: cached(weights) for name, weights in PUBLISHED.items()}
     if options.json:
         print(
@@ -30,7 +29,7 @@ def run_models(options: ModelsOptions) -> None:
 
 
 def as_json(weights: PublishedWeights, path: Path | None) -> dict[str, object]:
-    """Everything that is known of a file, and where it is and belongs on this machine."""
+    """Describe weights and their location."""
     return {
         **asdict(weights),
         "url": weights.url,
@@ -41,29 +40,29 @@ def as_json(weights: PublishedWeights, path: Path | None) -> dict[str, object]:
 
 
 def tell(found: dict[str, Path | None]) -> None:
-    """Print the table and what its marks mean."""
+    """Print the table and its footnotes."""
     table = Table(box=None)
     for title in ("name", "model", "parameters", "views", "size", "code / weights", "cached"):
         table.add_column(title, no_wrap=title == "name")
     table.add_column("source", overflow="fold")
     for name, path in found.items():
         table.add_row(*cells(PUBLISHED[name], path))
-    # Into a file or a pipe, every row is one line.
+    # Rows are not wrapped in a file or a pipe.
     console = Console(width=None if sys.stdout.isatty() else WIDEST, markup=False, highlight=False)
     console.print(table)
-    doubts: dict[str, list[str]] = {}
+    cautions: dict[str, list[str]] = {}
     for weights in PUBLISHED.values():
         if weights.caution:
-            doubts.setdefault(weights.caution, []).append(weights.name)
+            cautions.setdefault(weights.caution, []).append(weights.name)
     print("\n(!) Whether commercial use is allowed is unclear:")
-    for caution, names in doubts.items():
+    for caution, names in cautions.items():
         print(f"    {', '.join(names)}: {caution}.")
     if not hub_is_installed():
-        print(f"\nThe hub's cache was not looked at, for huggingface_hub is missing: {INSTALL}")
+        print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")
 
 
 def cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:
-    """A row of the table."""
+    """Format a row of the table."""
     fewest, most = weights.views
     count = weights.parameters
     return (

@@ -1,4 +1,4 @@
-"""From what a user named to what is completed: a scene opened, its cameras and photographs read."""
+"""Opening of a scene: photographs, cameras and the input splat of the options."""
 
 from __future__ import annotations
 
@@ -50,52 +50,46 @@ from gscompleter.stages.selection import points_before, select_context
 from gscompleter.types import Camera, Gaussians, View
 
 MIN_SIZE = 16
-"""Shorter side of an image, in pixels, under which there is nothing to match and to score."""
+"""Smallest side of an image, in pixels."""
 SPLATS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
-"""Endings of files of Gaussians."""
 MAX_DIGITS = 9
-"""Characters of the longest number of a frame."""
 CHOSEN, CHOSEN_WITH_SCENE = 3, 8
-"""Photographs that are chosen where none are named: to reconstruct the context, whose cost grows
-with their number, and to keep an eye on a scene that was brought."""
+"""Number of context photographs if none are named, without and with an input splat."""
 CHOSEN_FOR_ALL = 8
-"""Photographs that are chosen where no target is named either, and all of the scene matters."""
+"""Number of context photographs if no target is named either."""
 WITNESSES, WITNESS_SIDE = 6, 320
-"""Photographs that tell how far away things are where nobody says, and their longer side."""
+"""Photographs for depth range estimation, and the longer side of these and of check views."""
 MAX_WITNESSES = 40
-"""Photographs, besides the context, that tell what of a scene is supported."""
+"""Most check views of an input splat, in addition to the context."""
 
 
 @dataclass(frozen=True)
 class Opened:
-    """Posed photographs, and where they come from."""
+    """Photographs with cameras, and their source."""
 
     photographs: Photographs
     format: str
-    """Name of the format, or `photographs` where the cameras had to be found."""
     number: int
-    """How many photographs there are, those included whose camera was not found."""
+    """Number of photographs, with those whose camera was not found."""
 
     def with_ego_vehicle(self) -> Opened:
-        """Return the same, the vehicle that carries the camera being a part of the scene."""
+        """Return a copy that does not mask the vehicle that carries the camera."""
         return replace(self, photographs=self.photographs.with_ego_vehicle())
 
 
 @dataclass(frozen=True)
 class ContextBudget:
-    """How many photographs a context that nobody named may be made of."""
+    """Number of context photographs if none are named."""
 
     usable: int
-    """Photographs to choose from."""
     wanted: int
-    """As many as are worth their time."""
     allowed: int
-    """As many of these as there is memory for, but never fewer than the work starts from."""
+    """The default number, limited by memory but never below the minimum."""
 
 
 @dataclass(frozen=True)
 class DepthSource:
-    """Who told the depth range of a scene: given, scene, points, splat or features."""
+    """Source of each end of the depth range: given, scene, points, splat or features."""
 
     near: str
     far: str
@@ -103,38 +97,29 @@ class DepthSource:
 
 @dataclass(frozen=True)
 class Task:
-    """What is completed, and in which frame."""
+    """Input of a completion."""
 
     views: Sequence[View]
     targets: Sequence[Target]
     frame: Float[np.ndarray, "4 4"]
-    """From the frame of the photographs to that of the result."""
+    """Similarity from the frame of the photographs to that of the result."""
     origin: Float[np.ndarray, "3"]
-    """Where the result is told from, in the coordinates of the photographs or of the splat's file;
-    zero where those are not remote."""
+    """Origin of the result in the coordinates of the input; zero unless those are large."""
     depths: DepthSource
     scene: Gaussians | None = None
-    """The splat that was brought; None where the context is reconstructed."""
+    """Input splat, or None to reconstruct the context."""
     brought: Brought | None = None
-    """The file it came from."""
     method: str = "given"
-    """How the frame was found."""
     said: str = "the frame of the photographs"
-    """The same, for the user."""
+    """Description of `method` for the user."""
     witnesses: Sequence[View] | None = None
-    """The other photographs of `scene`, small: they tell what of it is supported."""
+    """Check views of the input splat, at low resolution."""
     budget: ContextBudget | None = None
-    """How many photographs might be chosen; None where they were named."""
+    """Number of context photographs, or None if they are named."""
 
 
 def open_scene(options: SceneOptions, console: Console) -> Opened:
-    """The posed photographs of `options.folder`. Where it has no cameras, they are found first, and
-    kept in the output folder, whatever becomes of the completion.
-
-    Raises:
-        InputError: as `open_photographs` and `find_poses`, and where another program's cameras
-            lie beside the photographs.
-    """
+    """Open the photographs. If they have no cameras, find them and keep them in OUT."""
     folder, poses, number = options.folder, options.out / POSES, None
     refuse_splat(folder)
     if options.format is None and holds_photographs(folder) and recognised(folder) is None:
@@ -153,11 +138,7 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
 
 
 def refuse_splat(path: Path) -> None:
-    """Refuse a file of Gaussians where photographs are needed.
-
-    Raises:
-        InputError: where `path` has the ending of such a file.
-    """
+    """Refuse a file of Gaussians given as the folder of photographs."""
     if not os.path.isdir(path) and path.name.lower().endswith(SPLATS):
         raise InputError(
             f"{quoted(path, 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
@@ -166,11 +147,7 @@ def refuse_splat(path: Path) -> None:
 
 
 def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
-    """The photographs and targets that the options name, once it is seen that there is room.
-
-    Raises:
-        InputError: where one does not exist, is impossible or cannot be read.
-    """
+    """Read the photographs and targets of the options, after checking sizes and memory."""
     given = opened.photographs
     targets = read_targets(given, options)
     if options.context:
@@ -181,17 +158,13 @@ def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
 
 
 def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task:
-    """The photographs that the options name, or all, and no target.
-
-    Raises:
-        InputError: where one does not exist, is impossible or cannot be read, or there is none.
-    """
+    """Read the named photographs, or all."""
     given, resolution = opened.photographs, working_size(options.resolution)
     frames = options.context or tuple(usable_cameras(given, range(len(given)), resolution))
     if not frames:
         raise InputError(
-            f"No photograph of {quoted(options.folder)} can be used; bring those that the splat "
-            "was trained on."
+            f"No photograph of {quoted(options.folder)} can be used; name the folder that the "
+            "splat was trained on."
         )
     return task_of(options, given, frames, (), device, check_sides)
 
@@ -204,8 +177,7 @@ def task_of(
     device: str,
     check: Callable[[Sequence[Camera]], None],
 ) -> Task:
-    """The photographs of `frames`, ascending, and the targets with theirs, once their cameras pass
-    `check`."""
+    """Read the photographs of `frames`, in ascending order, once the cameras pass `check`."""
     frames, resolution = sorted(frames), working_size(options.resolution)
     bounded = with_depth_range(given, frames, resolution)
     targets = [replace(t, camera=with_planes(t.camera, bounded)) for t in targets]
@@ -225,12 +197,9 @@ def in_frame_of_splat(
     opened: Opened,
     order: Int64[Tensor, "n"] | None = None,
 ) -> Task:
-    """`task` with the splat of a file, its cameras brought to where the photographs show it.
+    """Add the splat of a file to the task, and move its cameras into the splat's frame.
 
-    `order` says where in the file each Gaussian lies, if they are not in its order.
-
-    Raises:
-        InputError: where the photographs show something else.
+    `order` has the index of each Gaussian in the file if they were reordered.
     """
     given, device = opened.photographs, task.views[0].image.device
     cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
@@ -254,10 +223,9 @@ def in_frame_of_splat(
 
 
 def with_witnesses(task: Task, given: Photographs) -> Task:
-    """`task` with photographs that are neither context nor target, closest to the targets, or to
-    the context where there is none, and from all sides; none of them that cannot be read."""
-    taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
-    others = [frame for frame in range(len(given)) if frame not in taken]
+    """Add check views: unused photographs near the targets and all around."""
+    used = {view.frame for view in task.views} | {target.frame for target in task.targets}
+    others = [frame for frame in range(len(given)) if frame not in used]
     cameras = usable_cameras(given, others, WITNESS_SIDE)
     wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
     views = []
@@ -268,8 +236,7 @@ def with_witnesses(task: Task, given: Photographs) -> Task:
 
 
 def near_and_far(wanted: Sequence[Camera], cameras: Mapping[int, Camera], count: int) -> list[int]:
-    """The frames, ascending, of up to `count` cameras: half of them closest to `wanted`, the others
-    far apart among the rest. What is added near a target can stand before any photograph."""
+    """Select up to `count` frames: half nearest to `wanted`, the others spread over the rest."""
     near = closest(wanted, cameras, count if len(cameras) <= count else count // 2)
     rest = [frame for frame in cameras if frame not in near]
     if not rest:
@@ -279,18 +246,18 @@ def near_and_far(wanted: Sequence[Camera], cameras: Mapping[int, Camera], count:
 
 
 def with_working_range(task: Task, renderer: Renderer) -> Task:
-    """`task`, its photographs with the depth range that is worked in."""
+    """Set the depth range of the photographs."""
     near, far = working_range(task.views, task.scene, renderer)
     return replace(task, views=[ranged(view, near, far) for view in task.views])
 
 
 def rows_kept(path: Path) -> Bool[Tensor, "n"] | None:
-    """Which rows of a .ply are left once those that cannot be drawn are dropped; None of others."""
+    """Return the mask of finite Gaussians in a .ply, or None for other formats."""
     return drawable_rows(path) if format_of(path) == "ply" else None
 
 
 def check_context(options: SceneOptions) -> None:
-    """Refuse too few context frames, and the same one twice."""
+    """Refuse too few or repeated context frames."""
     context, needed = options.context, needed_views(options)
     if context is not None and len(context) < needed:
         raise InputError(
@@ -306,38 +273,37 @@ def check_context(options: SceneOptions) -> None:
 
 
 def check_targets(options: CompleteOptions) -> None:
-    """Refuse targets that are named, and others that are to be found besides."""
+    """Refuse `--target` together with `--auto`."""
     if options.target and options.auto is not None:
         raise InputError(
-            "Targets are named, and others are to be found besides; name them, or let them be "
-            "found, and complete the result for the others.",
+            "--target and --auto are both given; use one of them, and complete the result again "
+            "with the other.",
             "auto",
         )
 
 
 def needed_views(options: SceneOptions) -> int:
-    """The fewest photographs that the work starts from."""
+    """Return the minimum number of photographs."""
     return 2 if options.scene is None else 1
 
 
 def chosen_context(
     options: CompleteOptions, given: Photographs, targets: Sequence[Target]
 ) -> tuple[tuple[int, ...], ContextBudget]:
-    """Frames that matter to the targets, or where there are none, that show most of the scene;
-    never a target itself, whose photograph is for scoring. And how many there might be.
+    """Choose context frames for the targets, or for the whole scene without any.
 
-    Raises:
-        InputError: where too few photographs are left, or nothing tells how far away things are.
+    Targets are never chosen, because their photographs score the result.
     """
-    asked = {target.frame for target in targets}
+    target_frames = {target.frame for target in targets}
     resolution = working_size(options.resolution)
-    cameras = usable_cameras(given, [f for f in range(len(given)) if f not in asked], resolution)
+    cameras = usable_cameras(
+        given, [f for f in range(len(given)) if f not in target_frames], resolution
+    )
     if len(cameras) < needed_views(options):
-        there = "is 1 photograph" if len(cameras) == 1 else f"are {len(cameras)} photographs"
-        needed = "1 is" if needed_views(options) == 1 else f"{needed_views(options)} are"
+        left = "photograph is" if len(cameras) == 1 else "photographs are"
         raise InputError(
-            f"Besides the targets there {there} that can be used, and at least {needed} needed; "
-            "name fewer targets, or add photographs."
+            f"{len(cameras)} usable {left} left without the targets, and the context needs at "
+            f"least {needed_views(options)}; name fewer targets, or add photographs."
         )
     frames, candidates = list(cameras), list(cameras.values())
     wanted = [target.camera for target in targets] or overview(candidates)
@@ -355,7 +321,7 @@ def chosen_context(
 def context_budget(
     options: CompleteOptions, candidates: Sequence[Camera], targets: Sequence[Target]
 ) -> ContextBudget:
-    """How many of the photographs that `candidates` took may be chosen."""
+    """Compute the number of context photographs from the defaults and the memory."""
     wanted = CHOSEN if options.scene is None else CHOSEN_WITH_SCENE
     if not targets:
         wanted = CHOSEN_FOR_ALL
@@ -369,7 +335,7 @@ def context_budget(
 def usable_cameras(
     given: Photographs, frames: Sequence[int], resolution: Resolution
 ) -> dict[int, Camera]:
-    """The cameras of those frames that have a photograph and are possible."""
+    """Return the valid cameras of frames that have a photograph."""
     cameras = {}
     for frame in frames:
         try:
@@ -381,7 +347,7 @@ def usable_cameras(
 
 
 def closest(targets: Sequence[Camera], cameras: Mapping[int, Camera], count: int) -> list[int]:
-    """The frames, ascending, whose cameras stand closest to a target."""
+    """Select the frames whose cameras are nearest to a target, in ascending order."""
     centers = torch.stack([target.center for target in targets])
     distance = {f: (centers - c.center).norm(dim=-1).min().item() for f, c in cameras.items()}
     return sorted(sorted(cameras, key=distance.__getitem__)[:count])
@@ -390,7 +356,7 @@ def closest(targets: Sequence[Camera], cameras: Mapping[int, Camera], count: int
 def points_told(
     given: Photographs, targets: Sequence[Camera], cameras: dict[int, Camera]
 ) -> Float[Tensor, "n 3"]:
-    """About where the targets see the scene, by the depth range, as known or told by features."""
+    """Sample points in front of the targets within the known or estimated depth range."""
     near, far = given.near, given.far
     if near is None or far is None:
         frames = closest(targets, cameras, WITNESSES)
@@ -400,7 +366,7 @@ def points_told(
 
 
 def depth_source(options: SceneOptions, given: Photographs, bounded: Photographs) -> DepthSource:
-    """Who told each end of the depth range: who comes first."""
+    """Find the source of each end of the depth range."""
 
     def teller(name: str) -> str:
         if getattr(options, name) is not None:
@@ -415,7 +381,7 @@ def depth_source(options: SceneOptions, given: Photographs, bounded: Photographs
 
 
 def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
-    """The target cameras in the order of the command line."""
+    """Read the target cameras in the order of the command line."""
     resolution = working_size(options.resolution)
     targets = []
     for word in options.target:
@@ -430,11 +396,7 @@ def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
 
 
 def check_target_file(word: str, given: Photographs) -> None:
-    """Refuse a target that is neither the number of a frame nor a file.
-
-    Raises:
-        InputError: where nothing lies at the path `word`.
-    """
+    """Refuse a target that is neither a frame number nor a file."""
     if not os.path.exists(word):
         raise InputError(
             f"'{quoted(word, 60)}' is no target: a target is the number of a frame, from 0 to "
@@ -445,12 +407,12 @@ def check_target_file(word: str, given: Photographs) -> None:
 
 
 def with_planes(camera: Camera, photographs: Photographs) -> Camera:
-    """`camera` with the depth range of the photographs."""
+    """Set the depth range of a camera."""
     return replace(camera, near=photographs.near, far=photographs.far)
 
 
 def with_photograph(target: Target, given: Photographs, resolution: Resolution) -> Target:
-    """`target` and what its camera took, if it is a frame that has a photograph."""
+    """Add its photograph to a target, if there is one."""
     if target.frame is None or not given.has_photograph(target.frame):
         return target
     (view,) = given.views([target.frame], resolution)
@@ -458,17 +420,13 @@ def with_photograph(target: Target, given: Photographs, resolution: Resolution) 
 
 
 def check_sizes(cameras: Sequence[Camera]) -> None:
-    """Refuse images with nothing in them to match and to score, and those beyond all memory."""
+    """Refuse images that are too small, or too large for the memory."""
     check_sides(cameras)
     check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
 
 
 def check_scene(task: Task, scene: Gaussians) -> None:
-    """Refuse a scene that does not fit into memory together with what its photographs tell of it.
-
-    Raises:
-        InputError: where there is less than it needs.
-    """
+    """Refuse a splat that does not fit into memory together with its photographs."""
     cameras = [v.camera for v in task.views] + [target.camera for target in task.targets]
     pixels = max(camera.width * camera.height for camera in cameras)
     needed = needed_bytes(pixels, len(cameras)) + scene_needs(task, scene)
@@ -476,7 +434,7 @@ def check_scene(task: Task, scene: Gaussians) -> None:
 
 
 def scene_needs(task: Task, scene: Gaussians) -> int:
-    """About how much memory a scene that is brought to a task takes besides, in bytes."""
+    """Estimate the additional memory of an input splat, in bytes."""
     cameras = [view.camera for view in (*task.views, *(task.witnesses or ()))]
     parts = [part for part in vars(scene).values() if isinstance(part, Tensor)]
     numbers = sum(part[0].numel() for part in parts)
@@ -485,7 +443,7 @@ def scene_needs(task: Task, scene: Gaussians) -> int:
 
 
 def check_sides(cameras: Sequence[Camera]) -> None:
-    """Refuse images with nothing in them to match and to score."""
+    """Refuse images that are too small."""
     for camera in cameras:
         if min(camera.width, camera.height) < MIN_SIZE:
             raise InputError(
@@ -495,7 +453,7 @@ def check_sides(cameras: Sequence[Camera]) -> None:
 
 
 def frame_number(word: str) -> int | None:
-    """The number that `word` writes, or None where it names a file."""
+    """Parse a frame number; None if the word is a file name."""
     if re.fullmatch("-?[0-9]+", word) is None:
         return None
     if len(word) > MAX_DIGITS:
@@ -504,6 +462,6 @@ def frame_number(word: str) -> int | None:
 
 
 def say(console: Console, *lines: str) -> None:
-    """Print lines as they are."""
+    """Print lines without markup."""
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

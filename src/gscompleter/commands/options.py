@@ -1,7 +1,4 @@
-"""What the commands can be told. The command line is derived from these classes.
-
-Nothing here imports torch, so that `gscompleter --help` answers at once.
-"""
+"""Options of the commands, from which the command line is derived. Nothing here needs torch."""
 
 from __future__ import annotations
 
@@ -22,134 +19,125 @@ Frame = Annotated[int, Interval(ge=0, lt=10**9)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
-"""Height and width, the most pixels of the longer side, or the photographs' own size."""
+"""Height and width, the longest side, or `full` for the photographs' own size."""
 LONG_SIDE = 640
-"""Most pixels of the longer side of a photograph, where nobody says."""
+"""Default length of a photograph's longer side, in pixels."""
 
 FOUND = 4
-"""Cameras that are found at most, where nobody says how many."""
+"""Default number of target cameras that are searched for."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Settings):
-    """What every command can be told that does something."""
+    """Options of every command that writes something."""
 
     quiet: bool = False
-    """Say nothing but errors."""
+    """Print errors only."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComputeOptions(Options):
-    """What every command can be told that computes for long."""
+    """Options of every command that computes for long."""
 
     threads: Annotated[int, Interval(ge=1, le=1024)] | None = None
-    """How many threads compute; as many as there are usable cores if not given. A completion on a
-    CPU does not depend on it."""
+    """CPU threads to compute with; all available cores if not given. The result does not depend on
+    it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(ComputeOptions):
-    """What every command can be told that completes something."""
+    """Options of every command that completes scenes."""
 
     device: Device = "auto"
-    """Where to run."""
+    """Device to compute on; `auto` takes an NVIDIA GPU if there is one."""
     seed: Seed = 0
-    """Of everything random. The same seed gives the same bytes on a CPU."""
+    """Seed of all random numbers. The same seed gives the same files on a CPU."""
 
     @property
     def models(self) -> tuple[str, ...]:
-        """Names of the models that are asked for, whatever the photographs are."""
+        """Names of the models in use."""
         return ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions(RunOptions):
-    """What every command can be told that lets its models be chosen."""
+    """Options of every command with a choice of models."""
 
     reconstructor: str = "plane-sweep"
-    """The model that turns views into Gaussians: plane-sweep, which needs no weights, or one of
-    those that `gscompleter models` lists."""
+    """Model that turns photographs into Gaussians: plane-sweep, which needs no weights, or one that
+    `gscompleter models` lists."""
     weights: Path | None = None
-    """The file of its weights, where they are not to be downloaded."""
+    """Weights file of the reconstructor; downloaded if not given."""
     synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
-    """How the image at a target comes about."""
 
     @property
     def models(self) -> tuple[str, ...]:
+        """Names of the models in use."""
         return self.reconstructor, self.synthesis.name
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions(ComputeOptions):
-    """What every command can be told that opens posed photographs, and may bring a splat."""
+    """Options of every command that opens photographs with cameras."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Posed photographs: a folder with a COLMAP model or a nerfstudio transforms.json, a
-    cameras.json beside its photographs, a poses_bounds.npy of LLFF, a sequence of KITTI, a scene
-    of DGP, a segment of Waymo, a sequence of PandaSet, a chunk of pixelSplat, or a camera file of
-    RealEstate10K beside its frames. The cameras of photographs that have none are found by COLMAP
-    and kept in OUT/colmap."""
+    """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
+    PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
+    them and they are kept in OUT/colmap."""
     context: tuple[Frame, ...] | None = None
-    """Numbers of the frames to work with, in the order of the sorted file paths."""
     out: Path
-    """The folder to write."""
     format: str | None = None
-    """What SCENE is: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
-    mmdet3d, pandaset, chunks or real-estate-10k. Found by what lies there if not given."""
+    """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
+    mmdet3d, pandaset, chunks or real-estate-10k. Detected if not given."""
     scene: Path | None
-    """A file of Gaussians."""
     resolution: Size = LONG_SIDE
-    """Height and width to work at: photographs are scaled to cover it and cropped around the
-    centre. One number is the most pixels of the longer side, to which larger photographs are
-    shrunk; `full` keeps their own size."""
+    """Working size: the longest side in pixels (photographs are never enlarged), or height and
+    width (photographs are scaled and cropped), or `full`."""
     near: float | None = None
-    """Smallest depth in the scene, in its own unit. Estimated if not given."""
+    """Smallest depth in the scene, in the unit of its cameras; estimated if not given."""
     far: float | None = None
-    """Largest depth in the scene, in its own unit. Estimated if not given."""
+    """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
     drop_nonfinite: bool = False
-    """Leave out Gaussians of the scene that hold NaN or infinity."""
+    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     overwrite: bool = False
-    """Replace what an earlier run left in the output folder."""
+    """Replace the results of an earlier run in the output folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompletingOptions(SceneOptions, ModelOptions):
-    """What every command can be told that opens a scene and completes it."""
+    """Options of the commands that complete one scene."""
 
     scene: Path | None = None
-    """A file of Gaussians to complete, which is kept as it is. Without it the context is
+    """File of Gaussians (a splat) to complete; its Gaussians are kept. If not given, the scene is
     reconstructed from the photographs."""
-    keep_unsupported: bool = False
-    """Never set Gaussians of the scene aside that no photograph supports."""
+    no_prune: bool = False
+    """Keep Gaussians of the splat that cover a hole although no photograph shows them."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
-    """Settings of the stages. `--config NAME` says where they start: default, paper, an ablation
-    such as no-sa, or a YAML file. Those given here are applied over it."""
+    """Settings of the method. `--config NAME` selects default, paper, an ablation such as no-sa, or
+    a YAML file; the options here change single settings of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompleteOptions(CompletingOptions):
-    """Fill what the photographs never saw, as seen from the targets, and write the scene."""
+    """Fill the parts of a scene that its photographs do not show, and write the result."""
 
     context: tuple[Frame, ...] | None = None
-    """Numbers of the frames to start from, in the order of the sorted file paths. If not given,
-    those that matter to the targets are chosen, or without a target those that show most; a
-    target's own photograph is none of them."""
+    """Frame numbers of the photographs to start from, counted in the order of their file paths. If
+    not given, those that help the targets most. Photographs of targets are never used."""
     target: tuple[str, ...] = ()
-    """Frames to complete the scene for, by number, or a file of cameras (transforms.json,
-    cameras.json, COLMAP's images.txt, SuperSplat's poses). Several are
-    completed one after the other into one scene. If not given, cameras are found that see holes,
-    and targets.json has them."""
+    """Cameras to complete the scene for: frame numbers, or a file of cameras (transforms.json,
+    cameras.json, COLMAP's images.txt, SuperSplat poses). If not given, cameras that see holes are
+    searched for and written to targets.json."""
     auto: Annotated[int, Interval(ge=1, le=255)] | None = None
-    """How many cameras are found at most, where no target is given: 4 unless a number is named.
-    Fewer are taken where little is left to complete."""
+    """Most cameras to search for if no target is given; 4 if no number follows."""
     dry_run: bool = False
-    """Only write targets.json, which can be edited and given to --target, and show what would be
-    done."""
+    """Only search for cameras, write them to targets.json (to edit and to pass to --target), and
+    print the plan."""
     out: Path
-    """Folder for completed.ply, generated.ply, context.ply, targets.json, images/, report.html,
-    report.json and summary.json."""
-    film: bool = False
-    """Write film.mp4, too: about six seconds on the way through the holes, before and after side by
+    """Folder for the completed scene (completed.ply), the report (report.html), images and
+    summary.json."""
+    video: bool = False
+    """Also write video.mp4: a flight of six seconds through the holes, before and after side by
     side."""
 
 
@@ -157,223 +145,215 @@ class CompleteOptions(CompletingOptions):
 class LiveOptions(CompletingOptions):
     """Complete a scene in the browser: fly to a hole, press a button, and watch it close.
 
-    Every step can be undone. What is saved is what `gscompleter complete` writes for the same
-    photographs and the cameras in OUT/targets.json.
+    Every step can be undone. Saving writes the same files as `gscompleter complete`.
     """
 
     context: tuple[Frame, ...] | None = None
-    """Numbers of the frames to start from, in the order of the sorted file paths; those that show
-    most if not given."""
+    """Frame numbers of the photographs to start from, counted in the order of their file paths;
+    those that show most of the scene if not given."""
     out: Path = Path("live")
-    """Folder that the button Save writes, with the files that `complete` writes."""
+    """Output folder of the Save button."""
     resolution: Size = (256, 256)
-    """Height and width to work at, as `complete` has it. Smaller is faster."""
+    """Working size: height and width, the longest side in pixels, or `full`. Smaller is faster."""
     port: Port = 0
-    """Port to serve at; any that is free if not given."""
+    """Port of the page; a free one if not given."""
     host: str = "127.0.0.1"
-    """Address to serve at. Whoever reaches it can press the buttons; the default is this machine
-    alone."""
+    """Address of the page. Anyone who can reach it can use it; the default is this computer
+    only."""
     no_open: bool = False
-    """Only say where the page is, and open no browser."""
+    """Print the address without opening a browser."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CleanOptions(SceneOptions):
-    """Take out of a splat what its photographs are better without or do not need.
+    """Remove Gaussians of a splat that make its photographs worse or that none of them needs.
 
-    Nothing is generated, and no photograph is matched worse by more than a hundredth of a decibel.
-    `gscompleter strip` puts back what was taken out.
+    Nothing is generated, and no photograph loses more than 0.01 dB. `gscompleter strip` puts the
+    removed Gaussians back.
     """
 
     context: tuple[Frame, ...] | None = None
-    """Numbers of the frames that judge, in the order of the sorted file paths. All that have a
-    photograph if not given. What only others need is not safe."""
+    """Frame numbers of the photographs to compare with, counted in the order of their file paths;
+    all if not given. Gaussians that only other photographs need may be removed."""
     out: Path
     """Folder for completed.ply, removed.ply and summary.json."""
     scene: Path
-    """The file of Gaussians to clean."""
+    """File of Gaussians to clean."""
     device: Device = "auto"
-    """Where to run."""
+    """Device to compute on."""
     config: CleaningConfig = CleaningConfig()
-    """What is taken out."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(RunOptions):
-    """Complete a real stereo pair beyond its left and its right camera, and show before/after.
+    """Complete a stereo pair to the left and right of its cameras, and show before and after.
 
-    The photographs are the Middlebury motorcycle pair that scikit-image carries. Nothing is
+    The photographs are the Middlebury motorcycle pair that scikit-image contains. Nothing is
     downloaded.
     """
 
     out: Path = Path("demo")
     """Folder for the scene, its completion and before_after.png."""
     overwrite: bool = False
-    """Replace what an earlier run left in the output folder."""
+    """Replace the results of an earlier run in the output folder."""
 
     @property
     def models(self) -> tuple[str, ...]:
+        """Names of the models in use."""
         return ModelOptions().models
 
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions(Options):
-    """What every command can be told that lets others do its work."""
+    """Options of every command that can run on several machines."""
 
     engine: EngineName | None
-    """Who does the work."""
     workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
-    """How many workers there are. If not given, as many as there are cores and memory for on this
-    machine, as the cluster of Ray has room for, or one job of SLURM."""
+    """Number of workers; as many as fit if not given (one with SLURM)."""
     threads: Annotated[int, Interval(ge=1, le=1024)] | None = None
-    """How many threads compute in each; if not given, the cores are shared out on this machine,
-    and it is one elsewhere."""
+    """CPU threads of each worker; an equal share of the cores on this machine, one elsewhere if not
+    given."""
     address: str | None = None
-    """Of a cluster of Ray that is there; one is started on this machine if not given."""
+    """Address of a running Ray cluster; a cluster is started here if not given."""
     gpus: Annotated[float, Interval(ge=0, le=1024)] = 0.0
-    """GPUs that a worker of Ray or SLURM holds; of Ray also a part of one."""
+    """GPUs per worker with Ray (also fractions) or SLURM."""
     slurm: tuple[str, ...] = ()
-    """What SLURM is told with --engine submitit, as in --slurm partition=gpu time=120."""
+    """Parameters for SLURM with --engine submitit, as in --slurm partition=gpu time=120."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(ModelOptions, EngineOptions):
-    """Run methods on cases of which the truth is known, and score them.
+    """Run methods on cases with known target photographs, and score them.
 
-    Run again with the same options, it goes on where it was stopped. The tables are printed and
+    Run the same command again to continue an interrupted evaluation. The tables are printed and
     written at the end; `gscompleter tables OUT` writes them at any time.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """A cases.json; or, with --protocol, scenes: folders with a transforms.json or of such
-    folders, chunks of pixelSplat, camera files of RealEstate10K, or drives (Waymo, nuScenes, KITTI,
-    DDAD, PandaSet), of which the front camera is taken."""
+    """A cases.json; or, with --protocol, scenes: folders with a transforms.json, folders of such
+    folders, pixelSplat chunks, RealEstate10K camera files, or drives (Waymo, nuScenes, KITTI, DDAD,
+    PandaSet; front camera)."""
     out: Path
-    """Folder for the results, a new one or that of an earlier run to go on with."""
+    """Folder for the results; a folder of an earlier run is continued."""
     protocol: tuple[str, ...] = ()
-    """Choice of the given frames and the target: n-10 (frames n and n + 10 for n + 20, then
-    n + 20 and n + 10 for n, for n = 0, 21, 42, …, which is how we read the n-k of the paper; see
-    --one-per-scene), stress (0 and 30 for 99), or the path of an evaluation index; one or several.
-    A cases.json needs none. sequence-4 (or sequence-4-steps-6) completes each clip view after view:
-    frames 0 and 4 are given, then 8, 12, … are completed one after the other into one scene, and
-    once it is completed the photograph of a frame is given too. It takes context, full, paper,
-    ablations and reggs; the paper's study of long sequences is that with --generator oracle."""
+    """Choice of context and target frames; one or several of: n-10 (frames n and n + 10 for n + 20,
+    then n + 20 and n + 10 for n, for n = 0, 21, 42, …); stress (0 and 30 for 99); sequence-4 or
+    sequence-4-steps-6 (start from frames 0 and 4, then complete 8, 12, … one after the other); or
+    the path of an evaluation index. A cases.json needs none."""
     methods: tuple[str, ...] = ("context", "full", "paper")
-    """What to compare: context, full, paper, an ablation such as no-sa, densify-100, densify-800,
-    distill, reggs; or a group of them: ablations, baselines, all."""
-    again: Literal["nothing", "failures", "scores"] = "nothing"
-    """What of an earlier run is done once more: cases that failed, or all scores, from the
-    predictions that were saved."""
+    """Methods to compare: context, full, paper, an ablation such as no-sa, densify-100,
+    densify-800, distill, reggs; or a group: ablations, baselines, all."""
+    rerun: Literal["nothing", "failures", "scores"] = "nothing"
+    """Cases of an earlier run to repeat: those that failed, or the scoring of all saved
+    predictions."""
     shard: str | None = None
-    """i/n does every n-th case from the i-th on, i from 0 to n - 1; auto takes both from an array
-    of SLURM. Processes without it share the work, too."""
+    """Run every n-th case from the i-th on, given as i/n with i from 0; `auto` takes both from a
+    SLURM array. Processes without a shard share the work as well."""
     engine: EngineName | None = None
-    """Who does the work; this process alone if not given."""
+    """Engine that runs the cases; this process if not given."""
     resolution: Size | None = None
-    """What to work at, as `complete` has it. If not given, the resolution of the cases, or for
-    scenes that of `complete`."""
-    ignore_masked: bool = False
-    """Ignore what masks cover in the photographs, and boxes around what moves: nothing is made of
-    it, and it does not count in the scores."""
+    """Working size as in `complete`; by default that of the cases."""
+    use_masks: bool = False
+    """Ignore image regions that the data set masks or marks as moving objects, in the methods and
+    in the scores."""
     one_per_scene: bool = False
-    """Take one case of each scene: the first of each protocol (of n-10 frames 0 and 10 for 20) or
-    of a cases.json. The paper counts as many cases as scenes."""
+    """Run only the first case of each scene, for each protocol. The paper has one case per
+    scene."""
     ego_mask: bool = True
-    """Ignore parts of photographs that stay the same while the camera moves, such as the bonnet of
-    the vehicle that carries it, in all methods and in the scores."""
+    """Ignore image regions that stay the same while the camera moves, such as the bonnet of the car
+    that carries it, in the methods and in the scores."""
     limit: Annotated[int, Interval(ge=1)] | None = None
-    """Most cases to do, in all shards together."""
+    """Most cases to run, over all shards."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TablesOptions(Options):
-    """Write the tables of what `evaluate` has done so far, and print them."""
+    """Print and write the tables of an evaluation, finished or not."""
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """Folder that `evaluate` wrote. The tables and plots go there."""
+    """Output folder of `evaluate`; tables and plots are written there."""
     fid: bool = False
-    """Compare the pictures of each method with the photographs by FID, too."""
+    """Also compute the FID of each method."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class IndexOptions(Options):
-    """Write down which frames a protocol chooses in a data set."""
+    """Write the frames that a protocol selects in a data set."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """Scenes, as `evaluate` takes them."""
+    """Scenes as in `evaluate`."""
     protocol: str
-    """As `evaluate` takes it."""
+    """Protocol as in `evaluate`."""
     out: Path
-    """The evaluation index, a JSON file."""
+    """JSON file for the evaluation index."""
     overwrite: bool = False
-    """Replace the file where there is one."""
+    """Replace an existing file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(RunOptions):
-    """Measure what completions take on this machine, and how that grows.
+    """Measure how long completions take on this machine and how the time grows.
 
     Every completion is a process of its own, start-up included; methods are compared within one
-    process. All times are also told in yardsticks: the renderer, forward and backward, on 196,608
-    Gaussians at 256 x 256, just before and just after. Without a scene or cases it is the stereo
-    pair of `gscompleter demo` that is completed. The tables are printed.
+    process. Times are also given relative to a yardstick: one forward and backward pass of the
+    renderer with 196,608 Gaussians at 256 x 256. Without a scene or cases the stereo pair of
+    `gscompleter demo` is measured.
     """
 
     folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
-    """Posed photographs, as `complete` takes them; --context and --target name frames."""
+    """Photographs with cameras as in `complete`; needs --context and --target."""
     context: tuple[Frame, ...] = ()
-    """Frames to start from."""
+    """Frame numbers of the photographs to start from."""
     target: tuple[Frame, ...] = ()
-    """Frames to complete the scene for. Methods are compared on the first."""
+    """Frame numbers to complete the scene for. Methods are compared on the first."""
     resolution: tuple[int, int] = (256, 256)
-    """Height and width to work at, without --cases."""
+    """Working size, height and width, if --cases is not given."""
     near: float | None = None
-    """Smallest depth in the scene, in its own unit. Estimated if not given."""
+    """Smallest depth in the scene, in the unit of its cameras; estimated if not given."""
     far: float | None = None
-    """Largest depth in the scene, in its own unit. Estimated if not given."""
+    """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
     cases: Path | None = None
-    """A JSON file that names cases, and what they grow over, instead of a scene; as
-    benchmarks/performance.json does. Methods are compared on the first."""
+    """JSON file of cases and growth series instead of a scene, as benchmarks/performance.json.
+    Methods are compared on the first case."""
     only: tuple[str, ...] = ()
-    """Names of cases; all of the file if none is given."""
+    """Names of the cases to measure; all if not given."""
     methods: tuple[str, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
-    """What to compare: full, which is ours, autograd, which is ours without a frozen context,
-    densify-100, densify-800, distill, reggs."""
+    """Methods to compare: full (ours), autograd (ours without a frozen context), densify-100,
+    densify-800, distill, reggs."""
     growth: tuple[Literal["gaussians", "pixels", "views", "targets"], ...] = (
         "gaussians",
         "pixels",
         "views",
         "targets",
     )
-    """Over what to let the first case grow."""
+    """Quantities to increase in the first case."""
     repeats: Annotated[int, Interval(ge=1, le=1000)] = 5
-    """How often everything is measured."""
+    """Number of repetitions."""
     baseline_repeats: Annotated[int, Interval(ge=1, le=1000)] = 1
-    """How often at most methods are that take minutes: all but full and autograd."""
+    """Most repetitions of slow methods: all but full and autograd."""
     quick: bool = False
-    """Only try it: the smallest case, once, kernels compiled or not, two iterations of the
-    baselines, no growth."""
+    """Run a quick check: the smallest case once, two iterations of the baselines, no growth."""
     json: bool = False
-    """Print everything that was measured as JSON, instead of the tables."""
+    """Print all measurements as JSON instead of tables."""
     out: Path | None = None
     """Folder for bench.json, tables.md and growth.png."""
     overwrite: bool = False
-    """Replace what an earlier run left in the output folder."""
+    """Replace the results of an earlier run in the output folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelsOptions(Settings):
-    """List the published weights: what they are, under which licence, and which are cached."""
+    """List published model weights with their licences, and show which are downloaded."""
 
     json: bool = False
-    """Print everything that is known of them as JSON."""
+    """Print all details as JSON."""
 
 
 def most(options: CompleteOptions) -> int:
-    """How many targets are found, where none is named."""
+    """Return the number of targets to search for."""
     return FOUND if options.auto is None else options.auto
 
 
 def working_size(given: Size) -> tuple[int, int] | int | None:
-    """What `--resolution` asks for, as posed photographs take it."""
+    """Return `--resolution` as the readers of photographs take it."""
     return None if given == "full" else given

@@ -1,4 +1,4 @@
-"""What commands that open a scene say of it in `summary.json`, and what an interrupt leaves."""
+"""Input of a run for `summary.json`, and messages of interrupted runs."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from gscompleter.reports.completion import HeldOut
 from gscompleter.types import Camera, View
 
 MAX_HELD_OUT = 8
-"""Most unused photographs that are scored: each is drawn twice, like a target."""
+"""Most unused photographs to score."""
 
 
 def opened_as(options: SceneOptions, opened: Opened, task: Task) -> dict[str, Any]:
-    """What was opened, in which frame the result is, and the depth range that was worked in."""
+    """Describe the opened scene, its frame and its depth range."""
     camera = task.views[0].camera
     return {
         "scene": {
@@ -48,8 +48,7 @@ def settings_of(
     targets: Mapping[str, Any],
     models: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Everything that decided the result: what was opened, the targets and the models where there
-    are any, and `config`."""
+    """Describe all settings that determine the result."""
     return {
         "folder": str(options.folder),
         "format": options.format,
@@ -67,17 +66,12 @@ def settings_of(
 def read_held_out(
     options: SceneOptions, opened: Opened, task: Task, cameras: Mapping[int, Camera]
 ) -> list[HeldOut]:
-    """Read the photographs that are neither of the context nor of a target: at most `MAX_HELD_OUT`,
-    those closest to the targets, or to the context where there is none; none that is damaged.
+    """Read up to `MAX_HELD_OUT` unused photographs, nearest to the targets or the context.
 
-    Args:
-        options: What was asked for.
-        opened: Where the photographs lie.
-        task: What was completed.
-        cameras: Those of all photographs that can be used, in the frame of the result.
+    `cameras` are those of all usable photographs by frame, in the frame of the result.
     """
-    taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
-    others = {frame: camera for frame, camera in cameras.items() if frame not in taken}
+    used = {view.frame for view in task.views} | {target.frame for target in task.targets}
+    others = {frame: camera for frame, camera in cameras.items() if frame not in used}
     wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
     checks = {view.frame for view in task.witnesses or ()}
     held_out, device = list[HeldOut](), task.views[0].image.device
@@ -90,22 +84,18 @@ def read_held_out(
 
 
 def replaceable(options: SceneOptions) -> bool:
-    """Whether what lies in the output folder may give way to the result."""
+    """Return True if the content of the output folder may be replaced."""
     return options.overwrite or holds_poses_only(options.out)
 
 
 def holds_poses_only(out: Path) -> bool:
-    """Whether a folder has nothing in it but the poses that an earlier run found."""
+    """Return True if a folder contains only the cameras of an earlier run."""
     return os.path.isdir(out) and os.listdir(out) == [POSES]
 
 
 @contextmanager
 def saying_what_stays(out: Path) -> Iterator[None]:
-    """Let an interrupt say what it leaves in the output folder, where that is more than nothing.
-
-    Raises:
-        KeyboardInterrupt: with a sentence, or as it came.
-    """
+    """Let an interrupt name the results that were written."""
     before = written(out)
     try:
         yield
@@ -121,6 +111,6 @@ def saying_what_stays(out: Path) -> Iterator[None]:
 
 
 def written(out: Path) -> list[int | None]:
-    """When a result, and the cameras of its photographs, were written; None where they are not."""
+    """Return the modification times of the result and of found cameras, or None without."""
     summaries = [out / SUMMARY, out / POSES / SUMMARY]
     return [s.stat().st_mtime_ns if s.is_file() else None for s in summaries]

@@ -1,4 +1,4 @@
-"""The command `poses`: photographs in, their cameras out."""
+"""The command `poses`: find the cameras of photographs."""
 
 from __future__ import annotations
 
@@ -13,27 +13,22 @@ from gscompleter.commands.options import ComputeOptions
 
 @dataclass(frozen=True, kw_only=True)
 class PosesOptions(ComputeOptions):
-    """Find the cameras of photographs, and write them as a COLMAP folder (images and sparse/0).
+    """Find the cameras of photographs with COLMAP, and write a COLMAP folder.
 
-    Run again with the same photographs, it keeps what it found.
+    A second run with the same photographs keeps the result.
     """
 
     photographs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
-    """Folder of photographs of one scene that overlap. They are read, and stay as they are."""
+    """Folder of overlapping photographs of one scene. They are not changed."""
     out: Path
-    """The folder to write: upright copies in images, cameras and points in sparse/0."""
+    """Output folder: upright copies in images, cameras and points in sparse/0."""
     overwrite: bool = False
-    """Replace what an earlier run left in the output folder."""
+    """Replace the results of an earlier run in the output folder."""
 
 
 def run_poses(options: PosesOptions) -> None:
-    """Find the cameras, write them, and say how many there are and how well they fit.
-
-    Raises:
-        InputError: where there are too few photographs, none can be placed, or the folder cannot
-            be written.
-    """
-    # Here, so that `--help` waits for nothing.
+    """Find and write the cameras, and print their number and error."""
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.data.structure_from_motion import find_poses
@@ -47,6 +42,6 @@ def run_poses(options: PosesOptions) -> None:
         print(note)
     print(
         f"{found.registered} of {found.photographs} cameras and {found.points:,} points, "
-        f"{found.error:.2f} px off on average"
+        f"mean error {found.error:.2f} px"
         f"{', found by an earlier run' if found.reused else ''}: {options.out}"
     )

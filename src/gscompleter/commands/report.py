@@ -1,4 +1,4 @@
-"""The command `report`: the page on a completion or an evaluation, made again."""
+"""The command `report`: write the report page again."""
 
 from __future__ import annotations
 
@@ -14,21 +14,17 @@ from gscompleter.config.settings import Settings
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions(Settings):
-    """Make report.html of a completion or an evaluation again, from what lies in its folder."""
+    """Write report.html of a completion or an evaluation again."""
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """The folder that `complete`, `demo` or `evaluate` wrote."""
+    """Output folder of `complete`, `demo` or `evaluate`."""
     quiet: bool = False
-    """Say nothing but errors."""
+    """Print errors only."""
 
 
 def run_report(options: ReportOptions) -> None:
-    """Write `report.html` anew and say where it lies.
-
-    Raises:
-        InputError: where the folder holds no results, or damaged ones.
-    """
-    # Here, so that `--help` does not wait for torch.
+    """Write `report.html` and print its path."""
+    # Imported here so that `--help` does not wait for torch.
     from gscompleter.reports.completion_page import completion_page
     from gscompleter.reports.evaluation_page import TABLES, evaluation_page
     from gscompleter.reports.page import NAME, write_page

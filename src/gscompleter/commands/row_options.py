@@ -1,4 +1,4 @@
-"""A row of a manifest as the options of `complete`, by the same rules as its command line."""
+"""Options of `complete` from a row of a manifest."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import tyro
 
 from gscompleter.batch.manifest import FOLDER
 from gscompleter.commands.options import CompleteOptions, LiveOptions
+from gscompleter.commands.renamed import new_name
 from gscompleter.commands.words import read_words, sentence_of
 from gscompleter.config.settings import checked
 from gscompleter.errors import InputError, quoted
@@ -21,18 +22,14 @@ Command: Any = Union[  # noqa: UP007  (a command line has several)
     Annotated[CompleteOptions, tyro.conf.subcommand(COMPLETE)],
     Annotated[LiveOptions, tyro.conf.subcommand("live")],
 ]
-RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help")
-"""Options that a batch settles for all of its jobs."""
+RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
+"""Options that a batch sets for all jobs."""
 YES, NO = ("true", "yes", "1"), ("false", "no", "0", "")
-"""What a cell of a CSV says of a flag."""
+"""Values of a flag in a CSV."""
 
 
 def options_of(row: Mapping[str, Any], out: Path) -> CompleteOptions:
-    """The options that `row` stands for, with `out` as the folder to write.
-
-    Raises:
-        InputError: where one is unknown or wrong.
-    """
+    """Parse a row, or raise InputError; `out` is the output folder."""
     if not isinstance(row.get(FOLDER), str):
         raise InputError("The row has no folder; give it the folder of a scene.")
     words = [COMPLETE, row[FOLDER], *words_of(row), "--out", str(out), "--overwrite", "--quiet"]
@@ -44,11 +41,11 @@ def options_of(row: Mapping[str, Any], out: Path) -> CompleteOptions:
 
 
 def words_of(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """The options of a row as words of a command line, but for the scene."""
+    """Convert a row to words of a command line."""
     for key, value in row.items():
-        name = f"{prefix}{key}".replace("_", "-")
+        name = new_name(f"{prefix}{key}".replace("_", "-"))
         if name in RESERVED:
-            raise InputError(f"A row has no say in '{quoted(name)}'; the batch decides it.")
+            raise InputError(f"A row cannot set '{quoted(name)}'; the batch sets it.")
         if name == FOLDER or value is None:
             continue
         if isinstance(value, Mapping):
@@ -60,7 +57,7 @@ def words_of(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 
 def values_of(name: str, value: Any) -> list[str]:
-    """The value of an option as words."""
+    """Convert a value to words."""
     if isinstance(value, list):
         words = [str(item) for item in value]
     elif isinstance(value, str) and name in lists():
@@ -74,15 +71,15 @@ def values_of(name: str, value: Any) -> list[str]:
 
 
 def split(cell: str) -> list[str]:
-    """The words of a cell, with quotation marks as a shell has them."""
+    """Split a cell into words like a shell."""
     try:
         return shlex.split(cell)
     except ValueError as error:
-        raise InputError(f"'{quoted(cell)}' has a quotation mark without another.") from error
+        raise InputError(f"'{quoted(cell)}' has an unmatched quotation mark.") from error
 
 
 def is_set(name: str, value: Any) -> bool:
-    """Whether a row sets a flag."""
+    """Return True if a row sets a flag."""
     text = str(value).lower()
     if text not in (*YES, *NO):
         raise InputError(f"{name} is '{quoted(text)}'; it must be true or false.")
@@ -90,6 +87,7 @@ def is_set(name: str, value: Any) -> bool:
 
 
 def is_number(word: str) -> bool:
+    """Return True if a word is a number."""
     try:
         float(word)
     except ValueError:
@@ -99,13 +97,13 @@ def is_number(word: str) -> bool:
 
 @cache
 def flags() -> frozenset[str]:
-    """The options of `complete` that take no value."""
+    """Return the options of `complete` without a value."""
     return frozenset(name for name, kind in hints() if kind is bool)
 
 
 @cache
 def lists() -> frozenset[str]:
-    """The options of `complete` that take several values."""
+    """Return the options of `complete` with several values."""
 
     def has_tuple(kind: Any) -> bool:
         return "tuple" in str(kind).lower() or any(map(has_tuple, get_args(kind)))
@@ -114,5 +112,5 @@ def lists() -> frozenset[str]:
 
 
 def hints() -> list[tuple[str, Any]]:
-    """The options of `complete`, as its command line calls them, and their types."""
+    """Return the options of `complete` with their types."""
     return [(n.replace("_", "-"), kind) for n, kind in get_type_hints(CompleteOptions).items()]

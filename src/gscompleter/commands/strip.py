@@ -1,4 +1,4 @@
-"""The command `strip`: a completed scene as it was given."""
+"""The command `strip`: the original scene of a completed one."""
 
 from __future__ import annotations
 
@@ -14,25 +14,21 @@ from gscompleter.config.settings import Settings
 
 @dataclass(frozen=True, kw_only=True)
 class StripOptions(Settings):
-    """Take everything that was generated out of a scene again, and put back what was set aside."""
+    """Undo a completion: remove generated Gaussians and put pruned ones back."""
 
     completed: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="COMPLETED")]
-    """The completed scene. A removed.ply beside it is put back in its place."""
+    """Completed scene. Gaussians of a removed.ply beside it are put back."""
     out: Path
-    """The file for the scene as it was given."""
+    """File for the original scene."""
     overwrite: bool = False
-    """Replace the file where there is one."""
+    """Replace an existing file."""
     quiet: bool = False
-    """Say nothing but errors."""
+    """Print errors only."""
 
 
 def run_strip(options: StripOptions) -> None:
-    """Write the scene as it was before its completion, and say how much that is.
-
-    Raises:
-        InputError: where nothing of it was given, or a file cannot be read or written.
-    """
-    # Here, so that `--help` does not wait for torch.
+    """Write the original scene and print the number of Gaussians."""
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.progress import preparing, shown_on
@@ -44,4 +40,4 @@ def run_strip(options: StripOptions) -> None:
     with shown_on(None if options.quiet else Console(stderr=True)), preparing("stripping"):
         given, generated = strip(options.completed, options.out)
     if not options.quiet:
-        print(f"{given:,} Gaussians, {generated:,} generated ones taken out: {options.out}")
+        print(f"{given:,} Gaussians, {generated:,} generated ones removed: {options.out}")

@@ -1,4 +1,4 @@
-"""What was understood, in four lines before the work: opened, found out, to do, and its budget."""
+"""Summary of the input, printed before the work in four lines."""
 
 from __future__ import annotations
 
@@ -21,17 +21,14 @@ TOLD = {
     "splat": "by the splat",
     "features": "by matched features",
 }
-"""Who told the depth range, in words."""
 MAX_NAMED = 8
-"""Frames that a line names."""
 SECONDS_PER_PIXEL = 2e-5
-"""What `plane-sweep` takes for each pixel of each photograph on two cores of 2.8 GHz. 18 to 24
-millionths were measured from 256 x 256 to 427 x 640 pixels (docs/performance.md); of three and of
-eight photographs it is the same within a third."""
+"""Seconds of `plane-sweep` per pixel on two cores of 2.8 GHz. Measured: 18 to 24 µs from 256 x 256
+to 427 x 640 pixels (docs/performance.md)."""
 
 
 def understood(options: CompleteOptions, opened: Opened, task: Task) -> list[str]:
-    """The four lines. The cameras of `task` know the depth range that is worked in."""
+    """Write the four lines; the cameras of `task` have the working depth range."""
     device = task.views[0].image.device.type
     return [
         *found_out(options, opened, task),
@@ -41,7 +38,7 @@ def understood(options: CompleteOptions, opened: Opened, task: Task) -> list[str
 
 
 def found_out(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
-    """The lines on what was opened and found out."""
+    """Write the lines on the opened scene."""
     splat, note = "", None
     if task.scene is not None and options.scene is not None:
         splat = f"; {splat_line(options.scene, task.scene)}"
@@ -54,33 +51,33 @@ def found_out(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
 
 
 def photographs_line(opened: Opened) -> str:
-    """The format, the photographs, their cameras and lenses, and the points of a scene."""
+    """Describe the format, photographs, cameras and points of a scene."""
     given = opened.photographs
     count = f"{opened.number} photographs"
     if opened.number != len(given):
         count = f"{len(given)} of {count}"
     points = given.points()
-    told = "no points" if points is None else f"{len(points):,} points"
+    num_points = "no points" if points is None else f"{len(points):,} points"
     name = "photographs without cameras" if opened.format == "photographs" else opened.format
-    return f"{name}, {count}, {cameras_line(given.frames)}, {told}"
+    return f"{name}, {count}, {cameras_line(given.frames)}, {num_points}"
 
 
 def cameras_line(frames: Sequence[Frame]) -> str:
-    """How many cameras took the photographs, and through which lenses."""
+    """Describe the cameras and lenses."""
     cameras = dict.fromkeys(frame.intrinsics for frame in frames)
     lenses = dict.fromkeys(c.distortion.projection for c in cameras if c.distortion)
-    lens = f"{' and '.join(lenses)} lens taken out" if lenses else "no lens distortion"
+    lens = f"{' and '.join(lenses)} lens distortion removed" if lenses else "no lens distortion"
     return f"{len(cameras)} {'camera' if len(cameras) == 1 else 'cameras'} with {lens}"
 
 
 def splat_line(path: Path, scene: Gaussians) -> str:
-    """The splat that was brought."""
+    """Describe the input splat."""
     mode = "antialiased " if scene.is_antialiased else ""
     return f"{quoted(path)}, {len(scene):,} {mode}Gaussians of SH degree {scene.sh_degree}"
 
 
 def found_line(options: SceneOptions, opened: Opened, task: Task) -> str:
-    """The frame, the unit where it is known, the depth range and the working size."""
+    """Describe the frame, the depth range and the working size."""
     format = FORMATS.get(opened.format)
     unit = f" {format.unit}" if format is not None and format.unit is not None else ""
     camera, depths = task.views[0].camera, task.depths
@@ -90,7 +87,7 @@ def found_line(options: SceneOptions, opened: Opened, task: Task) -> str:
 
 
 def size_line(options: SceneOptions, opened: Opened, task: Task) -> str:
-    """The working size, and that of the photographs where they were shrunk."""
+    """Describe the working size, and that of the photographs if it differs."""
     frames = [view.frame for view in task.views if view.frame is not None]
     own = sizes_line([opened.photographs.camera(frame) for frame in frames])
     size = sizes_line([view.camera for view in task.views])
@@ -100,13 +97,13 @@ def size_line(options: SceneOptions, opened: Opened, task: Task) -> str:
 
 
 def sizes_line(cameras: Sequence[Camera]) -> str:
-    """The sizes of images, each once."""
+    """List the different image sizes."""
     sizes = dict.fromkeys(f"{camera.width} x {camera.height}" for camera in cameras)
     return ", ".join(sizes)
 
 
 def plan_line(options: CompleteOptions, task: Task, device: str) -> str:
-    """Context, targets, the models, and where the result is written."""
+    """Describe the context, targets, models and output."""
     chosen = " (chosen)" if options.context is None else ""
     frames = [target.frame for target in task.targets if target.frame is not None]
     others = len(task.targets) - len(frames)
@@ -121,19 +118,19 @@ def plan_line(options: CompleteOptions, task: Task, device: str) -> str:
 
 
 def budget_line(options: CompleteOptions, task: Task, device: str) -> str:
-    """How many photographs the context is made of, and about what memory and time that takes."""
+    """Describe the number of context photographs, memory and time."""
     return f"{count_line(task)}{memory_line(options, task)}{time_line(options, task, device)}"
 
 
 def count_line(task: Task) -> str:
-    """How many photographs the context may be made of, and who said so."""
+    """Describe the number of context photographs."""
     budget = task.budget
     if budget is None:
         named = len(task.views)
         return f"{named} {'photograph' if named == 1 else 'photographs'} for the context, as named"
     limit = ""
     if budget.allowed < budget.wanted:
-        limit = f", for there is no memory for {budget.wanted}"
+        limit = f" (memory is too small for {budget.wanted})"
     return (
         f"at most {budget.allowed} of {budget.usable:,} photographs for the context{limit} "
         "(--context names others)"
@@ -141,7 +138,7 @@ def count_line(task: Task) -> str:
 
 
 def memory_line(options: CompleteOptions, task: Task) -> str:
-    """About how much memory the completion needs, and how much there is."""
+    """Estimate the memory."""
     cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
     pixels = max(camera.width * camera.height for camera in cameras)
     images = len(task.views) + (len(task.targets) or most(options))
@@ -154,8 +151,7 @@ def memory_line(options: CompleteOptions, task: Task) -> str:
 
 
 def time_line(options: CompleteOptions, task: Task, device: str) -> str:
-    """About how long the context takes, as far as that was measured: not with another model, nor
-    on a GPU, nor where the context is there already."""
+    """Estimate the seconds of the context, for the default model on a CPU."""
     if task.scene is not None or options.reconstructor != "plane-sweep" or device != "cpu":
         return ""
     pixels = sum(view.camera.width * view.camera.height for view in task.views)
@@ -164,6 +160,6 @@ def time_line(options: CompleteOptions, task: Task, device: str) -> str:
 
 
 def frames_line(frames: Sequence[int | None]) -> str:
-    """Numbers of frames, the first of many."""
+    """List frame numbers, shortened."""
     names = names_listed([str(frame) for frame in frames], MAX_NAMED)
     return f"{'frame' if len(frames) == 1 else 'frames'} {names}"

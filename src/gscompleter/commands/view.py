@@ -1,4 +1,4 @@
-"""The command `view`: a scene before and after, in the browser."""
+"""The command `view`: a scene before and after in the browser."""
 
 from __future__ import annotations
 
@@ -20,41 +20,39 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions(Settings):
-    """Look at a scene before and after its completion in the browser: side by side, under a
-    slider, or one in place of the other, with what was generated tinted or hidden."""
+    """Show a scene before and after its completion in the browser.
+
+    Side by side, with a slider, or one at a time; generated Gaussians can be tinted or hidden.
+    """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
-    """What `complete` wrote (OUT), or a file of Gaussians in any format that `convert` reads."""
+    """Output folder of `complete`, or a file of Gaussians in any format that `convert` reads."""
     other: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="B")] = None
-    """The scene after, where A is the one before. Without it A is shown with and without what was
-    generated."""
+    """Scene after completion if A is the scene before. If not given, A is shown with and without
+    its generated Gaussians."""
     cameras: Path | None = None
-    """Cameras to jump to: a file of cameras, as `complete --target` takes it, or a folder with a
-    transforms.json or a COLMAP model. They are in the frame of the photographs where A is an OUT,
-    and else in that of A."""
+    """Cameras to jump to: a file of cameras as in `complete --target`, or a folder with a
+    transforms.json or a COLMAP model. They are in the coordinates of the photographs if A is an
+    output folder, otherwise in those of A."""
     resolution: tuple[int, int] | None = None
-    """Height and width of the images of cameras whose file does not tell them."""
+    """Image size (height and width) of cameras whose file has none."""
     save: Path | None = None
     """Write the page to this file instead of serving it."""
     overwrite: bool = False
-    """Replace the file where there is one."""
+    """Replace an existing file."""
     port: Port = 0
-    """Port of 127.0.0.1 to serve at; any that is free if not given."""
+    """Port of the page on 127.0.0.1; a free one if not given."""
     no_open: bool = False
-    """Only say where the page is, and open no browser."""
+    """Print the address without opening a browser."""
     drop_nonfinite: bool = False
-    """Leave out Gaussians that hold NaN or infinity."""
+    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     quiet: bool = False
-    """Say nothing but errors."""
+    """Print errors only."""
 
 
 def run_view(options: ViewOptions) -> None:
-    """Make the page, and write it or serve it until Ctrl-C.
-
-    Raises:
-        InputError: where something cannot be read, fetched or written.
-    """
-    # Here, so that `--help` does not wait for torch.
+    """Make the page, and write it or serve it until Ctrl-C."""
+    # Imported here so that `--help` does not wait for torch.
     from gscompleter.viewer.packages import load_libraries
     from gscompleter.viewer.page import make_page
 
@@ -73,22 +71,14 @@ def run_view(options: ViewOptions) -> None:
 
 
 def check_page(path: Path, overwrite: bool) -> None:
-    """Refuse a name that no browser takes for a page, and to replace a file unasked.
-
-    Raises:
-        InputError: where `path` is such a name, or is there and `overwrite` is off.
-    """
+    """Refuse a file name without .html, and an existing file unless `overwrite` is set."""
     if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{quoted(path)} is not named as a page; name it *.html.", "save")
+        raise InputError(f"{quoted(path)} is no .html file; name it *.html.", "save")
     check_free(path, overwrite)
 
 
 def exhibit_of(options: ViewOptions) -> Exhibit:
-    """What the options name.
-
-    Raises:
-        InputError: where it cannot be read.
-    """
+    """Read the scenes and cameras of the options."""
     from dataclasses import replace
 
     from gscompleter.viewer.exhibit import (
@@ -111,24 +101,20 @@ def exhibit_of(options: ViewOptions) -> Exhibit:
 
 
 def tell(exhibit: Exhibit, page: Page) -> None:
-    """Say what one would otherwise wonder about."""
+    """Print remarks on the page."""
     for remark in exhibit.remarks:
         print(remark)
     if page.left_out:
-        print(f"{page.left_out:,} Gaussians lie too far out to be shown.")
+        print(f"{page.left_out:,} Gaussians are too far away to be shown.")
     if page.parts:
         print(
-            f"The Gaussians are too large for one page: they lie beside it in {len(page.parts)} "
-            f"files, {', '.join(page.parts)}, which have to stay with it."
+            f"The Gaussians do not fit into one page; keep these {len(page.parts)} files beside "
+            f"it: {', '.join(page.parts)}."
         )
 
 
 def write(page: Page, path: Path) -> None:
-    """Write the page last, so that it never lacks its parts.
-
-    Raises:
-        InputError: where a file cannot be written.
-    """
+    """Write the parts of the page, then the page."""
     from gscompleter.io.files import replacing
 
     for name, part in page.parts.items():
@@ -139,11 +125,7 @@ def write(page: Page, path: Path) -> None:
 
 
 def serve(options: ViewOptions, page: Page) -> None:
-    """Serve the page to this machine until Ctrl-C.
-
-    Raises:
-        InputError: where the port is taken.
-    """
+    """Serve the page to this machine until Ctrl-C."""
     import webbrowser
     from contextlib import suppress
 
@@ -151,7 +133,7 @@ def serve(options: ViewOptions, page: Page) -> None:
 
     with serving(page, options.port) as server, suppress(KeyboardInterrupt):
         address = f"http://{ADDRESS}:{server.server_address[1]}/"
-        # Whoever waits for this line finds the server listening.
+        # Printed once the server listens.
         print(f"{address} (Ctrl-C ends it)", flush=True)
         if not options.no_open:
             webbrowser.open(address)

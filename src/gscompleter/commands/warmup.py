@@ -1,4 +1,4 @@
-"""The command `warmup`: compile in advance what the first completion would have to wait for."""
+"""The command `warmup`: compile all kernels in advance."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ from gscompleter.commands.options import ComputeOptions
 
 @dataclass(frozen=True, kw_only=True)
 class WarmupOptions(ComputeOptions):
-    """Compile all kernels for this machine, so that no completion has to: for images of containers
-    and nodes of a cluster.
+    """Compile all kernels for this machine, for container images and cluster nodes.
 
-    They lie in numba's cache, beside the package or where NUMBA_CACHE_DIR says, and hold for
-    processors of one kind.
+    They are stored in numba's cache, beside the package or in NUMBA_CACHE_DIR, and are valid for
+    one type of processor.
     """
 
 
 def run_warmup(options: WarmupOptions) -> None:
-    """Compile what is not compiled yet, and say how long it took and where it lies."""
-    # Here, so that `--help` does not wait for torch.
+    """Compile missing kernels, and print the time and the folder."""
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.compilation import PARTS, compile_kernels

@@ -1,4 +1,4 @@
-"""Words of a command line as options."""
+"""Parser of the command line."""
 
 from __future__ import annotations
 
@@ -16,29 +16,35 @@ import tyro
 from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
 from gscompleter.commands.generator_options import generator_flags
+from gscompleter.commands.help import HELP_ALL, Rule, asks_for_help, rule_for_help
 from gscompleter.commands.options import FOUND
+from gscompleter.commands.renamed import use_new_names
 from gscompleter.config import CompleterConfig, load_config
+from gscompleter.config.renamed import refuse_old_options
 from gscompleter.errors import InputError, quoted
 
 NEAR = 0.75
-"""Likeness from which on an option is near enough to be named, from 0 to 1."""
+"""Smallest similarity of an option to a misspelt one, from 0 to 1."""
 
 
 def sentence_of(error: InputError) -> str:
-    """What went wrong, and the option that can mend it."""
+    """Add the option that can correct it to the sentence of an error."""
     if error.argument is None:
         return str(error)
     return f"{str(error).removesuffix('.')} (--{error.argument.replace('_', '-')})."
 
 
 def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> Any:
-    """The options of the command that `words` name, one of the types that `command` is a union of.
+    """Parse a command line into one of the option classes of the union `command`.
 
-    Raises:
-        InputError: where they are wrong, or the config that they name is.
-        SystemExit: where they ask for help, which is printed.
+    It raises InputError for wrong words, and SystemExit after printing the help.
     """
+    words = use_new_names(words)
+    show_all = HELP_ALL in words
+    helps = [rule_for_help(show_all)] if asks_for_help(words) else []
+    words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
+    refuse_old_options(words)
     check_command(words, names)
     printed, config = StringIO(), CompleterConfig()
     read = partial(
@@ -51,7 +57,7 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
     try:
         with redirect_stderr(printed):
             config, words = config_named(auto_counted(words))
-            return read(args=words, registry=registry_from(config))
+            return read(args=words, registry=registry_from(config, *helps))
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -61,11 +67,7 @@ def read_words(words: Sequence[str], command: Any, names: Collection[str]) -> An
 
 
 def check_command(words: Sequence[str], names: Collection[str]) -> None:
-    """Refuse a command that does not exist, and name the nearest one.
-
-    Raises:
-        InputError: where the first of `words` is like one of `names`, but none of them.
-    """
+    """Refuse an unknown command, and name the nearest one."""
     near = get_close_matches(words[0], names, 1) if words else []
     if near and words[0] not in names:
         raise InputError(
@@ -75,18 +77,18 @@ def check_command(words: Sequence[str], names: Collection[str]) -> None:
 
 
 def options_in(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> list[str]:
-    """List the options that the help of the command in `words` begins its lines with, or those that
-    stand without one."""
+    """List the options of the command in `words`."""
     if not words or words[0].startswith("--"):
         return ["--help", "--version"]
     help_text = StringIO()
     with redirect_stdout(help_text), suppress(SystemExit):
         read([*words[:1], "--help"])
-    return re.findall(r"^[ │]*(?:-h, )?(--[a-z][\w.-]*)", help_text.getvalue(), re.MULTILINE)
+    found = re.findall(r"^[ │]*(?:-h, )?(--[a-z][\w.-]*)", help_text.getvalue(), re.MULTILINE)
+    return [*found, HELP_ALL]
 
 
 def misspelt(words: Sequence[str], options: Sequence[str], names: Collection[str]) -> str | None:
-    """Name the option that is nearest to one that does not exist; None where there is none."""
+    """Write a sentence on an unknown option that is similar to a known one, if any."""
     given = [word.split("=")[0] for word in words if word.startswith("--")]
     for word in given:
         option = word.replace("_", "-")
@@ -98,16 +100,12 @@ def misspelt(words: Sequence[str], options: Sequence[str], names: Collection[str
 
 
 def command_in(words: Sequence[str], names: Collection[str]) -> str:
-    """Return what one types to call the command that `words` name, if any."""
+    """Return the program with the command in `words`, if any."""
     return " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
 
 
 def check_once(words: Sequence[str]) -> None:
-    """Refuse an option that is named twice, for the later one alone would count.
-
-    Raises:
-        InputError: where `words` hold one.
-    """
+    """Refuse an option that is given twice."""
     named = [word.split("=")[0].replace("_", "-") for word in words if word.startswith("--")]
     twice = next((name for name in named if named.count(name) > 1), None)
     if twice is not None:
@@ -118,7 +116,7 @@ def check_once(words: Sequence[str]) -> None:
 
 
 def auto_counted(words: Sequence[str]) -> list[str]:
-    """`words` with a number after `--auto`, which may stand alone."""
+    """Insert the default number after an `--auto` without one."""
     alone = [
         w == "--auto" and not n.isdecimal() for w, n in zip(words, [*words, ""][1:], strict=True)
     ]
@@ -128,13 +126,13 @@ def auto_counted(words: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class NamedConfig:
-    """What is read before the rest: the config that single settings are applied over."""
+    """The option `--config NAME`, which is parsed first."""
 
     config: str = "default"
 
 
 def config_named(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[str]]:
-    """What `--config NAME` names, and the other words, which may change some of it."""
+    """Load the config of `--config NAME`, and return it with the other words."""
     if words[:1] not in (["complete"], ["live"]):
         return CompleterConfig(), words
     named, others = tyro.cli(
@@ -143,8 +141,8 @@ def config_named(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[str]]:
     return load_config(named.config), others
 
 
-def registry_from(config: CompleterConfig) -> ConstructorRegistry:
-    """How tyro reads our classes: a CompleterConfig begins as `config`."""
+def registry_from(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
+    """Create tyro's registry, with `config` as the default CompleterConfig."""
 
     def config_flags(info: StructTypeInfo) -> Any:
         if info.type is not CompleterConfig or info.default == config:
@@ -154,18 +152,20 @@ def registry_from(config: CompleterConfig) -> ConstructorRegistry:
     registry = ConstructorRegistry()
     registry.struct_rule(generator_flags)
     registry.struct_rule(config_flags)
+    for rule in rules:
+        registry.struct_rule(rule)
     return registry
 
 
 def unboxed(box: str, words: Sequence[str], names: Collection[str]) -> str:
-    """The sentence in the box that tyro draws around an error; indented or below it stands help."""
+    """Extract the sentence from tyro's boxed error message."""
 
     def is_empty(line: str) -> bool:
         return not line.strip("─- ")
 
     lines = [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
-    said = takewhile(lambda line: not is_empty(line), dropwhile(is_empty, lines))
-    sentence = " ".join(line.strip() for line in said if not line.startswith(" " * 5))
+    first_lines = takewhile(lambda line: not is_empty(line), dropwhile(is_empty, lines))
+    sentence = " ".join(line.strip() for line in first_lines if not line.startswith(" " * 5))
     usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
     needed = "" if usage is None else f"; give {lines[usage].strip()}"
     command = command_in(words, names)

@@ -1,4 +1,4 @@
-"""Settings of a completion: ours, the paper's, and the paper's ablations, as values."""
+"""Settings of a completion: the defaults, the paper's, and its ablations."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
+from gscompleter.config.renamed import refuse_old_keys
 from gscompleter.config.settings import Count, Settings, Share, Weight, updated
 from gscompleter.coverage import COVERED
 from gscompleter.errors import InputError, quoted
@@ -19,327 +20,317 @@ Memory = Annotated[float, Interval(ge=0, lt=1)]
 
 @dataclass(frozen=True)
 class SynthesisConfig(Settings):
-    """Settings of a Φ with weights; others ignore them."""
+    """Synthesis of the target image by generators with weights; others ignore it."""
 
     correct_color: bool = True
-    """Adapt the colours of the synthesized image to those of the photographs. The paper takes the
-    image as it is."""
+    """Match the colours of the synthesized image to those of the photographs (not in the paper)."""
     source_depth: Literal["context", "monocular"] = "context"
-    """Depth of the photograph for PE-Field, where its own settings name none: that of the scene,
-    or, as in the paper, of a monocular network."""
+    """Depth map of the photograph for PE-Field if `--generator-depth` is not given: rendered from
+    the scene, or estimated by a monocular network as in the paper."""
 
 
 @dataclass(frozen=True)
 class AnchorConfig(Settings):
+    """Choice of the photograph that forms the stereo pair with the synthesized image."""
+
     max_rotation: Annotated[float, Interval(ge=0, le=180)] = 45.0
-    """Largest turn away from the target, in degrees, that still leaves overlap."""
+    """Largest rotation between anchor and target, in degrees, that still leaves overlap."""
     selection: Literal["widest", "nearest"] = "widest"
-    """`widest` baseline is the paper's rule; `nearest` view is its ablation without it."""
+    """`widest` takes the view with the widest baseline (paper), `nearest` the nearest view."""
     min_baseline: Share = 0.01
-    """Smallest baseline of an anchor to the target, as a share of the widest. The paper excludes no
-    view."""
+    """Smallest baseline between anchor and target, relative to the widest one (paper: 0)."""
     min_overlap: Share = 0.25
-    """Smallest share of what the target observes of the scene that an anchor must see too, where
-    any view does. The paper asks for none."""
+    """Smallest share of the observed target image that an anchor must see too, if any view does
+    (paper: 0)."""
 
 
 @dataclass(frozen=True)
-class AffineConfig(Settings):
-    bridge: Literal["anchor", "target", "none"] = "anchor"
-    """View through which depths are compared. `target` and `none` are ablations of the paper."""
+class AlignmentConfig(Settings):
+    """Affine alignment of the lifted depths with the depths of the scene (Eq. 8)."""
+
+    align_at: Literal["anchor", "target", "none"] = "anchor"
+    """View at which depths are compared. `target` and `none` are ablations of the paper."""
     min_agreement: Share | None = 0.3
-    """Smallest share of what the target sees of the scene that must agree with an affine fitted
-    through the anchor, before one that is fitted at the target may take its place. None trusts the
-    anchor always, as the paper does."""
-    min_merged: Share | None = 0.15
-    """Smallest share of it that must agree, where no affine fits there either, for anything to be
-    added. None adds whatever there is, as the paper does."""
+    """Smallest share of observed pixels at the target that must agree with the fit at the anchor;
+    below it, a fit at the target may replace it. None never replaces it (paper)."""
+
+
+@dataclass(frozen=True)
+class DepthAgreementConfig(Settings):
+    """Rejection of targets whose lifted depths disagree with the scene."""
+
+    reject_below: Share | None = 0.15
+    """Add nothing if no fit is found and fewer observed pixels than this share agree. None never
+    rejects (paper)."""
 
 
 @dataclass(frozen=True)
 class RegistrationConfig(Settings):
-    affine: AffineConfig = AffineConfig()
-    """Settings of the coarse fit."""
+    """Registration of the lifted Gaussians along their rays (Eq. 9 to 11)."""
+
     iterations: Count = 8
-    """Steps of Adam; 0 leaves the coarse fit as it is (the paper's ablation without RC)."""
+    """Iterations of Adam; 0 keeps the affine alignment (ablation without RC)."""
     learning_rate: Step = 0.019
-    """Step of Adam, in the unit that `step` names."""
-    schedule: Literal["falling", "constant"] = "falling"
-    """Whether the step falls linearly to nothing, so that few iterations reach far and still end
-    close."""
+    """Learning rate of Adam, in the unit of `lr_unit`."""
+    lr_schedule: Literal["linear", "constant"] = "linear"
+    """`linear` decreases the learning rate to zero, `constant` keeps it (paper)."""
     beta1: Memory = 0.0
-    """Adam's memory of gradients. Its usual 0.9 remembers all of so short a run and overshoots."""
+    """Adam's decay rate of gradients. The usual 0.9 overshoots in so few iterations."""
     beta2: Memory = 0.8
-    """Adam's memory of their squares; usually 0.999."""
-    step: Literal["relative", "literal"] = "relative"
-    """`relative`: of each primitive's own distance, so that the unit of the scene does not
-    matter; depth losses are then relative to the median context depth. `literal`: in scene units,
-    as in the paper."""
+    """Adam's decay rate of squared gradients, usually 0.999."""
+    lr_unit: Literal["distance", "scene"] = "distance"
+    """`distance`: relative to each Gaussian's distance, with depth losses relative to the median
+    depth, so that the unit of the scene does not matter. `scene`: in scene units (paper)."""
     degrees_of_freedom: Literal[1, 3] = 1
-    """1 slides along the camera ray; 3 moves freely (ablation of the paper)."""
+    """1 moves Gaussians along their rays, 3 moves them freely (ablation of the paper)."""
     depth_weight: Weight = 1.0
     """λ_d of Eq. 11."""
     stereo_weight: Weight = 1.0
     """λ_s of Eq. 11."""
     rgb_weight: Weight = 0.0
-    """λ_c of Eq. 11; 0.1 in the paper. With a constant footprint a primitive looks the same at the
-    target wherever it stands on its ray, and the term tells it nothing."""
-    depth_of: Literal["candidates", "composite"] = "candidates"
-    """What L_depth renders: the candidates alone, each of which then feels its own error; or, as
-    in the paper, the scene with them, where those behind the context are hidden and stay wrong."""
+    """λ_c of Eq. 11 (paper: 0.1). With a constant footprint this term has no gradient."""
+    rendered_depth: Literal["candidates", "composite"] = "candidates"
+    """Gaussians that L_depth renders: the lifted ones alone, so that hidden ones get a gradient
+    too, or those together with the scene (paper)."""
     footprint: Literal["constant", "fixed"] = "constant"
-    """`constant`: sizes scale with distance, so that the image at the target stays as it is.
-    `fixed`: sizes stay what they were, as in the paper."""
+    """`constant` scales a Gaussian with its distance, which preserves the target image; `fixed`
+    keeps its size (paper)."""
     mask_occluded: bool = True
-    """Leave out of the stereo loss what the anchor cannot see: a new surface that lies behind the
-    context there. The paper's literal loss pulls it forward onto the context."""
+    """Exclude pixels from the stereo loss where the scene occludes the new surface in the anchor
+    view. The paper includes them, which pulls the surface forward."""
     mask_sky: bool = True
-    """Leave the sky out of the depth losses. The paper's losses have every pixel."""
+    """Exclude the sky from the depth losses (paper: included)."""
     min_ratio: Annotated[float, Interval(gt=0, le=1)] | None = 0.1
-    """Smallest factor by which the affine, or the optimisation, may shorten a distance, so that
-    nothing is pushed through the camera. None bounds nothing, as in the paper."""
-    carry_into_holes: bool = True
-    """Let pixels in a hole, where the scene has no depth to agree with, move like the observed
-    ones around them, so that no step remains at the border. The paper leaves them to the affine."""
+    """Smallest factor by which a distance may shrink, so that nothing passes the camera. None sets
+    no limit (paper)."""
+    extrapolate_into_holes: bool = True
+    """Move pixels in a hole like the observed pixels around it, which avoids a depth step at the
+    seam. The paper keeps their affine alignment."""
 
 
 @dataclass(frozen=True)
 class FreeSpaceConfig(Settings):
+    """Removal of new Gaussians from space that photographs show to be empty."""
+
     num_steps: Annotated[int, Interval(ge=0, le=1000)] = 48
-    """How often a candidate slides back before it is given up; 0 checks nothing, as in the
-    paper."""
+    """Steps by which a Gaussian slides back before it is dropped; 0 disables the check (paper)."""
 
 
 @dataclass(frozen=True)
 class HoleConfig(Settings):
+    """Definition of the hole mask (Eq. 12)."""
+
     max_alpha: Annotated[float, Interval(gt=0, le=1)] = COVERED
-    """τ of Eq. 12: a pixel of the target that the scene covers by less is a hole. It is painted by
-    Φ, what is lifted there joins the scene, and its depth continues that of its surroundings. Where
-    the scene's depth is compared, a pixel stays covered from one half on."""
+    """τ of Eq. 12: pixels with less accumulated opacity are holes. Depth comparisons always use
+    0.5."""
     min_covered: Share = 0.02
-    """Smallest share of the target's image that surfaces of the scene must cover. A target that
-    sees less of them is refused, for there is nothing to continue."""
+    """Smallest share of the target image that must show surfaces of the scene; targets that see
+    less are skipped."""
     dilation: Pixels = 3
-    """Pixels by which the mask grows on every side, which hides seams; 0 leaves it as it is."""
-    neighbourhood: Pixels | None = 16
-    """Pixels around a hole within which candidates are registered. Those farther away neither
-    join the scene nor inform those that do. None registers all of them, as the paper does."""
+    """Pixels by which the hole mask is dilated to hide seams; 0 disables it (paper)."""
+    candidate_radius: Pixels | None = 16
+    """Distance to a hole, in pixels, within which lifted Gaussians are registered. None registers
+    all of them (paper)."""
 
 
 @dataclass(frozen=True)
-class ContradictionConfig(Settings):
-    """Where photographs contradict each other, because something moved. What is completed takes
-    nothing from there. A scene that was brought is not asked."""
+class DynamicMasksConfig(Settings):
+    """Detection of regions that moved between photographs; not for an input splat."""
 
-    min_difference: Annotated[float, Interval(gt=0, le=1)] | None = 0.12
-    """Difference of colour, in [0, 1], from which two photographs of the same surface show
-    different things; None asks nothing, as in the paper."""
+    min_color_difference: Annotated[float, Interval(gt=0, le=1)] | None = 0.12
+    """Colour difference, in [0, 1], above which two photographs of a surface show different
+    things. None disables the check (paper)."""
 
 
 @dataclass(frozen=True)
-class SupportConfig(Settings):
-    """What is doubted of a scene that was brought. Of one that Ψ made of the photographs nothing
-    is."""
+class TrustConfig(Settings):
+    """Photometric trust in the Gaussians of an input splat."""
 
-    doubts: bool = True
-    """Whether what the scene shows counts only as far as its photographs support it. Without, it is
-    taken as it is, as in the paper."""
-    max_difference: Annotated[float, Interval(gt=0, le=1)] = 0.08
-    """Difference of colour, in [0, 1], from a photograph at which the scene's agreement with it has
-    fallen to 1/e. Where the whole scene is less exact, it grows in proportion."""
-    max_turn: Annotated[float, Interval(gt=0, le=180)] = 20.0
-    """Degrees between the rays of a photograph and of a camera at which what the photograph says
-    has fallen to 1/e. What it saw of a surface says less of how it looks from the side."""
-    keep_unsupported: bool = False
-    """Leave Gaussians that nothing supports where they are, and only add to them."""
+    color_sigma: Annotated[float, Interval(gt=0, le=1)] = 0.08
+    """Colour difference from a photograph, in [0, 1], at which trust drops to 1/e. It grows with
+    the mean error of the scene."""
+    angle_sigma: Annotated[float, Interval(gt=0, le=180)] = 20.0
+    """Angle between the rays of a photograph and of the camera, in degrees, at which the weight of
+    that photograph drops to 1/e."""
+    prune: bool = True
+    """Prune occluders: Gaussians in front of a hole that no photograph shows or needs."""
 
 
 @dataclass(frozen=True)
 class RefineConfig(Settings):
+    """Refinement of the opacities of added Gaussians (Eq. 13)."""
+
     iterations: Count = 10
-    """Steps of Adam at most; 0 leaves the opacities as they were lifted (the paper's ablation w/o
-    MV)."""
-    min_fall: Share | None = 3e-4
-    """Share of the loss of which a step has to take more away for another to follow: where nothing
-    that was added stands before a photograph, hardly anything goes. None takes all steps."""
+    """Most iterations of Adam; 0 keeps the lifted opacities (ablation without MV)."""
+    rel_tol: Share | None = 3e-4
+    """Stop if the relative decrease of the loss falls to this value. None runs all iterations."""
     learning_rate: Step = 0.24
-    """Step of Adam, on what `parametrization` names."""
+    """Learning rate of Adam, in the unit of `parametrization`."""
     parametrization: Literal["logit", "linear"] = "logit"
-    """What Adam moves: the logit, as 3DGS stores it, or the opacity itself, clamped to [0, 1]."""
+    """Optimized variable: the logit, as 3DGS stores it, or the opacity clamped to [0, 1]."""
     target_weight: Weight = 0.1
-    """λ of Eq. 13, on the synthesized image."""
+    """λ of Eq. 13, the weight of the synthesized image."""
     num_views: Count = 2
-    """How many of the nearest context views take part."""
+    """Number of nearest context views in the loss."""
 
 
 @dataclass(frozen=True)
 class ReconcileConfig(Settings):
-    """How what is added to a scene that is doubted is fitted to all photographs at once. It takes
-    the place of `RefineConfig` there."""
+    """Refinement against all photographs of an input splat, if `trust` is photometric."""
 
     iterations: Count = 60
-    """Steps of Adam; 0 leaves colours and opacities as they were lifted."""
+    """Iterations of Adam; 0 keeps the lifted colours and opacities."""
     views_per_step: Annotated[int, Interval(ge=1, le=1000)] = 4
-    """How many photographs take part in a step, besides the synthesized image."""
+    """Photographs per iteration, in addition to the synthesized image."""
     photograph_weight: Weight = 20.0
-    """Weight of what a photograph's error is above the allowed, as a share of it, against the error
-    in the holes, as a share of what it was."""
+    """Weight of a photograph's relative error above its budget, against the relative error in the
+    holes."""
     opacity_step: Step = 0.25
-    """Step of Adam on the logit of opacities."""
-    colour_step: Step = 0.04
-    """Step of Adam on spherical harmonics."""
+    """Learning rate of Adam for the logits of opacities."""
+    color_step: Step = 0.04
+    """Learning rate of Adam for spherical harmonics."""
     beta1: Memory = 0.7
-    """Adam's memory of slopes; usually 0.9. Each step asks other photographs."""
+    """Adam's decay rate of gradients, usually 0.9. Each iteration uses other photographs."""
     beta2: Memory = 0.95
-    """Adam's memory of their squares; usually 0.999."""
+    """Adam's decay rate of squared gradients, usually 0.999."""
     sh_degree: Annotated[int, Interval(ge=0, le=3)] = 2
-    """Degree of spherical harmonics up to which an added Gaussian may look different from
-    different sides, as those of a trained scene do; never above the scene's."""
+    """Highest degree of spherical harmonics of an added Gaussian, never above the scene's."""
 
     def at_most(self, sh_degree: int) -> ReconcileConfig:
-        """The same for a scene of this degree."""
+        """Limit the degree of spherical harmonics."""
         return replace(self, sh_degree=min(self.sh_degree, sh_degree))
 
 
 @dataclass(frozen=True)
-class HarmConfig(Settings):
-    tolerance: Annotated[float, Interval(ge=0, le=100)] | None = 0.018
-    """Largest loss of PSNR, in dB, that any context view may suffer, over the whole image; None
-    checks nothing, as in the paper. Photographs of a scene that is doubted lose nothing, whatever
-    it is."""
-    ssim_tolerance: Share = 0.0009
-    """Largest loss of SSIM that any photograph may suffer."""
-    max_loss: Share | None = 0.75
-    """Largest share of its opacity that what is added may lose by that. If it is more, or if the
-    photographs show something else than the synthesized image, nothing is added; None adds whatever
-    there is, as in the paper."""
+class PsnrGuardConfig(Settings):
+    """Error budget of the photographs, within which added Gaussians must stay."""
+
+    max_drop: Annotated[float, Interval(ge=0, le=100)] | None = 0.018
+    """Largest loss of PSNR of any context view, in dB over the whole image. None disables the check
+    (paper); with photometric trust it is always 0."""
+    max_ssim_drop: Share = 0.0009
+    """Largest loss of SSIM of any photograph."""
+    max_opacity_loss: Share | None = 0.75
+    """Add nothing if the added Gaussians lose more than this share of their opacity, or if the
+    synthesized image disagrees with the photographs. None always adds them (paper)."""
 
 
 @dataclass(frozen=True)
-class ExplorationConfig(Settings):
-    """Where a scene is completed, where nobody names a target."""
+class NextBestViewConfig(Settings):
+    """Search for target cameras if the user names none."""
 
     bases: Annotated[int, Interval(ge=1, le=1000)] = 16
-    """Photographs, spread over all, around whose cameras targets are looked for."""
+    """Photographs, spread over the scene, around which candidates are placed."""
     max_step: Annotated[float, Interval(gt=0, le=1)] = 0.2
-    """Longest move, as a share of the depth of what the camera sees. Where these photographs stand
-    closer together, it is as long as that."""
-    turn: Annotated[float, Interval(gt=0, le=0.5)] = 0.25
-    """Angle of a turn, as a share of the opening angle."""
-    side: Annotated[int, Interval(ge=16, le=4096)] = 96
-    """Pixels of the longer side of the images that candidates are judged by."""
-    reach: Share = 0.25
-    """How far from what was observed a pixel of a hole still counts, as a share of that side."""
+    """Largest move of a candidate, relative to the depth of the image. It is never larger than the
+    distance between these photographs."""
+    yaw_fraction: Annotated[float, Interval(gt=0, le=0.5)] = 0.25
+    """Rotation of a candidate, relative to the field of view."""
+    image_size: Annotated[int, Interval(ge=16, le=4096)] = 96
+    """Longer side, in pixels, of the images in which candidates are scored."""
+    border_radius: Share = 0.25
+    """Largest distance of a counted hole pixel to observed pixels, relative to that side."""
     clearance: Share = 0.5
-    """Share of the depth of the nearest twentieth of what a photograph sees, before which a surface
-    is close."""
+    """Depth below which a surface is too close, relative to the nearest 5 % of a photograph."""
     max_close: Share = 0.1
-    """Largest share of the image that close surfaces may fill."""
+    """Largest share of the image that surfaces that are too close may fill."""
     min_gain: Share = 0.01
-    """Gain, as a share of the image, below which little is left to gain."""
+    """Smallest gain, as a share of the image, for which another target is added."""
     enough: Annotated[float, Interval(gt=0, le=1)] = 0.7
-    """Share of the largest gain from which on a nearer camera comes first."""
+    """Share of the best gain that is enough for a nearer camera to be preferred."""
 
 
 @dataclass(frozen=True)
 class CompleterConfig(Settings):
-    """Settings of the four stages. The defaults are ours, wherever measurement shows better than
-    the paper's; `docs/design.md` has the table."""
+    """Settings of a completion.
+
+    The defaults are ours where measurements favour them over the paper's (`docs/design.md`).
+    """
 
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
-    """Share of its size by which the target image is extended on every side while it is completed,
-    where a hole reaches its border, so that a camera that moves on from the target does not meet
-    the next hole there. The paper completes what the target itself sees."""
+    """Padding of the target image on every side, relative to its size, if a hole reaches its
+    border, so that nearby cameras see no new hole there (paper: 0)."""
     ego_mask: bool = True
-    """Ignore parts of photographs that stay the same while the camera moves, such as the bonnet of
-    the vehicle that carries it. The paper takes photographs as they are."""
+    """Ignore image regions that stay the same while the camera moves, such as the bonnet of the
+    car that carries it (paper: use all pixels)."""
+    trust: Literal["full", "photometric"] = "photometric"
+    """Trust in the splat of `--scene`: `photometric` counts a Gaussian as far as photographs
+    confirm it, `full` takes all as they are (paper)."""
     synthesis: SynthesisConfig = SynthesisConfig()
-    """How the target image is synthesized."""
     anchor: AnchorConfig = AnchorConfig()
-    """Which photograph forms the stereo pair with the synthesized image."""
+    alignment: AlignmentConfig = AlignmentConfig()
+    depth_agreement: DepthAgreementConfig = DepthAgreementConfig()
     registration: RegistrationConfig = RegistrationConfig()
-    """How the lifted Gaussians are brought to the scene."""
     free_space: FreeSpaceConfig = FreeSpaceConfig()
-    """How candidates keep out of space that photographs saw through."""
     holes: HoleConfig = HoleConfig()
-    """What counts as a hole."""
-    contradiction: ContradictionConfig = ContradictionConfig()
-    """What counts as having moved between photographs."""
-    support: SupportConfig = SupportConfig()
-    """What counts as no hole only as far as photographs support it."""
+    dynamic_masks: DynamicMasksConfig = DynamicMasksConfig()
+    trust_settings: TrustConfig = TrustConfig()
     refine: RefineConfig = RefineConfig()
-    """How the opacities of the added Gaussians are refined."""
     reconcile: ReconcileConfig = ReconcileConfig()
-    """How what is added to a scene that is doubted is brought to agree with its photographs."""
-    harm: HarmConfig = HarmConfig()
-    """How much worse a photograph may be matched than before."""
-    exploration: ExplorationConfig = ExplorationConfig()
-    """Where targets are looked for, where nobody names any."""
+    psnr_guard: PsnrGuardConfig = PsnrGuardConfig()
+    next_best_view: NextBestViewConfig = NextBestViewConfig()
 
     @staticmethod
     def paper() -> CompleterConfig:
-        """The paper to the letter: the hard hole mask, steps in scene units, sizes that stay what
-        they were when a Gaussian slides, every pixel in the losses, nothing checked afterwards.
-
-        `docs/paper.md` lists what remains different, and how ambiguous sentences are read.
-        """
+        """Return the settings of the paper; `docs/paper.md` lists the remaining differences."""
         return CompleterConfig(
             margin=0.0,
             ego_mask=False,
+            trust="full",
             synthesis=SynthesisConfig(correct_color=False, source_depth="monocular"),
             anchor=AnchorConfig(min_baseline=0.0, min_overlap=0.0),
+            alignment=AlignmentConfig(min_agreement=None),
+            depth_agreement=DepthAgreementConfig(reject_below=None),
             registration=RegistrationConfig(
                 iterations=50,
                 learning_rate=0.01,
-                schedule="constant",
+                lr_schedule="constant",
                 beta1=0.9,
                 beta2=0.999,
-                step="literal",
+                lr_unit="scene",
                 rgb_weight=0.1,
-                depth_of="composite",
+                rendered_depth="composite",
                 footprint="fixed",
                 mask_occluded=False,
                 mask_sky=False,
                 min_ratio=None,
-                carry_into_holes=False,
-                affine=AffineConfig(min_agreement=None, min_merged=None),
+                extrapolate_into_holes=False,
             ),
             free_space=FreeSpaceConfig(num_steps=0),
-            refine=RefineConfig(iterations=30, min_fall=None, learning_rate=0.08),
-            holes=HoleConfig(dilation=0, neighbourhood=None),
-            harm=HarmConfig(tolerance=None, max_loss=None),
-            support=SupportConfig(doubts=False),
-            contradiction=ContradictionConfig(min_difference=None),
+            refine=RefineConfig(iterations=30, rel_tol=None, learning_rate=0.08),
+            holes=HoleConfig(dilation=0, candidate_radius=None),
+            psnr_guard=PsnrGuardConfig(max_drop=None, max_opacity_loss=None),
+            dynamic_masks=DynamicMasksConfig(min_color_difference=None),
         )
 
 
-_NO_DA: dict[str, Any] = {"affine": {"bridge": "none"}}
+_NO_DA: dict[str, Any] = {"align_at": "none"}
 _NO_RC: dict[str, Any] = {"iterations": 0}
 _NO_SA: dict[str, Any] = {"selection": "nearest"}
 
 ABLATIONS: dict[str, dict[str, Any]] = {
     "no-sa": {"anchor": _NO_SA},  # the nearest view instead of the best stereo anchor
-    "no-da": {"registration": _NO_DA},  # no affine
+    "no-da": {"alignment": _NO_DA},  # no affine
     "no-rc": {"registration": _NO_RC},  # no optimisation of distances
-    "no-da-rc": {"registration": _NO_DA | _NO_RC},
-    "none": {"anchor": _NO_SA, "registration": _NO_DA | _NO_RC},
-    "no-mv": {"refine": {"iterations": 0}, "harm": {"tolerance": None}},  # opacities as lifted
+    "no-da-rc": {"alignment": _NO_DA, "registration": _NO_RC},
+    "none": {"anchor": _NO_SA, "alignment": _NO_DA, "registration": _NO_RC},
+    "no-mv": {"refine": {"iterations": 0}, "psnr_guard": {"max_drop": None}},  # opacities as lifted
     "3-dof": {"registration": {"degrees_of_freedom": 3}},
-    "target-aligned": {"registration": {"affine": {"bridge": "target"}}},
+    "target-aligned": {"alignment": {"align_at": "target"}},
     "no-dilation": {"holes": {"dilation": 0}},
     "dilation": {"holes": {"dilation": 3}},
     "theta-30": {"anchor": {"max_rotation": 30.0}},
     "theta-45": {"anchor": {"max_rotation": 45.0}},
     "theta-90": {"anchor": {"max_rotation": 90.0}},
 }
-"""The paper's ablations: what of a config each changes, so that it lacks (or varies) one thing."""
+"""Changes to a config for each ablation of the paper."""
 
 
 def named_config(name: str) -> CompleterConfig:
-    """`default`, `paper`, or one of them with an ablation: `no-sa`, `paper/no-sa`.
+    """Return `default`, `paper`, or one of them with an ablation: `no-sa`, `paper/no-sa`.
 
     Raises:
-        InputError: where there is none of that name.
+        InputError: The name is unknown.
     """
     bases = {"default": CompleterConfig(), "paper": CompleterConfig.paper()}
     if name in bases:
@@ -355,11 +346,10 @@ def named_config(name: str) -> CompleterConfig:
 
 
 def load_config(source: str) -> CompleterConfig:
-    """A config by name, or from a YAML file that names only what differs from its `base`.
+    """Return a config by name, or read the changes to its `base` from a YAML file.
 
     Raises:
-        InputError: where the file is missing or not YAML, or names an unknown setting, or a value
-            of the wrong type or out of its range.
+        InputError: The file cannot be read, or it has an unknown setting or an invalid value.
     """
     path = Path(source)
     if path.suffix not in {".yaml", ".yml"}:
@@ -368,4 +358,5 @@ def load_config(source: str) -> CompleterConfig:
 
     changes = read_yaml(path)
     base = named_config(str(changes.pop("base", "default")))
+    refuse_old_keys(changes, f"{quoted(source)}: ")
     return updated(base, changes, f"{quoted(source)}: ")

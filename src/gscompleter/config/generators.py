@@ -1,4 +1,4 @@
-"""What each generator can be told, by its name. Nothing here needs torch."""
+"""Settings of each generator, by its name. Nothing here needs torch."""
 
 from __future__ import annotations
 
@@ -16,54 +16,54 @@ Steps = Annotated[int, Interval(ge=1, le=1000)]
 
 @dataclass(frozen=True)
 class GeneratorSettings(Settings):
-    """A generator that can be told nothing."""
+    """Settings of a generator that has none."""
 
 
 @dataclass(frozen=True)
 class WarpInpaintSettings(GeneratorSettings):
-    """The photographs warped into the target and completed by patches, without weights"""
+    """Photographs warped to the target, with holes filled by patches (needs no weights)."""
 
 
 @dataclass(frozen=True)
 class OracleSettings(GeneratorSettings):
-    """The true photograph"""
+    """The real photograph of the target, for measurements."""
 
 
 @dataclass(frozen=True)
 class DiffusionSettings(GeneratorSettings):
-    """A generator with weights"""
+    """Settings of a generator with weights."""
 
-    path: Text | None = None
-    """Its weights: a folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the Hugging
-    Face hub. Without it, the published ones of pe-field; diffusers-inpaint must be told."""
+    weights: Text | None = None
+    """Weights: a folder saved by diffusers, or USER/NAME or USER/NAME@COMMIT on the Hugging Face
+    hub. By default the published ones of pe-field; diffusers-inpaint needs this option."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 0
-    """How many further seeds are tried where its image disagrees with the photographs."""
+    """Further seeds to try if the image disagrees with the photographs."""
     offload: bool = False
-    """Keep on the GPU only the part of it that is at work, the rest in main memory."""
+    """Keep only the active part of the model on the GPU, which needs less GPU memory."""
 
 
 @dataclass(frozen=True)
 class PEFieldSettings(DiffusionSettings):
-    """The paper's diffusion transformer"""
+    """The paper's diffusion transformer."""
 
     steps: Steps = 4
-    """Evaluations of the transformer. The paper takes 4, its authors' demonstration 28."""
+    """Denoising steps. The paper uses 4, its authors' demo 28."""
     depth: Text | None = None
-    """Where it takes the depth of the photograph from: context, the scene itself; monocular, a
-    published network; or the folder or hub id of another one. Left out, it is context, or
-    monocular with the settings `paper`."""
-    at_once: Annotated[int, Interval(ge=1, le=1000)] = 4
-    """How many targets it denoises together, at most. Fewer need less memory."""
+    """Depth of the photograph: context (rendered from the scene), monocular (a published network),
+    or the folder or hub id of another network. By default context, or monocular with the config
+    `paper`."""
+    batch_size: Annotated[int, Interval(ge=1, le=1000)] = 4
+    """Most target images to denoise together. Fewer need less memory."""
 
 
 @dataclass(frozen=True)
 class DiffusersInpaintSettings(DiffusionSettings):
-    """Any inpainting pipeline of diffusers"""
+    """Any inpainting pipeline of diffusers."""
 
     steps: Steps | None = None
-    """Its denoising steps. Without it, as many as the pipeline itself takes."""
+    """Denoising steps; the pipeline's own number if not given."""
     prompt: Text = "a photograph"
-    """What it is told of the image, in words."""
+    """Text prompt."""
 
 
 GENERATORS: dict[str, type[GeneratorSettings]] = {
@@ -75,11 +75,7 @@ GENERATORS: dict[str, type[GeneratorSettings]] = {
 
 
 def settings_class(name: str) -> type[GeneratorSettings]:
-    """The class of the settings of the generator called `name`.
-
-    Raises:
-        InputError: where there is none of that name.
-    """
+    """Return the class of a generator's settings, or raise InputError for an unknown name."""
     if name not in GENERATORS:
         raise InputError(
             f"There is no generator '{quoted(name)}'; choose one of {', '.join(GENERATORS)}.",

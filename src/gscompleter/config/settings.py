@@ -1,8 +1,4 @@
-"""Settings that are declared once: frozen dataclasses whose annotations say what is allowed.
-
-The command line is derived from them, and pydantic checks them wherever they come from. Nothing
-here needs torch, and pydantic is imported where something is checked.
-"""
+"""Settings as frozen dataclasses with validated annotations. Nothing here needs torch."""
 
 from __future__ import annotations
 
@@ -25,12 +21,12 @@ S = TypeVar("S", bound="Settings")
 Count = Annotated[int, Interval(ge=0, le=100_000)]
 Share = Annotated[float, Interval(ge=0, le=1)]
 Weight = Annotated[float, Interval(ge=0, le=1e6)]
-# Room is left for what is added to it on each level and in each round.
+# Levels and rounds add to the seed.
 Seed = Annotated[int, Interval(ge=0, lt=2**62)]
 
 
 class Settings:
-    """What settings have in common: no unknown names, and only finite numbers."""
+    """Base of all settings: no unknown names, finite numbers only."""
 
     __pydantic_config__: ClassVar[Any] = {
         "extra": "forbid",
@@ -40,11 +36,7 @@ class Settings:
 
 
 def checked(settings: S, prefix: str = "") -> S:
-    """`settings`, once each value is seen to be of its type and in its range.
-
-    Raises:
-        InputError: where one is not. `prefix` and the name of the setting are its argument.
-    """
+    """Validate types and ranges; InputErrors name `prefix` and the setting as their argument."""
     from pydantic import TypeAdapter
 
     with told(settings, prefix=prefix):
@@ -52,12 +44,7 @@ def checked(settings: S, prefix: str = "") -> S:
 
 
 def updated(settings: S, changes: Mapping[str, Any], where: str = "") -> S:
-    """`settings` with `changes`, a mapping of names in which settings of settings are mappings too.
-
-    Raises:
-        InputError: where a name is unknown, or a value of the wrong type or out of range; it
-            begins with `where` the value stands.
-    """
+    """Apply nested changes; the sentences of InputErrors begin with `where`."""
     from pydantic import TypeAdapter
 
     text = json.dumps(merged(asdict(settings), changes))  # type: ignore[call-overload]
@@ -67,7 +54,7 @@ def updated(settings: S, changes: Mapping[str, Any], where: str = "") -> S:
 
 @contextmanager
 def told(settings: object, where: str = "", prefix: str = "") -> Iterator[None]:
-    """What pydantic finds wrong with `settings` becomes a sentence."""
+    """Translate pydantic's errors into InputErrors."""
     from pydantic import ValidationError
 
     try:
@@ -79,7 +66,7 @@ def told(settings: object, where: str = "", prefix: str = "") -> Iterator[None]:
 
 
 def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """`values` with `changes`, mappings within mappings alike."""
+    """Merge nested mappings; `changes` win."""
     result = dict(values)
     for name, change in changes.items():
         nested = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
@@ -88,7 +75,7 @@ def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 
 
 def sentence_on(wrong: ErrorDetails, name: str, settings: object) -> str:
-    """What is wrong with the setting called `name`."""
+    """Write the sentence about the setting called `name`."""
     if wrong["type"] == "unexpected_keyword_argument":
         for part in wrong["loc"][:-1]:
             settings = getattr(settings, str(part))
@@ -97,5 +84,5 @@ def sentence_on(wrong: ErrorDetails, name: str, settings: object) -> str:
     given = wrong["input"]
     shown = f"'{quoted(given)}'" if isinstance(given, str) else quoted(given)
     if wrong["type"] == "dataclass_type":
-        return f"{name} holds settings of its own, got {shown}."
+        return f"{name} is a group of settings, got {shown}."
     return f"{name} {re.sub(r'^[A-Z][a-z]+ should', 'must', wrong['msg'])}, got {shown}."

@@ -1,4 +1,4 @@
-"""A YAML file of settings, as far as JSON knows its values."""
+"""Settings from a YAML file."""
 
 from __future__ import annotations
 
@@ -12,26 +12,23 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.reading import read_bytes
 
 LONGEST_FILE = 65_536
-"""Bytes of a file beyond which it holds no settings."""
+"""Largest size of a settings file, in bytes."""
 LONGEST_REASON = 120
-"""Characters of what PyYAML objects to."""
+"""Most characters of PyYAML's reason in a sentence."""
 
 
 class PlainLoader(yaml.SafeLoader):
-    """YAML without aliases, of which a short file can make an endless one."""
+    """A YAML loader without aliases, which can expand a short file endlessly."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
+        """Refuse aliases."""
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("aliases are not read; write the value out")
         return super().compose_node(parent, index)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file, of what JSON knows.
-
-    Raises:
-        InputError: where it cannot be read, is no YAML, holds something else, or is too long.
-    """
+    """Read the mapping in a YAML file, limited to JSON values, or raise InputError."""
     name, data = f"The config {quoted(path)}", read_bytes(path, LONGEST_FILE)
     try:
         content = json.loads(json.dumps(yaml.load(data.decode(), PlainLoader), default=str))

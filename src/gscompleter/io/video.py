@@ -40,7 +40,7 @@ def check_writer() -> None:
         raise InputError(
             "A film is written through imageio-ffmpeg, which is not installed; run "
             "`pip install gscompleter[film]`.",
-            "film",
+            "video",
         )
     ffmpeg()
 
@@ -55,7 +55,7 @@ def ffmpeg() -> str:
         raise InputError(
             "imageio-ffmpeg has no ffmpeg for this machine; install one, and name it in "
             "IMAGEIO_FFMPEG_EXE.",
-            "film",
+            "video",
         ) from error
 
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.config import AffineConfig
+from gscompleter.config import AlignmentConfig, DepthAgreementConfig
 from gscompleter.types import DepthAffine, DepthMap, Lift, Render
 
 MAX_TRIALS = 512
@@ -115,19 +115,22 @@ def fit_bridge(
     at_target: Render,
     at_anchor: Render,
     rng: torch.Generator,
-    config: AffineConfig = AffineConfig(),
+    config: AlignmentConfig = AlignmentConfig(),
+    reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> DepthAffine:
     """Fit the affine depth correction at the anchor (the paper's bridge) or at the target.
 
     The context has holes at the target, but the part that is visible there can contradict the
     anchor.
     """
-    if config.bridge == "none":
+    if config.align_at == "none":
         return DepthAffine()
-    if config.bridge == "target":
+    if config.align_at == "target":
         return fit_affine(lift.reference_depth, at_target.depth_map(), rng)
     affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng)
-    return unless_contradicted(affine, lift.reference_depth, at_target.depth_map(), rng, config)
+    return unless_contradicted(
+        affine, lift.reference_depth, at_target.depth_map(), rng, config, reject_below
+    )
 
 
 def unless_contradicted(
@@ -135,7 +138,8 @@ def unless_contradicted(
     predicted: DepthMap,
     context: DepthMap,
     rng: torch.Generator,
-    config: AffineConfig,
+    config: AlignmentConfig,
+    reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> DepthAffine:
     """Replace an affine that contradicts the context at the target by a fit at the target.
 
@@ -153,4 +157,4 @@ def unless_contradicted(
     if refitted.inliers >= max(MIN_INLIERS, 2 * agree):
         return replace(refitted, agreement=refitted.inliers, contradicted=True)
     enough = len(x) >= MIN_SEEN * context.depth.numel()
-    return replace(affine, refuted=enough and agree < (config.min_merged or 0.0))
+    return replace(affine, refuted=enough and agree < (reject_below or 0.0))

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gscompleter.config import ExplorationConfig
+from gscompleter.config import NextBestViewConfig
 from gscompleter.geometry import project, rotation_about
 from gscompleter.types import Camera, Render
 
@@ -39,7 +39,7 @@ def candidates(
     bases: Sequence[Camera],
     renders: Sequence[Render],
     step: float,
-    config: ExplorationConfig = ExplorationConfig(),
+    config: NextBestViewConfig = NextBestViewConfig(),
 ) -> list[Candidate]:
     """Propose the moves of each base camera that end in free space.
 
@@ -50,7 +50,9 @@ def candidates(
     found = []
     for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
         longest = config.max_step * depth
-        away = moves(base, depth, min(step, longest) if step > 0 else longest, config.turn, up)
+        away = moves(
+            base, depth, min(step, longest) if step > 0 else longest, config.yaw_fraction, up
+        )
         found += [Candidate(camera, index, nearest[index]) for camera in away]
     small = [resized(b, *r.alpha.T.shape) for b, r in zip(bases, renders, strict=True)]
     return [c for c in found if in_the_open(c.camera.center, small, renders)]
@@ -131,7 +133,7 @@ def in_the_open(
     return not hidden
 
 
-def is_close(render: Render, nearest: float, config: ExplorationConfig) -> bool:
+def is_close(render: Render, nearest: float, config: NextBestViewConfig) -> bool:
     """Return True if surfaces much closer than `nearest` fill too much of an image."""
     seen = render.depth_map()
     near = seen.valid & (seen.depth < config.clearance * nearest)

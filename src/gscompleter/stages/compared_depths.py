@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gscompleter.config import AffineConfig
+from gscompleter.config import AlignmentConfig
 from gscompleter.stages.alignment import affine_inliers, compared
 from gscompleter.types import DepthAffine, DepthPairs, Lift, Render
 
@@ -11,12 +11,12 @@ MAX_PAIRS = 1000
 
 
 def compared_depths(
-    lift: Lift, at_target: Render, at_anchor: Render, affine: DepthAffine, config: AffineConfig
+    lift: Lift, at_target: Render, at_anchor: Render, affine: DepthAffine, config: AlignmentConfig
 ) -> DepthPairs | None:
     """Sample the depths that `affine` was fitted to; None if there are none."""
-    if config.bridge == "none":
+    if config.align_at == "none":
         return None
-    at_the_target = config.bridge == "target" or affine.contradicted
+    at_the_target = config.align_at == "target" or affine.contradicted
     predicted, render = lift.anchor_depth, at_anchor
     if at_the_target:
         predicted, render = lift.reference_depth, at_target

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
-from gscompleter.config import ContradictionConfig
+from gscompleter.config import DynamicMasksConfig
 from gscompleter.coverage import COVERED
 from gscompleter.generators.robust import robust_affine
 from gscompleter.geometry import baseline_between, inside, project, sample, unproject
@@ -101,15 +101,15 @@ class Answer:
 def contradicted(
     views: Sequence[View],
     renders: Sequence[Render],
-    config: ContradictionConfig = ContradictionConfig(),
+    config: DynamicMasksConfig = DynamicMasksConfig(),
 ) -> list[Bool[Tensor, "_ _"]]:
     """Compute a dynamic mask for each photograph by comparison with its neighbours."""
-    if config.min_difference is None:
+    if config.min_color_difference is None:
         return [torch.zeros_like(view.counted) for view in views]
     photos = [small(view, render) for view, render in zip(views, renders, strict=True)]
     votes = [torch.zeros_like(photo.known, dtype=torch.int32) for photo in photos]
     for one, other in neighbours([view.camera for view in views]):
-        pair = questioned(photos[one], photos[other], config.min_difference)
+        pair = questioned(photos[one], photos[other], config.min_color_difference)
         for index, comparison, region in zip((one, other), pair, agreed(*pair), strict=True):
             votes[index] += region.int() - (comparison.confirmed & ~region).int()
     return [at_size(vote > 0, view.camera) for vote, view in zip(votes, views, strict=True)]

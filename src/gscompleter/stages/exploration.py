@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gscompleter.config import ExplorationConfig
+from gscompleter.config import NextBestViewConfig
 from gscompleter.frames.thinning import thinned, thinning
 from gscompleter.geometry import (
     baseline_between,
@@ -59,13 +59,13 @@ class Choice:
 
 
 def gain(
-    holes: Bool[Tensor, "h w"], overlap: float, config: ExplorationConfig = ExplorationConfig()
+    holes: Bool[Tensor, "h w"], overlap: float, config: NextBestViewConfig = NextBestViewConfig()
 ) -> float:
     """Compute the gain of completing an image, as a fraction of the image.
 
     `overlap` is the fraction of the observed part that the anchor sees, too.
     """
-    radius = max(round(config.reach * max(holes.shape)), 1)
+    radius = max(round(config.border_radius * max(holes.shape)), 1)
     bordering = holes & dilate(~holes, radius)
     return bordering.float().mean().item() * overlap
 
@@ -85,7 +85,7 @@ def best(
     choices: Sequence[Choice],
     photographs: Sequence[Camera],
     step: float,
-    config: ExplorationConfig = ExplorationConfig(),
+    config: NextBestViewConfig = NextBestViewConfig(),
 ) -> Choice | None:
     """Choose the camera to complete next, or None if little is left; `step` is in scene units."""
     most = max((choice.gain for choice in choices), default=0.0)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gscompleter.config import HarmConfig
+from gscompleter.config import PsnrGuardConfig
 from gscompleter.masks import dilate
 from gscompleter.render import FrozenView, OpacityImage, image_of
 from gscompleter.ssim import RADIUS, ssim_map
@@ -81,7 +81,7 @@ def do_no_harm(
     added: Gaussians,
     frozen_views: Sequence[FrozenView],
     budgets: Sequence[Sequence[ErrorBudget]],
-    config: HarmConfig = HarmConfig(),
+    config: PsnrGuardConfig = PsnrGuardConfig(),
     drawings: Sequence[OpacityImage] | None = None,
 ) -> Gaussians:
     """Fade added Gaussians until every photograph is within its error budgets.
@@ -93,7 +93,7 @@ def do_no_harm(
     Returns:
         The Gaussians, or none of them if they lose more than `max_loss` of their opacity.
     """
-    if config.tolerance is None or len(added) == 0:
+    if config.max_drop is None or len(added) == 0:
         return added
     if drawings is None:
         drawings = [image_of(frozen.plan(added)) for frozen in frozen_views]
@@ -182,12 +182,12 @@ def those_over(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[D
 
 
 def is_undone(
-    added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: HarmConfig = HarmConfig()
+    added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: PsnrGuardConfig = PsnrGuardConfig()
 ) -> bool:
-    """Return True if added Gaussians lost more than `max_loss` of their opacity."""
-    if config.max_loss is None or len(added) == 0:
+    """Return True if added Gaussians lost more than `max_opacity_loss` of their opacity."""
+    if config.max_opacity_loss is None or len(added) == 0:
         return False
-    return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_loss
+    return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_opacity_loss
 
 
 def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:

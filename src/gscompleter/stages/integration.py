@@ -87,7 +87,7 @@ def refine_opacities(
         ]
         loss = torch.stack(terms).sum()
         losses.append(loss.item())
-        if config.min_fall is not None and has_settled(losses, config.min_fall):
+        if config.rel_tol is not None and has_settled(losses, config.rel_tol):
             break
         optimizer.step(loss)
     return replace(added, opacities=opacities().detach(), encoded=None), tuple(losses)

@@ -106,7 +106,7 @@ class Fit:
         self._added = added
         self._sh = widened(added.sh, (config.sh_degree + 1) ** 2).requires_grad_()
         self._logits = (FAINT * added.opacities).logit(eps=1e-4).requires_grad_()
-        rates = [(self._logits, config.opacity_step), (self._sh, config.colour_step)]
+        rates = [(self._logits, config.opacity_step), (self._sh, config.color_step)]
         self._optimizer = Adam(rates, (config.beta1, config.beta2))
 
     def looks(self) -> Looks:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gscompleter.config import RegistrationConfig
+from gscompleter.config import AlignmentConfig, DepthAgreementConfig, RegistrationConfig
 from gscompleter.coverage import COVERED
 from gscompleter.descent import Adam
 from gscompleter.geometry import reaching, slide, z_depths
@@ -50,13 +50,25 @@ def register(
     rng: torch.Generator,
     config: RegistrationConfig = RegistrationConfig(),
     max_alpha: float = COVERED,
+    alignment: AlignmentConfig = AlignmentConfig(),
+    reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> Registration:
     """Register lifted Gaussians: all by one affine, then each along its ray.
 
-    `frozen_target` is the scene at the target, and `at_anchor` its render at the anchor. Pixels of
-    the target with alpha below `max_alpha` are holes.
+    Args:
+        lift: Candidates and the depth maps predicted together with them.
+        frozen_target: The scene frozen at the target camera.
+        at_anchor: The scene rendered at the anchor camera.
+        reference: The synthesized image and the target camera.
+        anchor: Camera of the anchor.
+        renderer: Draws the candidates under the anchor camera.
+        rng: Randomness of RANSAC.
+        config: Weights, steps and choices.
+        max_alpha: A pixel of the target that the scene covers by less is a hole.
+        alignment: Settings of the affine fit.
+        reject_below: As `DepthAgreementConfig`.
     """
-    affine = fit_bridge(lift, frozen_target.context, at_anchor, rng, config.affine)
+    affine = fit_bridge(lift, frozen_target.context, at_anchor, rng, alignment, reject_below)
     coarse = apply_affine(
         lift.gaussians, affine, reference.camera, config.footprint, config.min_ratio
     )
@@ -65,7 +77,11 @@ def register(
     registered, losses = register_along_rays(
         coarse, frozen_target, at_anchor, reference, anchor, renderer, config
     )
-    if config.carry_into_holes and config.degrees_of_freedom == 1 and lift.pixel_index is not None:
+    if (
+        config.extrapolate_into_holes
+        and config.degrees_of_freedom == 1
+        and lift.pixel_index is not None
+    ):
         scene = frozen_target.context.depth_map(max_alpha)
         registered = carry_into_holes(
             coarse, registered, lift.pixel_index, scene, reference.camera, config
@@ -143,7 +159,7 @@ def register_along_rays(
     optimizer = Adam([(parameters, config.learning_rate)], (config.beta1, config.beta2))
     losses = []
     for iteration in track(range(config.iterations), "Registering"):
-        left = 1 - iteration / config.iterations if config.schedule == "falling" else 1.0
+        left = 1 - iteration / config.iterations if config.lr_schedule == "linear" else 1.0
         moved = displace(seen, parameters, reference.camera, config)
         loss = objective(moved, frozen_target, alone, renderer.render(moved, anchor))
         optimizer.step(loss, left)
@@ -163,7 +179,7 @@ def displace(
     """Move Gaussians along their target rays (Eq. 10), or freely if `degrees_of_freedom` is 3."""
     offsets = coarse.means - camera.center
     distances = offsets.norm(dim=1, keepdim=True)
-    unit = distances if config.step == "relative" else torch.ones_like(distances)
+    unit = distances if config.lr_unit == "distance" else torch.ones_like(distances)
     if config.degrees_of_freedom == 3:
         return replace(coarse, means=coarse.means + unit * parameters, encoded=None)
     ratio = 1 + (unit * parameters / distances)[:, 0]
@@ -215,7 +231,7 @@ class Objective:
         """Create the objective from renders of the scene at target and anchor."""
         anchor_depth = compared_depth(at_anchor, anchor, config)
         seen = anchor_depth.depth[anchor_depth.valid]
-        relative = config.step == "relative" and len(seen) > 0
+        relative = config.lr_unit == "distance" and len(seen) > 0
         unit = seen.median().item() if relative else 1.0
         target_depth = compared_depth(at_target, reference.camera, config)
         return Objective(target_depth, anchor_depth, reference.image, unit, config)
@@ -238,10 +254,10 @@ class Objective:
         """Compute the loss; `alone` renders `candidates` at the target without the scene."""
         c = self.config
         loss = torch.zeros((), device=candidates.means.device)
-        if c.depth_of == "composite" or c.rgb_weight > 0:
+        if c.rendered_depth == "composite" or c.rgb_weight > 0:
             together = frozen_target.composite(candidates)
             loss = loss + c.rgb_weight * (together.image - self.image).abs().mean()
-        shown = together if c.depth_of == "composite" else alone(candidates)
+        shown = together if c.rendered_depth == "composite" else alone(candidates)
         loss = loss + c.depth_weight * self.depth_error(
             shown, self.target_depth, self.target_depth.valid & shown.depth_map().valid
         )

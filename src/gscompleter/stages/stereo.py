@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.config import SupportConfig
+from gscompleter.config import TrustConfig
 from gscompleter.errors import InputError
 from gscompleter.geometry import unproject
 from gscompleter.reconstructors import Reconstructor
@@ -48,7 +48,7 @@ def stereo_among(
     drawn: Render,
     reconstructor: Reconstructor,
     renderer: Renderer,
-    config: SupportConfig,
+    config: TrustConfig,
 ) -> Stereo | None:
     """Reconstruct the photographs that show most of a target, and render the result there.
 

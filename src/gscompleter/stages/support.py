@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from gscompleter.config import SupportConfig
+from gscompleter.config import TrustConfig
 from gscompleter.generators.robust import robust_affine
 from gscompleter.geometry import z_depths
 from gscompleter.kernels import evidence as kernels
@@ -41,13 +41,13 @@ STANDOFF = 0.5
 
 
 def gather_evidence(
-    drawn: Gaussians, views: Sequence[View], frozen: Sequence[FrozenView], config: SupportConfig
+    drawn: Gaussians, views: Sequence[View], frozen: Sequence[FrozenView], config: TrustConfig
 ) -> Evidence:
     """Measure visible area and photometric consistency of each Gaussian in each photograph."""
     with torch_on_one_thread():
         differences = side_by_side(difference, [f.context for f in frozen], views)
     usual = torch.stack([d.median() for d in differences]).median().item()
-    scale = config.max_difference * max(1.0, usual / EXACT)
+    scale = config.color_sigma * max(1.0, usual / EXACT)
     means = float32(drawn.means)
     areas, agreement = np.empty((2, len(views), len(means)), np.float32)
 
@@ -76,7 +76,7 @@ def support(
     evidence: Evidence,
     sums: Float[Tensor, "m"],
     camera: Camera,
-    config: SupportConfig = SupportConfig(),
+    config: TrustConfig = TrustConfig(),
 ) -> Float[Tensor, "m"]:
     """Compute the trust of each Gaussian from a camera: in [0, 1], 1 for invisible ones.
 
@@ -84,7 +84,7 @@ def support(
     """
     seen = (evidence.areas, evidence.agreement, evidence.means, sums)
     arrays = map(float32, (evidence.centers, *seen))
-    limits = np.float32(math.radians(config.max_turn)), np.float32(ENOUGH)
+    limits = np.float32(math.radians(config.angle_sigma)), np.float32(ENOUGH)
     values = np.empty(len(sums), np.float32)
     share(kernels.support, len(values), *arrays, place_of(camera), *limits, values)
     return torch.from_numpy(values).to(sums)

@@ -130,7 +130,7 @@ def load_diffusers_inpaint(
     settings: DiffusersInpaintSettings = DiffusersInpaintSettings(),
 ) -> DiffusersInpaint:
     """Create the generator from its settings; raises the errors of `load_painter`."""
-    painter = load_painter(settings.path, device, settings.offload)
+    painter = load_painter(settings.weights, device, settings.offload)
     return DiffusersInpaint(painter, seed, settings.prompt, settings.steps, settings.retries)
 
 
@@ -151,7 +151,7 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
         raise InputError(
             "The generator 'diffusers-inpaint' needs the path of a model; give a folder that "
             "diffusers saved or USER/NAME on the Hugging Face hub.",
-            "generator_path",
+            "generator_weights",
         )
     source = source_of(path)
     announce([source])

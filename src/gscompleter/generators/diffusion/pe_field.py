@@ -60,7 +60,7 @@ class PEField:
     """Rounding of target positions; bfloat16 as in the authors' code."""
     retries: int = 0
     """Number of further seeds to try if an image is inconsistent with the photographs."""
-    at_once: int = PEFieldSettings.at_once
+    at_once: int = PEFieldSettings.batch_size
     """Largest number of images denoised together."""
 
     takes_margin: bool = True
@@ -155,11 +155,11 @@ def load_pe_field(
 ) -> PEField:
     """Create PE-Field from its settings; raises InputError if packages or weights are missing."""
     return PEField(
-        load_kontext(settings.path, device, settings.offload),
+        load_kontext(settings.weights, device, settings.offload),
         seed,
         settings.steps,
         None if settings.depth is None else source_depth_named(settings.depth, device),
         device,
         retries=settings.retries,
-        at_once=settings.at_once,
+        at_once=settings.batch_size,
     )

@@ -141,7 +141,7 @@ def needs_diffusers(name: str) -> None:
 
 
 @contextmanager
-def reading(source: Source, setting: str = "path") -> Iterator[None]:
+def reading(source: Source, setting: str = "weights") -> Iterator[None]:
     """Silence the libraries and convert failures to InputErrors, which name `setting`."""
     try:
         with silent(source.is_local), few_retries():
