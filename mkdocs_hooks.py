@@ -1,6 +1,6 @@
-"""What the site shows besides `docs/`: pages made of README, scripts, options and names.
+"""Pages of the site that are generated: from README, scripts, options and public names.
 
-Links hold in the repository; here they are turned to where the same file lies on the site.
+Links are written for the repository, and converted to the same file on the site.
 """
 
 from __future__ import annotations
@@ -26,28 +26,60 @@ TEXTS = {
     "CHANGELOG.md": "changelog.md",
 }
 """Files of the repository that are pages of the site."""
-STAGES = ("selection", "context", "anchor", "alignment", "registration", "integration")
-"""Modules of `stages/` in the paper's order, with what chooses the photographs before them."""
+FILES = ("LICENSE", "CITATION.cff")
+"""Files of the repository that pages link to and that are copied as they are."""
+STAGES = (
+    "select_context",
+    "context",
+    "synthesize",
+    "select_anchor",
+    "lift",
+    "align_depth",
+    "slide_along_rays",
+    "extrapolate",
+    "filter_holes",
+    "refine",
+)
+"""Modules of `stages/` in the paper's order; those that do not exist are left out."""
 LINK = re.compile(r"(?<=\]\()[^)\s]+(?=\))")
 
 
 def tutorials() -> dict[str, Path]:
-    """The numbered scripts by their pages."""
+    """Return the numbered scripts by their pages."""
     return {f"tutorials/{path.stem}.md": path for path in sorted((ROOT / "examples").glob("0*.py"))}
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """The scripts get a section, and pages that `nav` does not name another."""
-    named = set(re.findall(r"[\w/]+\.md", str(config.nav)))
-    others = sorted({path.name for path in (ROOT / "docs").glob("*.md")} - named)
+    """Add the scripts, the decisions, and the pages that `nav` does not name."""
+    named = set(re.findall(r"[\w/-]+\.md", str(config.nav)))
+    pages = sorted(path.relative_to(ROOT / "docs").as_posix() for path in find_pages())
+    others = [page for page in pages if page not in named]
+    decisions = [page for page in others if page.startswith("decisions/")]
     config.nav.insert(2, {"Tutorials": list(tutorials())})
-    if others:
-        config.nav.append({"More": others})
+    add_pages(config.nav, "decisions/index.md", decisions)
+    if more := [page for page in others if page not in decisions]:
+        config.nav.append({"More": more})
     return config
 
 
+def find_pages() -> list[Path]:
+    """Return all Markdown files of `docs/`."""
+    return list((ROOT / "docs").rglob("*.md"))
+
+
+def add_pages(nav: list[Any], after: str, pages: list[str]) -> None:
+    """Append `pages` to the section of `nav` that holds `after`, at any depth."""
+    for entry in list(nav):
+        if entry == after:
+            nav.extend(pages)
+        elif isinstance(entry, dict):
+            for section in entry.values():
+                if isinstance(section, list):
+                    add_pages(section, after, pages)
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """The pages that are made."""
+    """Add the generated pages."""
     made = {page: (ROOT / name).read_text() for name, page in TEXTS.items()}
     made |= {page: of_script(path) for page, path in tutorials().items()}
     made |= {
@@ -55,20 +87,21 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "reference/python.md": of_names(),
         "reference/stages.md": of_stages(),
     }
+    made |= {name: (ROOT / name).read_text() for name in FILES}
     for page, text in made.items():
         files.append(File.generated(config, page, content=text))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Links to files of the repository become links to pages."""
+    """Convert links to files of the repository to links to pages."""
     by_page = {made: name for name, made in TEXTS.items()}
     place = by_page.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     return LINK.sub(lambda link: site_link(link[0], place, page.file.src_uri), markdown)
 
 
 def site_link(link: str, place: str, page: str) -> str:
-    """Where a link in the file at `place` leads from its page."""
+    """Convert a link in the repository file `place` to a link from its page."""
     target, mark, anchor = link.partition("#")
     if ":" in target or not target or page.startswith("reference/"):
         return link
@@ -79,24 +112,26 @@ def site_link(link: str, place: str, page: str) -> str:
 
 
 def of_script(path: Path) -> str:
-    """A script: what its docstring says, then the script."""
+    """Make the page of a script: its docstring, then its code."""
     text = path.read_text()
-    title, _, said = (ast.get_docstring(ast.parse(text)) or path.stem).partition("\n")
-    return f"# {title.rstrip('.')}\n\n{said}\n\n```python\n{text}```\n"
+    title, _, text_below = (ast.get_docstring(ast.parse(text)) or path.stem).partition("\n")
+    return f"# {title.rstrip('.')}\n\n{text_below}\n\n```python\n{text}```\n"
 
 
 def of_commands() -> str:
-    """What `--help-all` says of each command."""
+    """Make the page of all commands from their `--help-all`."""
     from gscompleter.cli import COMMANDS
 
     sections = [f"## {name}\n\n{as_definitions(help_of(name))}" for name in COMMANDS]
-    return "# Command line\n\nWhat `gscompleter COMMAND --help-all` says.\n\n" + "\n".join(sections)
+    return "# Command line\n\nThe output of `gscompleter COMMAND --help-all`.\n\n" + "\n".join(
+        sections
+    )
 
 
-def as_definitions(said: str) -> str:
-    """Help as Markdown: options are terms, and what is said of each is one paragraph."""
+def as_definitions(help_text: str) -> str:
+    """Convert help to Markdown: options are terms, each with one paragraph."""
     parts = []
-    for line in said.splitlines():
+    for line in help_text.splitlines():
         text, indent = line.strip(), len(line) - len(line.lstrip())
         term, _, rest = text.partition("  ")
         if not text.strip("-"):
@@ -113,28 +148,30 @@ def as_definitions(said: str) -> str:
 
 
 def help_of(command: str) -> str:
-    """The help of a command, 100 characters wide and without colours."""
+    """Return the help of a command, 100 characters wide and without colours."""
     from gscompleter.cli import parsed
 
-    said = io.StringIO()
+    output = io.StringIO()
     plain = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     with (
         patch.dict(os.environ, plain),
-        contextlib.redirect_stdout(said),
+        contextlib.redirect_stdout(output),
         contextlib.suppress(SystemExit),
     ):
         parsed([command, "--help-all"])
-    return re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue()).strip()
+    return re.sub(r"\x1b\[[0-9;]*m", "", output.getvalue()).strip()
 
 
 def of_names() -> str:
-    """The public names."""
+    """Make the page of the public names."""
     package = importlib.import_module("gscompleter")
     entries = [f"::: gscompleter.{package._HOMES[name]}.{name}\n" for name in package.__all__]
     return "# Python\n\nThe names of `import gscompleter as gsc`.\n\n" + "\n".join(entries)
 
 
 def of_stages() -> str:
-    """The stages, in the paper's order."""
-    entries = [f"::: gscompleter.stages.{name}\n" for name in STAGES]
+    """Make the page of the stages, in the paper's order."""
+    folder = ROOT / "src" / "gscompleter" / "stages"
+    names = [name for name in STAGES if (folder / f"{name}.py").is_file()]
+    entries = [f"::: gscompleter.stages.{name}\n" for name in names]
     return "# Stages\n\nA stage is a function of values to a value.\n\n" + "\n".join(entries)

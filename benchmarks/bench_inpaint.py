@@ -1,11 +1,9 @@
-"""The embedded fill of holes against what else a user could call: time and PSNR in one run.
+"""Time and PSNR of the embedded hole filling and of other methods, in one run.
 
     python benchmarks/bench_inpaint.py path/to/cases.json [--only NAME] [--pictures FOLDER]
 
-For every case the context is reconstructed and its photographs are warped into the target; every
-method then fills the same holes of the same image. PSNR (dB) is that of the hole's pixels against
-the photograph held back. The biharmonic fill of scikit-image solves a dense system for each hole
-and is run at half size, which its time profits from.
+All methods fill the same holes of the same warped image; PSNR (dB) is over the hole. The biharmonic
+fill of scikit-image runs at half size, as it solves a dense system for each hole.
 """
 
 from __future__ import annotations
@@ -40,17 +38,15 @@ Method = Callable[[View, View, SceneContext, Warped], Image]
 
 
 def ours(nearest: View, target: View, context: SceneContext, warped: Warped) -> Image:
-    """All of warp-inpaint, its warp included."""
     return WarpInpaint()(nearest, target.camera, context)
 
 
 def averages(nearest: View, target: View, context: SceneContext, warped: Warped) -> Image:
-    """A pyramid of averages."""
     return push_pull(warped.image, warped.known.to(warped.image.dtype))
 
 
 def opencv(flag: int) -> Method:
-    """cv2.inpaint with a radius of 5 pixels."""
+    """Make a method of cv2.inpaint with a radius of 5 pixels."""
 
     def fill(nearest: View, target: View, context: SceneContext, warped: Warped) -> Image:
         image = (warped.image.numpy() * 255).round().astype(np.uint8)
@@ -61,7 +57,6 @@ def opencv(flag: int) -> Method:
 
 
 def biharmonic(nearest: View, target: View, context: SceneContext, warped: Warped) -> Image:
-    """scikit-image's biharmonic fill at half size."""
     h, w = warped.known.shape
     size = (w // 2, h // 2)
     image = cv2.resize(warped.image.numpy(), size, interpolation=cv2.INTER_AREA)
@@ -81,7 +76,7 @@ METHODS: dict[str, Method] = {
 
 
 def known_scene(case: Case) -> tuple[View, View, SceneContext]:
-    """The nearest photograph, the photograph held back, and what is known of the scene."""
+    """Load the nearest photograph, the target photograph, and the reconstructed scene."""
     views, (target,) = case.load(case.context), case.load((case.target,))
     scene = load_reconstructor("plane-sweep")(views).gaussians
     renderer = load_renderer("cpu")
@@ -96,12 +91,12 @@ def known_scene(case: Case) -> tuple[View, View, SceneContext]:
 def main(
     cases: Annotated[Path, tyro.conf.Positional], only: str = "", pictures: Path | None = None
 ) -> None:
-    """Fill the holes of every case by every method and print means.
+    """Fill the holes of all cases with all methods and print means.
 
     Args:
-        cases: A cases.json with its scene folders beside it.
-        only: Run only the cases whose name contains this.
-        pictures: Folder for a strip per case: one image per method, then the photograph.
+        cases: A cases.json next to its scene folders.
+        only: Run only cases whose name contains this.
+        pictures: Folder for one strip of images per case, the photograph last.
     """
     scores: dict[str, list[float]] = {name: [] for name in METHODS}
     seconds: dict[str, list[float]] = {name: [] for name in METHODS}
@@ -111,7 +106,7 @@ def main(
         if warped.known.all():
             continue
         if number == 0:
-            ours(nearest, target, context, warped)  # compiled before the clock starts
+            ours(nearest, target, context, warped)  # compiles before the clock starts
         images = []
         for name, method in METHODS.items():
             start = time.perf_counter()
@@ -135,7 +130,7 @@ def main(
             f"{name:24s} {statistics.mean(scores[name]):7.2f} dB {min(difference):8.2f} dB "
             f"{spent:7.3f} s {ratio:10.2f} x"
         )
-    print("worst loss: the case in which warp-inpaint is farthest behind (negative) the method")
+    print("worst loss: largest deficit (negative) of warp-inpaint in any case")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,9 @@
-"""The embedded Ψ on more and more photographs of a scene, beside pairs of them merged, in one run.
+"""The default reconstructor on many photographs at once, and on merged pairs of them.
 
     python benchmarks/bench_many_views.py ../shared/data/fox --views 4 8 16 32
 
-Photographs are spread evenly over the scene, and scored at 256 x 256: those that were given, and
-those halfway between two of them, each after the one gain for each channel that suits it best, for
-many views have one exposure and photographs have their own. Time grows with the number of
-photographs if the seconds for each stay the same.
+Scores at 256 x 256 are for the given photographs and for those halfway between two of them, each
+with its best exposure gain per channel.
 """
 
 from __future__ import annotations
@@ -31,19 +29,17 @@ SIZE = 256, 256
 
 
 def jointly(views: Sequence[View]) -> Gaussians:
-    """All photographs at once."""
     return PlaneSweep()(views).gaussians
 
 
 def by_pairs(views: Sequence[View]) -> Gaussians:
-    """Each photograph with the next one, merged: what two-view models offer."""
+    """Reconstruct pairs of neighbouring photographs and merge them, as two-view models do."""
     pairs = [views[i : i + 2] for i in range(0, len(views) - 1, 2)]
     return merge([PlaneSweep()(pair).gaussians for pair in pairs])
 
 
 def spread(scene: Path, count: int) -> tuple[list[View], list[View]]:
-    """`count` photographs spread over a scene, and those halfway between them, with one depth
-    range."""
+    """Load `count` evenly spread photographs and those halfway between, with one depth range."""
     last = len(gsc.load_views(scene, resolution=(16, 16))) - 1
     given = np.linspace(0, last, count).round().astype(int).tolist()
     middle = {(a + b) // 2 for a, b in pairwise(given)} - set(given)
@@ -55,28 +51,26 @@ def spread(scene: Path, count: int) -> tuple[list[View], list[View]]:
 
 
 def ranged(views: Sequence[View], near: float, far: float) -> list[View]:
-    """`views` with a depth range."""
     return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
 
 
 def scores(gaussians: Gaussians, views: Sequence[View]) -> list[float]:
-    """PSNR (dB) at each of `views`, in its exposure."""
+    """Compute PSNR (dB) at each view, in its exposure."""
     renderer = gsc.load_renderer("cpu")
-    drawn = [renderer.render(gaussians, view.camera).image for view in views]
+    images = [renderer.render(gaussians, view.camera).image for view in views]
     return [
-        psnr(exposed_as(v.image, image), v.image) for image, v in zip(drawn, views, strict=True)
+        psnr(exposed_as(v.image, image), v.image) for image, v in zip(images, views, strict=True)
     ]
 
 
 def exposed_as(
     photograph: Float[Tensor, "h w 3"], image: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "h w 3"]:
-    """`image` times the gain of each channel that brings it nearest to `photograph`."""
+    """Multiply each channel of `image` by its best gain for `photograph`."""
     return image * (image * photograph).sum((0, 1)) / image.square().sum((0, 1))
 
 
 def row(name: str, make: Callable[[Sequence[View]], Gaussians], scene: Path, count: int) -> None:
-    """One row of the table."""
     views, between = spread(scene, count)
     start = time.perf_counter()
     made = make(views)
@@ -91,7 +85,6 @@ def row(name: str, make: Callable[[Sequence[View]], Gaussians], scene: Path, cou
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description="Photographs to Gaussians, of many views.")
     parser.add_argument("scenes", nargs="*", type=Path, default=[Path("../shared/data/fox")])
     parser.add_argument("--views", nargs="+", type=int, default=[4, 8, 16])

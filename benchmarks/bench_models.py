@@ -1,9 +1,8 @@
-"""Ψ by Ψ: seconds and memory for two photographs, beside the embedded default.
+"""Time and memory of all reconstructors for two photographs, next to the default.
 
     python benchmarks/bench_models.py [--size 256] [--only mvsplat-re10k ...]
 
-The networks hold random weights, which take as long as learned ones. Each runs in a process of its
-own, so that its peak of memory is its own: the process, torch and the weights included.
+Networks have random weights, and a process each, so that peak memory is their own.
 """
 
 from __future__ import annotations
@@ -37,18 +36,17 @@ MODELS = (
     "da3-small",
     "da3-base",
 )
-"""One of each network; the default comes first, for the ratios."""
+"""One of each network, after the default, which the ratios refer to."""
 
 
 @dataclass(frozen=True)
 class Measured:
     seconds: float
-    """Median of the repetitions."""
     peak_bytes: int | None
 
 
 def photographs(size: int) -> list[View]:
-    """The centre of the Middlebury motorcycle pair, which scikit-image carries."""
+    """Load the centre of the Middlebury motorcycle pair of scikit-image."""
     with TemporaryDirectory() as folder:
         write_motorcycle_scene(Path(folder))
         return load_views(folder, resolution=(size, size), near=1.0, far=20.0)
@@ -57,7 +55,7 @@ def photographs(size: int) -> list[View]:
 def model(
     name: str, device: str = "cpu", dtype: torch.dtype = torch.float32
 ) -> tuple[Reconstructor, int]:
-    """The reconstructor, with random weights if it has any, and how many."""
+    """Load a reconstructor, with random weights if it has any, and their number."""
     if name not in PUBLISHED:
         return load_reconstructor(name), 0
     from gscompleter.reconstructors.feed_forward.build import around, network_of
@@ -68,25 +66,24 @@ def model(
 
 
 def repeated(reconstruct: Reconstructor, views: list[View], repetitions: int) -> Measured:
-    """Run it once to warm up, then a few times with a clock."""
     with peak_memory(views[0].image.device) as peak:
         seconds = median_seconds(lambda: reconstruct(views), repetitions)
     return Measured(seconds, peak.bytes)
 
 
 def measure(name: str, size: int, repetitions: int) -> tuple[int, Measured]:
-    """Parameters of a model, and what it takes on a CPU."""
+    """Return the number of parameters of a model, and its measurement on a CPU."""
     reconstruct, parameters = model(name)
     return parameters, repeated(reconstruct, photographs(size), repetitions)
 
 
 def main(size: int = 256, repetitions: int = 3, only: tuple[str, ...] = MODELS) -> None:
-    """Measure and print.
+    """Measure all models and print the table.
 
     Args:
-        size: Sides of the two photographs, in pixels: a multiple of 64.
-        repetitions: Timed runs of each model.
-        only: Which models; ratios are to the first.
+        size: Sides of the two photographs in pixels, a multiple of 64.
+        repetitions: Timed runs per model.
+        only: Models to measure; ratios refer to the first.
     """
     table = Table("model", "parameters", "seconds", "ratio", "memory (GiB)", "ratio", box=None)
     first = None

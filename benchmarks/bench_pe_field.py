@@ -1,11 +1,10 @@
-"""PE-Field's transformer, random weights: positions for each head beside the plain ones of FLUX.
+"""PE-Field's transformer with random weights: positions per head against plain ones of FLUX.
 
-    python benchmarks/bench_pe_field.py                        # a block of each kind, on a CPU
-    python benchmarks/bench_pe_field.py --device cuda --compile # all of it, on a GPU
+    python benchmarks/bench_pe_field.py                        # one block per kind, on a CPU
+    python benchmarks/bench_pe_field.py --device cuda --compile # all blocks, on a GPU
 
-It is as wide as the published one; what it computes takes as long as with learned weights. Where
-not all blocks are built, their time is multiplied up to 19 double and 38 single ones, and the
-table says so. Needs `pip install 'gscompleter[diffusion]'`.
+If not all blocks are built, their time is scaled to 19 double and 38 single ones, and the table
+says so. Needs `pip install 'gscompleter[diffusion]'`.
 """
 
 from __future__ import annotations
@@ -30,27 +29,27 @@ from gscompleter.generators.diffusion.rotary import with_per_head_positions
 BLOCKS = (PE_FIELD_TRANSFORMER["num_layers"], PE_FIELD_TRANSFORMER["num_single_layers"])
 """Double and single blocks of the published transformer."""
 TOKEN, TEXT = 16, 512
-"""Pixels along a side of a token; tokens of the prompt."""
+"""Side of a token in pixels; tokens of the prompt."""
 PAPER_SECONDS = 1.73
-"""What the paper states for 4 steps at 256 x 448, encoding and decoding included, on its GPU."""
+"""Time in the paper for 4 steps at 256 x 448 with encoding and decoding, on its GPU."""
 
 
 @dataclass(frozen=True)
 class Options:
     height: int = 256
-    """Of the target."""
+    """Height of the target."""
     width: int = 448
-    """Of the target."""
+    """Width of the target."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """bfloat16 on a GPU, float32 on a CPU, as the generator has it."""
+    """Device; bfloat16 on a GPU, float32 on a CPU, as in the generator."""
     blocks: tuple[int, int] | None = None
-    """Double and single blocks that are built; all on a GPU, one of each on a CPU."""
+    """Double and single blocks to build; default: all on a GPU, one of each on a CPU."""
     steps: int = 4
     """Evaluations of the transformer."""
     images: int = 1
     """Targets that are denoised together."""
     repetitions: int = 3
-    """The median of so many passes counts."""
+    """Number of passes of which the median is taken."""
     compile: bool = False
     """Time torch.compile too."""
 
@@ -58,13 +57,13 @@ class Options:
 @dataclass(frozen=True)
 class Pass:
     seconds: float
-    """Of one evaluation, over all 57 blocks."""
+    """Seconds of one evaluation of all 57 blocks."""
     peak_bytes: int | None
-    """Most memory on the GPU; None on a CPU."""
+    """Peak memory of the GPU; None on a CPU."""
 
 
 def transformer(blocks: tuple[int, int], device: str) -> Any:
-    """FLUX's, as wide as it is published, with random weights."""
+    """Build FLUX's transformer with random weights."""
     from diffusers import FluxTransformer2DModel
 
     with torch.device("meta"):
@@ -80,7 +79,7 @@ def transformer(blocks: tuple[int, int], device: str) -> Any:
 
 
 def call(model: Any, options: Options, numbers: int) -> Callable[[], None]:
-    """One evaluation for the photographs and the images; `numbers` is how many a position has."""
+    """Make a function that evaluates the transformer; `numbers` is the length of a position."""
     size = nearest_size(options.height, options.width)
     grid = (size[0] // TOKEN, size[1] // TOKEN)
     ids = target_ids(size, grid)[:, :numbers].repeat(2, 1).to(options.device)
@@ -104,7 +103,7 @@ def call(model: Any, options: Options, numbers: int) -> Callable[[], None]:
 
 
 class Stopwatch:
-    """Seconds that some blocks of a network take."""
+    """Seconds spent in some blocks of a network."""
 
     def __init__(self, blocks: Iterable[torch.nn.Module]) -> None:
         self.seconds = 0.0
@@ -125,7 +124,7 @@ class Stopwatch:
 
 
 def measured(model: Any, once: Callable[[], None], options: Options) -> Pass:
-    """Median of the passes; blocks that are missing count as those that are there."""
+    """Measure the median pass, with missing blocks estimated from those that are built."""
     kinds = (model.transformer_blocks, model.single_transformer_blocks)
     missing = [all_of_them / len(b) - 1 for b, all_of_them in zip(kinds, BLOCKS, strict=True)]
     once()
@@ -150,7 +149,7 @@ def main() -> None:
     """Print the table."""
     options = tyro.cli(Options, description=__doc__)
     if options.device == "cuda" and not torch.cuda.is_available():
-        raise SystemExit("--device cuda was asked for, and there is no GPU; leave it out.")
+        raise SystemExit("--device cuda needs a GPU, and there is none; leave it out.")
     built = options.blocks or ((1, 1) if options.device == "cpu" else BLOCKS)
     model = transformer(built, options.device)
     rows = {"plain positions": measured(model, call(model, options, 3), options)}

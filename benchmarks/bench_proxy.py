@@ -1,11 +1,9 @@
-"""How much sooner a proxy is frozen than its whole scene, as ratios within one run, and how much it
-looks like it.
+"""Time to freeze a LOD proxy instead of the whole scene, and their similarity, in one run.
 
     python benchmarks/bench_proxy.py [--count 2000000]
 
-The scene is that of `bench_render.py`, copied until there are so many Gaussians, each a little
-aside and fainter. What users would do without a proxy is to draw all of it, or some: as many as the
-proxy has, enlarged.
+The scene is that of `bench_render.py`, copied until there are `count` Gaussians. The alternatives
+are the whole scene and a subset as large as the proxy with enlarged Gaussians.
 """
 
 from __future__ import annotations
@@ -32,34 +30,33 @@ def main(count: int = 2_000_000, size: int = 256, cameras: int = 4) -> None:
     Args:
         count: Gaussians of the scene.
         size: Side of the images.
-        cameras: How many look at it.
+        cameras: Number of cameras.
     """
     scene = crowded(merge([pixel_gaussians(size, x)[0] for x in (-0.2, 0.2)]), count)
     scene = scene[order_nearby(scene)]
     start = pixel_gaussians(size, -0.3)[1].camera
-    looking = [moved(start, 0.6 * number / max(cameras - 1, 1)) for number in range(cameras)]
-    made = median_seconds(lambda: run_by_run(scene, looking), runs=3)
-    proxy = run_by_run(scene, looking).scene
+    viewpoints = [moved(start, 0.6 * number / max(cameras - 1, 1)) for number in range(cameras)]
+    made = median_seconds(lambda: run_by_run(scene, viewpoints), runs=3)
+    proxy = run_by_run(scene, viewpoints).scene
     whole, ours, fewer = (
-        median_seconds(lambda drawn=drawn: frozen(drawn, looking), runs=3)
-        for drawn in (scene, proxy, thinned(scene, len(proxy)))
+        median_seconds(lambda part=part: frozen(part, viewpoints), runs=3)
+        for part in (scene, proxy, thinned(scene, len(proxy)))
     )
     print(f"{count:,} Gaussians, {len(proxy):,} in the proxy, {cameras} views of {size} px:")
     print(f"  {whole / ours:6.1f} x   all of them frozen / the proxy")
     print(f"  {whole / (ours + made):6.1f} x   the same, making it included ({1e3 * made:.0f} ms)")
     print(f"  {fewer / ours:6.1f} x   as many of them, enlarged / the proxy")
-    print(f"  {likeness(proxy, scene, looking):6.1f} dB  the proxy to all of them")
-    print(f"  {likeness(thinned(scene, len(proxy)), scene, looking):6.1f} dB  as many of them")
+    print(f"  {likeness(proxy, scene, viewpoints):6.1f} dB  the proxy to all of them")
+    print(f"  {likeness(thinned(scene, len(proxy)), scene, viewpoints):6.1f} dB  as many of them")
 
 
 def frozen(scene: Gaussians, cameras: Sequence[Camera]) -> None:
-    """Freeze a scene at each camera."""
     for camera in cameras:
         load_renderer("cpu").freeze(scene, camera)
 
 
 def likeness(scene: Gaussians, whole: Gaussians, cameras: Sequence[Camera]) -> float:
-    """Mean PSNR of one scene to another, in dB."""
+    """Compute the mean PSNR between renders of two scenes, in dB."""
     draw = load_renderer("cpu").render
     pairs = ((draw(scene, camera).image, draw(whole, camera).image) for camera in cameras)
     return torch.tensor([psnr(*pair) for pair in pairs]).mean().item()

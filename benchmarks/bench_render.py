@@ -1,9 +1,8 @@
-"""How much faster the compiled renderer is than the alternatives, as ratios within one run.
+"""Speed of the compiled renderer against alternatives, as ratios in one run.
 
     python benchmarks/bench_render.py [--size 256]
 
-The scene is the stereo pair of the demo: one Gaussian per pixel of both photographs, seen from
-between them, with a third view's worth of Gaussians added.
+The context has one Gaussian per pixel of two cameras; a third camera adds the new ones.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from gscompleter.types import observed, sh_from_rgb
 
 
 def now() -> float:
-    """Seconds, once a GPU has done all that it was told."""
+    """Return the clock in seconds, after all GPU work is done."""
     if torch.cuda.is_initialized():
         torch.cuda.synchronize()
     return time.perf_counter()
 
 
 def median_seconds(function: Callable[[], object], runs: int = 7, warm: bool = True) -> float:
-    """Median over `runs`, after one that is not counted where `warm`."""
+    """Measure the median over `runs`, after a warm-up run unless `warm` is False."""
     if warm:
         function()
     seconds = []
@@ -42,7 +41,7 @@ def median_seconds(function: Callable[[], object], runs: int = 7, warm: bool = T
 
 
 def pixel_gaussians(size: int, shift: float) -> tuple[Gaussians, View]:
-    """A Gaussian per pixel of a camera moved by `shift` metres, on a wavy surface 3 m away."""
+    """Make one Gaussian per pixel of a camera moved by `shift` metres, on a surface 3 m away."""
     left, _ = motorcycle_cameras(741, 500)
     K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]])
     camera = moved(replace(left, K=K, width=size, height=size, near=1.0, far=8.0), shift)
@@ -66,7 +65,7 @@ def main(size: int = 256, reference_size: int = 48) -> None:
 
     Args:
         size: Side of the images of the compiled renderer.
-        reference_size: Side of those that are compared with the reference, which is slow.
+        reference_size: Side of those for the slow reference renderer.
     """
     cpu, reference = load_renderer("cpu"), load_renderer("reference")
 
@@ -101,7 +100,7 @@ def main(size: int = 256, reference_size: int = 48) -> None:
     opacity_only = median_seconds(planned)
     print(f"a step of optimisation, {len(context):,} frozen and {len(new):,} new Gaussians:")
     print(f"  {together / composite:10.1f} x   all of them / composite of the frozen view")
-    print(f"  {composite / opacity_only:10.1f} x   composite / plan, where only opacities move")
+    print(f"  {composite / opacity_only:10.1f} x   composite / plan, if only opacities move")
     print(f"  (composite {1e3 * composite:.1f} ms, plan {1e3 * opacity_only:.1f} ms)")
 
 

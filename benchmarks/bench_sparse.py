@@ -2,10 +2,8 @@
 
     python benchmarks/bench_sparse.py [--size 256] [--dense-cells 64]
 
-Two photographs of `size` x `size` pixels make a voxel of most pixels. At the resolution of the
-published model the box around them has billions of cells, which no dense convolution can hold. The
-dense network, torch's `conv3d` and `conv_transpose3d`, gets a box of `dense_cells` cells a side
-around coarser voxels of the same points, and the sparse network the same coarser voxels.
+No dense network can hold the published resolution, so both also run on coarser voxels in a box of
+`dense_cells` cells a side.
 """
 
 from __future__ import annotations
@@ -24,11 +22,10 @@ from gscompleter.reconstructors.feed_forward.voxels import voxelize
 
 CHANNELS = 164
 RESOLUTION = 0.001
-"""Of the published model, in scene units."""
+"""Voxel size of the published model, in scene units."""
 
 
 def best_seconds(function: Callable[[], object], runs: int = 3) -> float:
-    """The fastest of `runs`."""
     seconds = []
     for _ in range(runs):
         start = time.perf_counter()
@@ -38,7 +35,7 @@ def best_seconds(function: Callable[[], object], runs: int = 3) -> float:
 
 
 def points_of_two_views(size: int) -> Tensor:
-    """A point per pixel of two cameras beside each other, on wavy surfaces 2 to 6 units away."""
+    """Make a point per pixel of two adjacent cameras, on surfaces 2 to 6 units away."""
     place = (torch.arange(size) + 0.5) / size - 0.5
     y, x = torch.meshgrid(place, place, indexing="ij")
     rays = torch.stack([x, y, torch.full_like(x, 0.9)], dim=-1) / 0.9
@@ -48,13 +45,13 @@ def points_of_two_views(size: int) -> Tensor:
 
 
 def dense_kernel(conv: SparseConv) -> Tensor:
-    """[27, in, out] with x fastest as [out, in, x, y, z]."""
+    """Convert [27, in, out] with x fastest to [out, in, x, y, z]."""
     kernel = conv.kernel
     return kernel.unflatten(0, (3, 3, 3)).permute(4, 3, 2, 1, 0).contiguous()
 
 
 def dense_unet(network: SparseUNet, features: Tensor) -> Tensor:
-    """The convolutions of `network` on every cell of a box [1, c, x, y, z]."""
+    """Run the convolutions of `network` on every cell of a box [1, c, x, y, z]."""
     x, encoded = features, []
     for encoder in network.encoders:
         x = F.conv3d(x, dense_kernel(encoder.conv), stride=2, padding=1).relu_()
@@ -68,13 +65,13 @@ def dense_unet(network: SparseUNet, features: Tensor) -> Tensor:
 
 
 def doubled(features: Tensor, conv: SparseConv) -> Tensor:
-    """A transposed convolution of stride 2 on a box."""
+    """Apply a transposed convolution of stride 2 to a box."""
     kernel = dense_kernel(conv).transpose(0, 1)
     return F.conv_transpose3d(features, kernel, stride=2, padding=1, output_padding=1).relu_()
 
 
 def in_box(features: Tensor, grid: Grid, cells: int) -> Tensor:
-    """The features in a box [1, c, cells, cells, cells] of zeros."""
+    """Place features in a box of zeros [1, c, cells, cells, cells]."""
     box = features.new_zeros((cells, cells, cells, features.shape[1]))
     x, y, z = (grid.coordinates - grid.coordinates.amin(dim=0))[:, 1:].unbind(1)
     box[x, y, z] = features
@@ -86,7 +83,7 @@ def main(size: int = 256, dense_cells: int = 64) -> None:
     """Print the table.
 
     Args:
-        size: Side of the two photographs, in pixels.
+        size: Side of the two photographs in pixels.
         dense_cells: Side of the box of the dense network, a multiple of 16.
     """
     torch.manual_seed(0)

@@ -1,10 +1,9 @@
-"""The embedded stereo against OpenCV's, on the motorcycle pair: time and accuracy in one run.
+"""Time and accuracy of the embedded stereo and OpenCV's, on the motorcycle pair.
 
     python benchmarks/bench_stereo.py
 
-OpenCV's semi-global matcher gets what it needs, a rectified pair and a range of disparities; ours
-gets two posed photographs. Pixels that OpenCV leaves without a depth count as missed. The smoothing
-of ours is timed beside scikit-image's total variation (first order, no weights, no edges).
+OpenCV's semi-global matcher gets a rectified pair and a range of disparities, ours two posed
+photographs. Pixels without depth count as errors.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, fit_surf
 
 
 def report(name: str, depth: np.ndarray, truth: np.ndarray, seconds: float) -> None:
-    """One row: shares of the pixels with truth within 5 % and 2 % of it, and the time."""
+    """Print the shares of pixels within 5 % and 2 % of the truth, and the time."""
     known = truth > 0
     error = np.abs(depth[known] - truth[known]) / truth[known]
     shares = [100 * np.mean(np.nan_to_num(error, nan=1.0) < t) for t in (0.05, 0.02)]
@@ -41,7 +40,7 @@ def main() -> None:
     """Print the table, at half the size of the photographs."""
     left, right, disparity = stereo_motorcycle()
     halves = [np.ascontiguousarray(cv2.resize(i, None, fx=0.5, fy=0.5)) for i in (left, right)]
-    # Unknown disparities are infinite, and become depths of 0.
+    # Unknown disparities are infinite and give depth 0.
     truth = (FOCAL_PX * BASELINE_M / (disparity + PRINCIPAL_POINT_DX_PX))[::2, ::2]
     height, width = halves[0].shape[:2]
     truth = truth[:height, :width]

@@ -1,10 +1,10 @@
-"""Everything that needs a GPU, measured on the one at hand: `make gpu`, or
+"""Measurements that need a GPU; writes docs/gpu.md and docs/gpu.json.
 
+    make gpu
     PYTHONPATH=src:tests python benchmarks/gpu.py [--only agreement stages ...]
 
-where torch with CUDA, gsplat and what the tests need is installed. The data are synthetic rooms and
-the weights are random, so that nothing is downloaded; networks take as long as with learned ones.
-It writes docs/gpu.md and docs/gpu.json.
+It needs torch with CUDA, gsplat and the test dependencies. Data are synthetic rooms and weights are
+random, so nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -36,29 +36,28 @@ from scenes import Room, camera_at, gaussians_of, view_of
 
 ROOT = Path(__file__).resolve().parents[1]
 NETWORKS = MODELS[1:]
-"""Those with weights; the first of all is plane-sweep."""
+"""Models with weights; the first of all is plane-sweep."""
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Where and how large the parts are; small ones on a CPU test this file."""
+    """Settings of all parts; small ones on a CPU are for tests of this file."""
 
     device: str = "cuda"
-    """Its name is that of the renderer, too."""
+    """Device, also the name of the renderer."""
     sizes: tuple[tuple[int, int], ...] = ((256, 256), (256, 448))
-    """Heights and widths of images."""
+    """Heights and widths of the images."""
     models: tuple[str, ...] = MODELS
     dtypes: tuple[str, ...] = tuple(DTYPES)
     repetitions: int = 5
-    """The median of so many counts."""
 
     @property
     def renderer(self) -> Renderer:
         return load_renderer(self.device)
 
     def camera(self, x: float, size: tuple[int, int], yaw: float = 0.0) -> Camera:
-        """A camera of `size` in the room, as wide in angle as a square one of its height."""
+        """Make a camera of `size` in the room, with the focal length of a square one."""
         height, width = size
         camera = camera_at(x, yaw=yaw, size=height)
         K = camera.K.clone()
@@ -66,21 +65,18 @@ class Bench:
         return replace(camera, K=K, width=width)
 
     def views(self, size: tuple[int, int]) -> list[View]:
-        """Two photographs of the room."""
         shots = [view_of(Room(), self.camera(x, size), i) for i, x in enumerate((-0.3, 0.1))]
         return [shot.to(self.device) for shot in shots]
 
     def target(self, size: tuple[int, int]) -> Camera:
-        """A camera beside them that sees what they do not."""
         return self.camera(0.5, size, yaw=10).to(self.device)
 
     def scene(self, views: list[View]) -> Gaussians:
-        """A Gaussian for each pixel, at its true depth."""
         return merge([gaussians_of(view.to("cpu")) for view in views]).to(self.device)
 
 
 def built(bench: Bench) -> Iterator[Row]:
-    """The first picture, for which gsplat compiles its kernels where it has none."""
+    """Measure the first render, for which gsplat compiles its kernels."""
     view = bench.views((64, 64))[0]
     scene = bench.scene([view])
     seconds = median_seconds(lambda: bench.renderer.render(scene, view.camera), 1, warm=False)
@@ -88,7 +84,7 @@ def built(bench: Bench) -> Iterator[Row]:
 
 
 def tested(*arguments: str) -> Iterator[Row]:
-    """What pytest says with these arguments; where nothing passed, something is missing."""
+    """Run pytest with these arguments; no passed test counts as a failure."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     lines = done.stdout.strip().splitlines() or [shortened(done.stderr) or "no output"]
@@ -100,7 +96,7 @@ def tested(*arguments: str) -> Iterator[Row]:
 
 
 def agreement(bench: Bench) -> Iterator[Row]:
-    """Pictures and gradients beside those of the reference, which draws on the CPU."""
+    """Compare renders and gradients with those of the reference renderer on the CPU."""
     from test_render import CAMERA, PARAMETERS, REFERENCE, SCENES, gradients
 
     camera = CAMERA.to(bench.device)
@@ -114,11 +110,11 @@ def agreement(bench: Bench) -> Iterator[Row]:
         for parameter in PARAMETERS:
             error = (found[parameter].cpu() - expected[parameter]).norm()
             relative = error / expected[parameter].norm().clamp_min(1e-12)
-            yield Row(f"{name}: relative difference of slopes in {parameter}", relative.item())
+            yield Row(f"{name}: relative difference of gradients in {parameter}", relative.item())
 
 
 def renderer(bench: Bench) -> Iterator[Row]:
-    """A step of registration and one of refinement, beside drawing all of it anew."""
+    """Measure a step of registration and of refinement, with and without a frozen scene."""
     for size in bench.sizes:
         views = bench.views(size)
         context, camera = bench.scene(views), bench.target(size)
@@ -134,7 +130,6 @@ def renderer(bench: Bench) -> Iterator[Row]:
 
 
 def composite_step(view: FrozenView, new: Gaussians) -> Callable[[], None]:
-    """Forward and backward where means move."""
 
     def step() -> None:
         means = new.means.clone().requires_grad_()
@@ -144,7 +139,6 @@ def composite_step(view: FrozenView, new: Gaussians) -> Callable[[], None]:
 
 
 def opacity_step(view: FrozenView, new: Gaussians) -> Callable[[], None]:
-    """Forward and backward where opacities alone change."""
     plan = view.plan(new)
 
     def step() -> None:
@@ -155,7 +149,7 @@ def opacity_step(view: FrozenView, new: Gaussians) -> Callable[[], None]:
 
 
 def stages(bench: Bench) -> Iterator[Row]:
-    """The second completion of the room with the embedded models; the first compiles kernels."""
+    """Measure the second completion of the room; the first one compiles kernels."""
     complete = GSCompleter(renderer=bench.renderer)
     for size in bench.sizes:
         views, target = bench.views(size), bench.target(size)
@@ -166,8 +160,7 @@ def stages(bench: Bench) -> Iterator[Row]:
 
 
 def completions(bench: Bench) -> Iterator[Row]:
-    """A completion with every Ψ. Random weights see no room, so that only its coming to an end
-    and its provenance are looked at."""
+    """Complete with all models; with random weights only success and provenance are checked."""
     size = bench.sizes[0]
     views, target = bench.views(size), bench.target(size)
 
@@ -185,7 +178,7 @@ def completions(bench: Bench) -> Iterator[Row]:
 
 
 def models(bench: Bench) -> Iterator[Row]:
-    """Two photographs through each network."""
+    """Measure two photographs through each network."""
     views = bench.views(bench.sizes[0])
 
     def passed(name: str, dtype: str) -> Iterator[Row]:
@@ -202,7 +195,7 @@ def models(bench: Bench) -> Iterator[Row]:
 
 
 def pe_field(bench: Bench, kontext: Callable[[str], Any] | None = None) -> Iterator[Row]:
-    """An image in four steps, encoding and decoding included."""
+    """Measure an image in four steps, with encoding and decoding."""
     size = bench.sizes[-1]
     views, target = bench.views(size), bench.target(size)
     scene = bench.scene(views)
@@ -221,7 +214,7 @@ def pe_field(bench: Bench, kontext: Callable[[str], Any] | None = None) -> Itera
 
 
 def random_kontext(device: str) -> Any:
-    """FLUX Kontext as large as it is published, with random weights and an empty prompt."""
+    """Build FLUX Kontext with random weights and an empty prompt."""
     from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, FluxKontextPipeline
 
     from bench_pe_field import BLOCKS, TEXT
@@ -269,19 +262,15 @@ PARTS = {
 
 
 def machine() -> dict[str, str]:
-    """The GPU and the versions that the numbers hold for.
-
-    Raises:
-        SystemExit: with code 2, where torch sees no GPU.
-    """
+    """Describe the GPU and the versions; exit with code 2 if torch sees no GPU."""
     if not torch.cuda.is_available():
         print("make gpu needs a CUDA device, and torch sees none on this machine.", file=sys.stderr)
         raise SystemExit(2)
     major, minor = torch.cuda.get_device_capability()
-    # gsplat compiles for these architectures alone, which spares minutes.
+    # gsplat compiles for this architecture only, which saves minutes.
     os.environ.setdefault("TORCH_CUDA_ARCH_LIST", f"{major}.{minor}")
-    asked = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    driver = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.split("\n")
+    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    driver = subprocess.run(command, capture_output=True, text=True, check=False).stdout.split("\n")
     return {
         "device": torch.cuda.get_device_name(),
         "driver": driver[0].strip() or "unknown",

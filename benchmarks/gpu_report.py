@@ -1,7 +1,6 @@
-"""Measurements in processes of their own: what fails or takes too long is a row, the rest goes on.
+"""Measurements in separate processes: a failure or timeout is a row, and the rest continues.
 
-A script hands its parts to `main`. A person calls it once, and it calls itself once for each part.
-Rows are written to a file as they come, so that a part that is stopped keeps what it had.
+Rows are written at once, so that a part that is stopped keeps what it measured.
 """
 
 from __future__ import annotations
@@ -21,25 +20,24 @@ from tempfile import TemporaryDirectory
 import tyro
 
 MEASURE = "measure-part"
-"""First argument of the process that measures one part; its name and a file for rows follow."""
+"""First argument of the process of one part, followed by its name and a file for rows."""
 
 EXCEPTION = re.compile(r"[\w.]+(Error|Exception|Exit)\b")
-"""Begins the line of a traceback that names its reason."""
+"""Start of the line of a traceback that names the error."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One measurement, or why there is none."""
+    """One measurement, or the reason of a failure."""
 
     what: str
     value: float | None = None
-    """None where it failed, or where the note says it all."""
+    """None if it failed or if the note is the result."""
     unit: str = ""
     note: str = ""
     failed: bool = False
 
     def shown(self) -> str:
-        """The result as a person reads it."""
         number = "" if self.value is None else f"{self.value:.4g} {self.unit}".strip()
         text = "; ".join(part for part in (number, self.note) if part)
         return f"**failed**: {text}" if self.failed else text
@@ -53,15 +51,13 @@ class Part:
     limit: float
     """Seconds after which it is stopped."""
     rows: Callable[[], Iterable[Row]]
-    """Runs in a process of its own."""
+    """Function that measures, called in the process."""
     needs: str | None = None
-    """Name of the part without which this one is pointless."""
+    """Name of a part that has to succeed first."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What became of a part."""
-
     title: str
     seconds: float
     rows: tuple[Row, ...]
@@ -74,20 +70,20 @@ class Found:
 @dataclass(frozen=True)
 class Options:
     seconds: float = 480.0
-    """For all parts together."""
+    """Time limit of all parts together."""
     out: Path = Path("docs")
     """Folder of gpu.md and gpu.json."""
     only: tuple[str, ...] = ()
-    """Names of parts; all if none is given."""
+    """Names of parts; default: all."""
 
 
 def main(parts: Mapping[str, Part], machine: Callable[[], dict[str, str]], about: str) -> None:
-    """The command line of a script with `parts`; `machine` refuses where they cannot be measured.
+    """Run the command line of a script with `parts`.
 
     Args:
-        parts: By name, in their order.
-        machine: What the numbers hold for; raises SystemExit on a machine without a GPU.
-        about: The script's help.
+        parts: Parts by name, in order.
+        machine: Describes the machine; raises SystemExit without a GPU.
+        about: Help text of the script.
     """
     if sys.argv[1:2] == [MEASURE]:
         name, path = sys.argv[2:]
@@ -96,7 +92,7 @@ def main(parts: Mapping[str, Part], machine: Callable[[], dict[str, str]], about
     options = tyro.cli(Options, description=about)
     unknown = [name for name in options.only if name not in parts]
     if unknown:
-        raise SystemExit(f"There is no part {unknown[0]!r}; choose of {', '.join(parts)}.")
+        raise SystemExit(f"There is no part {unknown[0]!r}; choose one of {', '.join(parts)}.")
     described = machine()
     wanted = {name: p for name, p in parts.items() if not options.only or name in options.only}
     found = measured(wanted, Path(sys.argv[0]), options.seconds)
@@ -106,7 +102,6 @@ def main(parts: Mapping[str, Part], machine: Callable[[], dict[str, str]], about
 
 
 def append(path: Path, rows: Iterable[Row]) -> None:
-    """Write rows as they come, a line each."""
     with path.open("a") as file:
         for row in rows:
             file.write(json.dumps(asdict(row)) + "\n")
@@ -114,7 +109,7 @@ def append(path: Path, rows: Iterable[Row]) -> None:
 
 
 def tried(what: str, compute: Callable[[], Iterable[Row]]) -> Iterator[Row]:
-    """The rows of one of several alike: where it fails, the others of the part go on."""
+    """Yield rows, or a failed row if they raise, so that the other rows continue."""
     try:
         yield from compute()
     except Exception as error:
@@ -122,16 +117,16 @@ def tried(what: str, compute: Callable[[], Iterable[Row]]) -> Iterator[Row]:
 
 
 def measured(parts: Mapping[str, Part], script: Path, seconds: float) -> dict[str, Found]:
-    """Run the parts one after the other, all of them within `seconds`."""
+    """Run the parts one after the other, within `seconds` in total."""
     end = time.monotonic() + seconds
     found: dict[str, Found] = {}
     for name, part in parts.items():
         needed = None if part.needs is None else found.get(part.needs)
         left = min(part.limit, end - time.monotonic())
         if needed is not None and needed.failed:
-            reason = f"left out, for '{needed.title}' failed"
+            reason = f"left out, because '{needed.title}' failed"
         elif left <= 0:
-            reason = f"left out, for the {seconds:.0f} s of all parts were over"
+            reason = f"left out, because the {seconds:.0f} s of all parts are over"
         else:
             found[name] = in_process(name, part, script, left)
             continue
@@ -140,7 +135,6 @@ def measured(parts: Mapping[str, Part], script: Path, seconds: float) -> dict[st
 
 
 def in_process(name: str, part: Part, script: Path, limit: float) -> Found:
-    """The rows of a part, and one more that says why where it did not come to its end."""
     print(f"{part.title} ...", flush=True)
     start = time.monotonic()
     with TemporaryDirectory() as folder:
@@ -155,7 +149,7 @@ def in_process(name: str, part: Part, script: Path, limit: float) -> Found:
 
 
 def reason_of(command: list[str], limit: float) -> str | None:
-    """Run a command, and all that it starts, for at most `limit` seconds; why it failed, if so."""
+    """Run a command for at most `limit` seconds, and return the reason if it fails."""
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     process = subprocess.Popen(command, text=True, start_new_session=True, **quiet)
     try:
@@ -167,26 +161,24 @@ def reason_of(command: list[str], limit: float) -> str | None:
     if process.returncode == 0:
         return None
     lines = errors.strip().splitlines() or [f"exit code {process.returncode}, no message"]
-    # A compiler's log may follow the line that says what failed.
-    told = [line for line in lines if EXCEPTION.match(line)]
-    return shortened((told or lines)[-1])
+    # A compiler's log may follow the line that names the error.
+    named = [line for line in lines if EXCEPTION.match(line)]
+    return shortened((named or lines)[-1])
 
 
 def shortened(text: str, most: int = 200) -> str:
-    """One line of at most `most` characters, without what would break a table."""
+    """Shorten to one line of at most `most` characters, without table syntax."""
     line = " ".join(text.split()).replace("|", "/")
     return line if len(line) <= most else line[: most - 1] + "…"
 
 
 def write(folder: Path, machine: Mapping[str, str], found: Mapping[str, Found]) -> None:
-    """gpu.md to read and gpu.json to compute with."""
     content = {"machine": machine, "parts": {name: asdict(part) for name, part in found.items()}}
     (folder / "gpu.json").write_text(json.dumps(content, indent=2) + "\n")
     (folder / "gpu.md").write_text(page(machine, found))
 
 
 def page(machine: Mapping[str, str], found: Mapping[str, Found]) -> str:
-    """All rows as tables."""
     lines = ["# On a GPU", "", "Written by `make gpu`; [gpu.json](gpu.json) holds the same.", ""]
     lines += ["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in machine.items())]
     for part in found.values():

@@ -1,11 +1,9 @@
-"""What a batch of very many jobs would take: measured jobs, replayed through the scheduler.
+"""Simulated time of a large batch: measured jobs, replayed through the scheduler.
 
     python benchmarks/simulate_batch.py OUT --jobs 10000 --workers 16 --lost-per-hour 0.05
 
-OUT is what `gscompleter batch` wrote. Jobs are drawn from its rows. A worker takes the next job
-when it is free, as in `gscompleter.batch`; it needs a while to start, and may be killed in the
-middle of a job, which is then done again, at most `retries` times more. With --jobs 0 the jobs of
-OUT are replayed as they are, to hold the simulation against the time that OUT took.
+Jobs are sampled from the rows that `gscompleter batch` wrote to OUT; with --jobs 0 they are
+replayed as they are, to compare the simulation with the measured time.
 """
 
 from __future__ import annotations
@@ -21,30 +19,26 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Fleet:
-    """Who does the jobs."""
-
     workers: int
     start_seconds: float
-    """Until a worker does its first job: processes, imports, compiled kernels."""
+    """Time until the first job of a worker: process, imports, compiled kernels."""
     lost_per_hour: float
-    """How often a worker is killed in an hour."""
+    """How often a worker is killed per hour."""
     retries: int = 2
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What became of the jobs."""
-
     hours: float
     busy: float
-    """Share of the time of all workers in which they did what counts."""
+    """Share of the workers' time spent on successful attempts."""
     repeated: int
-    """Attempts that were lost."""
+    """Number of lost attempts."""
     given_up: int
 
 
 def replay(seconds: Sequence[float], fleet: Fleet, seed: int = 0) -> Replay:
-    """Let the workers of `fleet` do jobs of so many seconds."""
+    """Simulate the workers of `fleet` on jobs of the given durations."""
     chance = random.Random(seed)
     free = [fleet.start_seconds] * fleet.workers
     waiting = [(job, 0) for job in range(len(seconds))][::-1]
@@ -68,13 +62,12 @@ def replay(seconds: Sequence[float], fleet: Fleet, seed: int = 0) -> Replay:
 
 
 def rows_of(out: Path) -> list[dict]:
-    """The rows of jobs that are done."""
     rows = [json.loads(path.read_text()) for path in sorted((out / "rows").glob("*.json"))]
     return [row for row in rows if row["state"] == "done"]
 
 
 def measured_hours(out: Path, rows: Sequence[dict]) -> float:
-    """From the first job that began to the last that ended."""
+    """Compute the hours from the start of the first job to the end of the last."""
     ends = [(out / "rows" / f"{row['job']}.json").stat().st_mtime for row in rows]
     return (max(ends) - min(e - r["seconds"] for e, r in zip(ends, rows, strict=True))) / 3600
 

@@ -1,12 +1,12 @@
-"""Does support find what is wrong of a trained splat? And what does completing it change?
+"""How well trust finds errors of a trained splat, and how completion changes its PSNR.
 
     python benchmarks/support.py SCENE SPLAT TRAIN_TXT [--complete FRAME ...]
 
-SCENE are posed photographs, SPLAT was trained on those of them that TRAIN_TXT names. For each of
-the others: the share of pixels that are wrong (the colour is off by more than 0.1, over a few
-pixels, once the exposure is fitted) and the area under the ROC curve of support, told by all
-photographs but that one, and by those of the training alone. With --complete these frames are
-completed, each by itself, from the 8 photographs that stand closest; the others are witnesses.
+SPLAT was trained on the photographs of SCENE that TRAIN_TXT names. For each other photograph the
+script prints the share of wrong pixels (colour error above 0.1 after exposure fitting) and the area
+under the ROC curve of trust, computed from all other photographs and from the training ones. Frames
+after --complete are completed one by one from the 8 nearest photographs; the others are check
+views.
 """
 
 from __future__ import annotations
@@ -40,27 +40,26 @@ CONTEXT = 8
 
 
 def main() -> None:
-    """Print a row per photograph that the splat was not trained on."""
+    """Print one row per photograph that is not a training photograph."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("splat", type=Path)
     parser.add_argument("train", type=Path)
     parser.add_argument("--complete", type=int, nargs="*", default=[])
-    asked = parser.parse_args()
-    photographs = open_photographs(asked.scene)
+    options = parser.parse_args()
+    photographs = open_photographs(options.scene)
     names = [Path(str(frame.image)).name for frame in photographs.frames]
-    trained = [n for n, name in enumerate(names) if name in asked.train.read_text().split()]
+    trained = [n for n, name in enumerate(names) if name in options.train.read_text().split()]
     views = photographs.views(list(range(len(names))), LONG_SIDE)
-    scene = load_splat(asked.splat)
+    scene = load_splat(options.splat)
     near, far = depth_range_of_scene(scene, [v.camera for v in views], load_renderer("cpu"))
     views = [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
     find(scene, views, trained)
-    for frame in asked.complete:
+    for frame in options.complete:
         complete(scene, views, frame, trained)
 
 
 def find(scene: Gaussians, views: Sequence[View], trained: Sequence[int]) -> None:
-    """How well support finds wrong pixels."""
     renderer, config = load_renderer("cpu"), TrustConfig()
     frozen_views = [renderer.freeze(scene, view.camera) for view in views]
     evidence = gather_evidence(Proxy(scene), views, frozen_views, config)
@@ -69,22 +68,21 @@ def find(scene: Gaussians, views: Sequence[View], trained: Sequence[int]) -> Non
         frozen = frozen_views[frame]
         wrong, sums = difference(frozen.context, view) > WRONG, weight_sums(frozen)
         areas = []
-        for told in ([n for n in range(len(views)) if n != frame], list(trained)):
-            told_of = chosen(evidence, told)
-            known = support(told_of, sums, view.camera, config)
-            areas.append(roc(believed_alpha(frozen, known), wrong))
+        for numbers in ([n for n in range(len(views)) if n != frame], list(trained)):
+            part = chosen(evidence, numbers)
+            trust = support(part, sums, view.camera, config)
+            areas.append(roc(believed_alpha(frozen, trust), wrong))
         share = wrong.float().mean().item()
         print(f"{frame}: wrong {share:.3f}, by all others {areas[0]:.3f}, trained {areas[1]:.3f}")
 
 
 def chosen(evidence: Evidence, told: list[int]) -> Evidence:
-    """What some of the photographs say."""
     parts = (evidence.centers, evidence.areas, evidence.agreement)
     return Evidence(evidence.proxy, *(part[told] for part in parts))
 
 
 def roc(believed: Tensor, wrong: Tensor) -> float:
-    """Area under the ROC curve of little belief for being wrong."""
+    """Compute the area under the ROC curve of low alpha as a sign of wrong pixels."""
     ranks = believed.flatten().argsort(descending=True).argsort().double() + 1
     bad = wrong.flatten()
     positives, negatives = int(bad.sum()), int((~bad).sum())
@@ -95,14 +93,13 @@ def roc(believed: Tensor, wrong: Tensor) -> float:
 
 
 def complete(scene: Gaussians, views: Sequence[View], frame: int, trained: Sequence[int]) -> None:
-    """Complete the scene for a frame and compare all photographs before and after."""
     target = views[frame]
     others = [n for n in range(len(views)) if n != frame]
     remoteness = {n: (views[n].camera.center - target.camera.center).norm().item() for n in others}
     context = sorted(sorted(others, key=remoteness.__getitem__)[:CONTEXT])
-    witnesses = [views[n] for n in others if n not in context]
+    check_views = [views[n] for n in others if n not in context]
     views_in = [views[n] for n in context]
-    completion = GSCompleter()(views_in, target.camera, scene, witnesses)
+    completion = GSCompleter()(views_in, target.camera, scene, check_views)
     renderer = load_renderer("cpu")
 
     def gain(n: int) -> float:
@@ -114,12 +111,12 @@ def complete(scene: Gaussians, views: Sequence[View], frame: int, trained: Seque
 
     of_trained = [gain(n) for n in trained]
     of_others = [gain(n) for n in others if n not in trained]
-    aside = 0 if completion.set_aside is None else int(completion.set_aside.sum())
+    pruned = 0 if completion.set_aside is None else int(completion.set_aside.sum())
     print(
         f"completed for {frame}: {gain(frame):+.2f} dB there; "
         f"trained {min(of_trained):+.3f} at worst, {sum(of_trained) / len(of_trained):+.3f} mean; "
         f"others {min(of_others):+.2f} at worst, {sum(of_others) / len(of_others):+.2f} mean; "
-        f"{len(completion.added)} added, {aside} aside, {completion.seconds['total']:.0f} s",
+        f"{len(completion.added)} added, {pruned} pruned, {completion.seconds['total']:.0f} s",
         flush=True,
     )
 

@@ -1,4 +1,4 @@
-"""Jobs that write a line and a result, for the workers of a batch to do and to be killed over."""
+"""Jobs that write a line and a result, for workers that may be killed by them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gscompleter.errors import InputError
 
 @dataclass(frozen=True)
 class Writing:
-    """Does a job as its options say: `seconds` long, and in the way that `ends` names."""
+    """Runs a job for `seconds`, and ends it as `ends` names."""
 
     out: str
     retries: int = 2
@@ -50,14 +50,14 @@ class Writing:
 
 
 def noted(path: Path) -> None:
-    """One more line, with the process that wrote it."""
+    """Append a line with the id of this process."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
         file.write(f"{os.getpid()}\n")
 
 
 def outcomes(out: Path, jobs: Sequence[Job], engine: Engine, retries: int = 2) -> list[Outcome]:
-    """What becomes of those of `jobs` that have no row."""
+    """Run the jobs without a row and yield their outcomes."""
     place = FolderPlace(out)
     rounds = Rounds(place, BatchRows(place), missing(jobs, place, again=False), retries)
     return list(rounds.outcomes(engine, Writing(str(out), retries)))

@@ -1,4 +1,4 @@
-"""A browser for tests of pages: Debian's chromium, with nothing of its own to send or to ask."""
+"""A browser for tests of pages: Debian's chromium, without requests of its own."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ SWITCHES = [
     *("--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
 ]
-"""Software WebGL 2, and no traffic of the browser's own."""
+"""Software WebGL 2, and no background requests of the browser."""
 NO_SCREEN = ["--disable-gpu-vsync", "--disable-frame-rate-limit"]
-"""No screen is waited for. A page that draws all the time would leave no time for others."""
+"""Do not wait for a screen; a page that always renders would block others."""
 
 PATIENCE = 60_000
-"""Milliseconds that anything may take."""
+"""Timeout of any action, in milliseconds."""
 
 Picture = Float[np.ndarray, "h w 3"]
 
 
 def needed(reason: str) -> None:
-    """Skip for want of something; where everything has to be tested, fail."""
+    """Skip for want of something; on CI, fail."""
     if os.environ.get("CI"):
         pytest.fail(reason)
     pytest.skip(reason)
@@ -40,7 +40,7 @@ def needed(reason: str) -> None:
 
 @contextmanager
 def launched(switches: Sequence[str] = (*SWITCHES, *NO_SCREEN)) -> Iterator[Any]:
-    """A browser that runs meanwhile."""
+    """Run a browser."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
     if CHROMIUM is None:
         needed("needs chromium")
@@ -51,7 +51,7 @@ def launched(switches: Sequence[str] = (*SWITCHES, *NO_SCREEN)) -> Iterator[Any]
 
 
 class Tab:
-    """A page that was opened from its file with the network off."""
+    """A page opened from its file, with the network off."""
 
     def __init__(self, browser: Any, path: Path, width: int, height: int, link: str = "") -> None:
         self.context = browser.new_context(viewport={"width": width, "height": height})
@@ -69,11 +69,11 @@ class Tab:
         self.page.goto(path.as_uri() + link)
 
     def picture(self) -> Picture:
-        """What the window shows."""
+        """Take a screenshot."""
         return pixels_of(self.page.screenshot())
 
 
 def pixels_of(screenshot: bytes) -> Picture:
-    """The colours of a screenshot in [0, 1]."""
+    """Decode the colours of a screenshot in [0, 1]."""
     image = Image.open(io.BytesIO(screenshot)).convert("RGB")
     return np.asarray(image, dtype=np.float64) / 255

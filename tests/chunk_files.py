@@ -1,4 +1,4 @@
-"""Chunks in the format of pixelSplat, made of a synthetic room."""
+"""Writers of pixelSplat chunks of a synthetic room."""
 
 import io
 import json
@@ -56,7 +56,7 @@ def save_chunk(path: Path, *examples: object) -> Path:
 
 
 def save_dataset(root: Path) -> Path:
-    """Three scenes in two chunks, as the test half of a data set."""
+    """Write three scenes in two chunks, as the test split of a data set."""
     save_chunk(root / "test" / "000000.torch", example("a"), example("b"))
     save_chunk(root / "test" / "000001.torch", example("c"))
     index = {"a": "000000.torch", "b": "000000.torch", "c": "000001.torch"}

@@ -8,7 +8,7 @@ from gscompleter.cli import main
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Run `gscompleter` with these arguments; returns its exit code."""
+    """Run `gscompleter` with these arguments; return its exit code."""
     monkeypatch.setattr(sys, "argv", ["gscompleter", *map(str, arguments)])
     try:
         main()

@@ -1,15 +1,15 @@
-"""Every shape in an annotation is a run-time check while the tests run."""
+"""Every shape in an annotation is checked at run time while the tests run."""
 
 import os
 from pathlib import Path
 
-# As the command line has it: threads that spin while they wait make a busy machine crawl.
+# As in the command line: threads that spin while they wait slow down a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import pytest
 from jaxtyping import install_import_hook
 
-# All of the package but `gscompleter.kernels`, whose functions numba compiles.
+# The whole package except `gscompleter.kernels`, whose functions numba compiles.
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "gscompleter"
 CHECKED = sorted(
     path.stem
@@ -24,7 +24,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 @pytest.fixture(scope="session")
 def room(tmp_path_factory) -> Path:
-    """A synthetic room photographed from three places; frame 2 sees what 0 and 1 do not."""
+    """Write a synthetic room photographed from three places; frame 2 sees more than 0 and 1."""
     from scenes import camera_at, photographed
 
     cameras = [camera_at(x, yaw=yaw, size=64) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
@@ -33,7 +33,7 @@ def room(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def completed_room(room, tmp_path_factory) -> Path:
-    """The output of one plain run on the room. Whoever changes it copies it first."""
+    """Return the output of one plain run on the room; copy it before changing it."""
     from command import run
 
     out = tmp_path_factory.mktemp("runs") / "out"
@@ -45,7 +45,7 @@ def completed_room(room, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def shared() -> Path:
-    """Real photographs and files for development, where they lie beside the project."""
+    """Return the folder of real photographs and files for development, or skip."""
     if not SHARED.is_dir():
         pytest.skip(f"needs the development data, and there is no folder {SHARED}")
     return SHARED

@@ -1,4 +1,4 @@
-"""What the authors' Depth Anything 3 gave, and how to compare."""
+"""Outputs of the authors' Depth Anything 3, and comparison with them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ STAND_INS = {
     "metric-tiny": METRIC_TINY,
     "nested-tiny": NestedConfig(DepthAnythingConfig(), METRIC_TINY),
 }
-"""The networks of the fixtures, by how their names begin."""
+"""Configurations of the fixtures' networks by the prefix of their names."""
 OFFICIAL = {
     "da3-small": "da3-small",
     "da3-base": "da3-base",
@@ -54,11 +54,11 @@ OFFICIAL = {
     "da3-giant": "da3-giant",
     "da3metric-large": "da3-metric-large",
 }
-"""Published lists of tensors, and what the networks are called here."""
+"""Published lists of tensors and our names of their networks."""
 
 
 def weighted(network: nn.Module, multipliers: dict[str, float]) -> nn.Module:
-    """`network` with the weights of the fixtures; parts of a nested one have their own names."""
+    """Load the fixtures' weights; parts of a nested network have names of their own."""
     if isinstance(network, NestedDepthAnything):
         weighted(network.da3, multipliers)
         weighted(network.da3_metric, multipliers)
@@ -73,13 +73,13 @@ def weighted(network: nn.Module, multipliers: dict[str, float]) -> nn.Module:
 
 @cache
 def network_for(name: str) -> DepthAnything | MetricDepthAnything | NestedDepthAnything:
-    """The network of a stand-in, with the weights of the fixtures. Do not change it."""
+    """Return the shared network of a fixture with its weights; do not modify it."""
     multipliers = json.loads((FIXTURES / "multipliers.json").read_text())["multipliers"]
     return weighted(network_with(STAND_INS[name]), multipliers).eval().requires_grad_(False)
 
 
 def shapes_in(path: Path) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the tensors that a file of weights holds: one of a shared tensor."""
+    """List names and shapes in a weight file; shared tensors occur once."""
     listed = json.loads(path.read_text())
     aliases = listed.get("aliases") or {}
     return {key: tuple(s) for key, (s, _) in listed["keys"].items() if key not in aliases}
@@ -87,7 +87,7 @@ def shapes_in(path: Path) -> dict[str, tuple[int, ...]]:
 
 @dataclass
 class Outputs:
-    """What the modules of a network gave in one pass, by their names."""
+    """Outputs of a network's modules in one pass, by name."""
 
     of: dict[str, object]
 
@@ -99,7 +99,7 @@ class Outputs:
 
 
 def images_and_poses(case: Case) -> tuple[Tensor, Poses | None]:
-    """The input as the network takes it, its poses normalised as in the authors' inference."""
+    """Load the network input, with poses normalised as in the authors' inference."""
     images = normalised_images(case.tensor("in_image_u8"))
     if "in_c2w" not in case.values:
         return images, None
@@ -108,7 +108,7 @@ def images_and_poses(case: Case) -> tuple[Tensor, Poses | None]:
 
 
 def between(outputs: dict[str, object], network: nn.Module) -> dict[str, Tensor]:
-    """Values between the layers, by the names of the fixtures."""
+    """Collect intermediate values by the names of the fixtures."""
     found = {}
     tokens = outputs["backbone.pretrained"]
     for i, handed_on in enumerate(tokens):
@@ -131,7 +131,7 @@ def between(outputs: dict[str, object], network: nn.Module) -> dict[str, Tensor]
 
 
 def through_any_view(network: DepthAnything, case: Case) -> tuple[Prediction, dict[str, Tensor]]:
-    """A pass, with what lies between; rays, too, which a reconstruction leaves out."""
+    """Run the network; return intermediate values and rays too."""
     images, poses = images_and_poses(case)
     size, outputs = tuple(images.shape[3:]), Outputs({})
     hooks = outputs.watch(network)
@@ -156,7 +156,7 @@ def through_any_view(network: DepthAnything, case: Case) -> tuple[Prediction, di
 
 
 def errors_of(found: dict[str, Tensor], case: Case, kind: str, stride: int) -> dict[str, float]:
-    """Largest error of each array over its largest value; some are stored in part."""
+    """Compute the largest relative error of each array; some are stored in part."""
     errors = {}
     for name, value in found.items():
         if f"{kind}_{name}" not in case.values:
@@ -172,7 +172,7 @@ def errors_of(found: dict[str, Tensor], case: Case, kind: str, stride: int) -> d
 
 
 def any_view_errors(network: DepthAnything, case: Case) -> dict[str, float]:
-    """Errors of an any-view network, and of its Gaussians where it has a head for them."""
+    """Compute the errors of an any-view network and of its Gaussians, if any."""
     predicted, found = through_any_view(network, case)
     stride = int(case.values["mid_stride"])
     out = outputs_of(predicted) | {"depth": predicted.depth, "depth_conf": predicted.confidence}
@@ -190,14 +190,14 @@ def any_view_errors(network: DepthAnything, case: Case) -> dict[str, float]:
 
 
 def outputs_of(predicted: Prediction, scale: float = 1.0) -> dict[str, Tensor]:
-    """The predicted cameras, in a unit of 1 / `scale`."""
+    """Convert the predicted cameras to a unit of 1 / `scale`."""
     w2c = predicted.poses.w2c[:, :, :3].clone()
     w2c[..., 3] *= scale
     return {"pose_enc": predicted.numbers, "extrinsics": w2c, "intrinsics": predicted.poses.K}
 
 
 def gaussian_errors(gaussians: PixelGaussians, case: Case, prefix: str) -> dict[str, float]:
-    """Errors of Gaussians: harmonics degree by degree, rotations up to sign."""
+    """Compute the errors of Gaussians: SH degree by degree, rotations up to sign."""
     step = int(case.values["stride"])
     names = ("means", "scales", "opacities")
     values = {name: getattr(gaussians, name).flatten(1, 3)[:, ::step] for name in names}
@@ -221,7 +221,7 @@ def gaussian_errors(gaussians: PixelGaussians, case: Case, prefix: str) -> dict[
 
 
 def metric_errors(network: MetricDepthAnything, case: Case) -> dict[str, float]:
-    """Errors of the metric network."""
+    """Compute the errors of the metric network."""
     images, _ = images_and_poses(case)
     outputs = Outputs({})
     hooks = outputs.watch(network)
@@ -236,7 +236,7 @@ def metric_errors(network: MetricDepthAnything, case: Case) -> dict[str, float]:
 
 
 def nested_errors(network: NestedDepthAnything, case: Case) -> dict[str, float]:
-    """Errors of the nested network."""
+    """Compute the errors of the nested network."""
     images, poses = images_and_poses(case)
     with torch.no_grad():
         predicted = network(images, poses)
@@ -249,7 +249,7 @@ def nested_errors(network: NestedDepthAnything, case: Case) -> dict[str, float]:
 
 
 def errors_in(path: Path) -> dict[str, float]:
-    """Errors of all arrays of a case, whichever network it is of."""
+    """Compute the errors of all arrays of a case."""
     case, network = Case.load(path), network_for(path.stem.split("_")[0])
     if isinstance(network, NestedDepthAnything):
         return nested_errors(network, case)

@@ -1,4 +1,4 @@
-"""A synthetic room in the formats of vehicles, for readers that `pose_files` has no writers for."""
+"""Writers of a synthetic room in vehicle formats that `pose_files` does not cover."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IDENTITY = {
 
 
 def infos() -> dict[str, Any]:
-    """Infos of mmdetection3d: one camera, half a second from one sample to the next."""
+    """Build infos of mmdetection3d: one camera, half a second between samples."""
     return {
         "metainfo": {"categories": {"car": 0, "barrier": 1}},
         "data_list": [info(number) for number in range(len(CAMERAS))],
@@ -46,7 +46,7 @@ def info(number: int) -> dict[str, Any]:
 
 
 def write_infos(folder: Path, content: Any = None) -> Path:
-    """infos.pkl beside the photographs of the room."""
+    """Write infos.pkl beside the photographs of the room."""
     write_photographs(folder)
     path = folder / "infos.pkl"
     path.write_bytes(pickle.dumps(infos() if content is None else content))
@@ -54,7 +54,7 @@ def write_infos(folder: Path, content: Any = None) -> Path:
 
 
 def write_swept_dgp(folder: Path) -> Path:
-    """A scene of DGP whose photographs belong to a sweep of the laser."""
+    """Write a DGP scene whose photographs belong to a laser sweep."""
     path = dgp(folder) / "scene_1.json"
     scene = json.loads(path.read_text())
     for number, datum in enumerate(scene["data"]):
@@ -67,8 +67,7 @@ def write_swept_dgp(folder: Path) -> Path:
 
 
 def write_drive(folder: Path) -> Path:
-    """A drive of raw KITTI; every sensor stands where the camera does, a metre from frame to
-    frame."""
+    """Write a drive of raw KITTI, all sensors at the camera, one metre between frames."""
     numbers = " ".join(f"{value:.12e}" for value in np.eye(3).ravel())
     K = np.concatenate([CAMERAS[0].K.double().numpy(), np.zeros((3, 1))], axis=1)
     projection = " ".join(f"{value:.12e}" for value in K.ravel())

@@ -1,9 +1,8 @@
 """A device that no machine has: code that would fail on a GPU fails here, without one.
 
-Within `Elsewhere()` the device `meta` holds tensors that say they lie there and compute on the CPU
-what they stand for, values and gradients. As on a GPU, one with a tensor of the CPU in the same
-operation is an error, and `.numpy()` needs `.cpu()` first. It is stricter in one thing: an index on
-the CPU, which a GPU takes at the cost of waiting for it, is refused as well.
+Within `Elsewhere()` the device `meta` holds tensors that compute values and gradients on the CPU.
+As on a GPU, mixing one with a CPU tensor in an operation is an error, and `.numpy()` needs `.cpu()`
+first. It is stricter in one thing: a CPU index, which a GPU waits for, is refused as well.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ class MixedError(RuntimeError):
 
 
 class There(Tensor):
-    """A tensor on `DEVICE`; `inner` is what it stands for."""
+    """A tensor on `DEVICE`; `inner` holds its values."""
 
     inner: Tensor
 
@@ -44,7 +43,7 @@ class There(Tensor):
         return made
 
     def tolist(self) -> Any:
-        """Waits for the device and copies, as on a GPU."""
+        """Wait for the device and copy, as on a GPU."""
         return self.inner.tolist()
 
     @classmethod
@@ -53,7 +52,7 @@ class There(Tensor):
 
 
 class Elsewhere(TorchDispatchMode):
-    """Where tensors on `DEVICE` hold values."""
+    """A mode in which tensors on `DEVICE` hold values."""
 
     def __enter__(self) -> Elsewhere:
         self.constants = Constants()
@@ -70,7 +69,7 @@ class Elsewhere(TorchDispatchMode):
 
 
 class Constants(TorchFunctionMode):
-    """`torch.tensor` and `new_tensor` copy numbers past all dispatch; here they take two steps."""
+    """A mode for `torch.tensor` and `new_tensor`, which bypass dispatch, in two steps."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
@@ -84,7 +83,7 @@ class Constants(TorchFunctionMode):
 
 
 def computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    """The result of an operation, on the device where a GPU would leave it."""
+    """Put the result of an operation on the device where a GPU would leave it."""
     leaves = tree_leaves((args, kwargs))
     there = [leaf for leaf in leaves if isinstance(leaf, There)]
     on_device = bool(there)
@@ -101,7 +100,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def refuse_company(func: Any, args: Any, leaves: list[Any]) -> None:
-    """Raise where a GPU would: elementwise it takes a CPU tensor that is a number, to copy any."""
+    """Raise like a GPU: elementwise it accepts a CPU tensor that is a number, to copy any."""
     if func is COPY:
         return
     strangers = [x for x in leaves if isinstance(x, Tensor) and not isinstance(x, There)]
@@ -114,7 +113,7 @@ def refuse_company(func: Any, args: Any, leaves: list[Any]) -> None:
 
 
 def placed(value: Any, known: dict[int, There]) -> Any:
-    """A result on the device; what was changed in place stays itself."""
+    """Put a result on the device; tensors changed in place stay themselves."""
     if not isinstance(value, Tensor) or isinstance(value, There):
         return value
     return known[id(value)] if id(value) in known else There(value)
@@ -129,7 +128,7 @@ def is_there(device: Any) -> bool:
 
 
 def without_autocast(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let networks ask that autocast be off on `DEVICE`, which autocast itself does not know."""
+    """Let networks disable autocast on `DEVICE`, which autocast itself does not know."""
     known = torch.autocast
 
     def autocast(device: str, *arguments: Any, **settings: Any) -> torch.autocast:

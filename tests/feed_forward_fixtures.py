@@ -1,7 +1,7 @@
-"""What the authors' code gave for weights that follow from their names, and how to compare.
+"""Outputs of the authors' code for pseudo-random weights, and comparison with them.
 
-Weights, rule v1: a tensor named `key` is drawn from a normal distribution whose seed is the hash
-of the key, then scaled by its shape, and by a factor from multipliers.json where it is listed.
+Rule v1: a tensor named `key` is sampled from a normal distribution with the hash of the key as
+seed, then scaled by its shape, and by its factor in multipliers.json, if any.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from parity import relative_error
 
 STORED = Path(__file__).parent / "fixtures" / "feed_forward"
 EXTRA = os.environ.get("GSC_EXTRA_FIXTURES")
-"""A folder with more fixtures, in the layout of the stored ones; the tests take all that it has."""
+"""Folder with additional fixtures in the same layout, all of which the tests use."""
 EVERY = 97
-"""Of the values between the layers each 97th is stored."""
+"""Stride of the stored intermediate values."""
 
 
 def rule_v1(key: str, shape: torch.Size, multiplier: float = 1.0) -> Tensor:
-    """The weight called `key`."""
+    """Create the weight `key`."""
     digest = hashlib.sha256(key.encode()).digest()
     seed = int.from_bytes(digest[:8], "little") & 0x7FFFFFFFFFFFFFFF
     normal = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
@@ -42,7 +42,7 @@ def rule_v1(key: str, shape: torch.Size, multiplier: float = 1.0) -> Tensor:
 
 
 def with_rule_v1(network: nn.Module, model: str) -> nn.Module:
-    """`network` with the weights of the fixtures of `model`."""
+    """Load the weights of the fixtures of `model`."""
     multipliers = json.loads((STORED / model / "multipliers.json").read_text())["multipliers"]
     weights = {
         key: rule_v1(key, value.shape, multipliers.get(key, 1.0))
@@ -53,13 +53,13 @@ def with_rule_v1(network: nn.Module, model: str) -> nn.Module:
 
 
 def published_shapes(model: str, name: str) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of all weights of the authors' network."""
+    """List names and shapes of all weights of the authors' network."""
     keys = json.loads((STORED / model / f"{name}.json").read_text())["keys"]
     return {key: tuple(shape) for key, (shape, _) in keys.items()}
 
 
 def extra(model: str, pattern: str = "*.npz") -> list[Path]:
-    """The files of a model in the folder of more fixtures."""
+    """List the additional fixtures of a model."""
     return sorted(Path(EXTRA, model).glob(pattern)) if EXTRA else []
 
 
@@ -87,10 +87,9 @@ class Case:
         return Cameras(*(self.tensor(f"in_{name}") for name in names))
 
     def output_errors(self, predicted: PixelGaussians) -> dict[str, float]:
-        """Largest error of each output over the largest value of the authors'.
+        """Compute the largest error of each output, relative to the authors' largest value.
 
-        Harmonics are compared degree by degree: the rotation changes the higher ones by less
-        than a thousandth of the constant.
+        SH are compared degree by degree, because higher ones are below 0.001 of the constant.
         """
         step = int(self.values["stride"])
         axes = rotations_from(predicted.quats)
@@ -122,7 +121,7 @@ class Case:
         return errors
 
     def intermediate_errors(self, between: dict[str, Tensor]) -> dict[str, float]:
-        """Likewise of the values between the layers, all that are stored."""
+        """Compute the same for the stored intermediate values."""
         names = [name[4:] for name in self.values if name.startswith("mid_")]
         return {
             name: relative_error(between[name].flatten()[::EVERY], self.tensor(f"mid_{name}"))
@@ -132,7 +131,7 @@ class Case:
 
 @dataclass
 class Pass:
-    """A pass through a network, and what went into and came out of some of its modules."""
+    """A pass through a network, with inputs and outputs of some modules."""
 
     predicted: PixelGaussians
     inputs: dict[str, tuple]
@@ -156,7 +155,7 @@ class Pass:
         return Pass(predicted, inputs, outputs)
 
     def of_mvsplat(self) -> dict[str, Tensor]:
-        """The values that fixtures of MVSplat store."""
+        """Collect the values of MVSplat fixtures."""
         names = {
             "corr_refine": "corr_refine_net",
             "depth_logits": "depth_head_lowres",
@@ -171,7 +170,7 @@ class Pass:
         return {**between, "trans_features": trans_features, "cnn": cnn, "cost_volume": cost_volume}
 
     def of_depthsplat(self) -> dict[str, Tensor]:
-        """The values that fixtures of DepthSplat store."""
+        """Collect the values of DepthSplat fixtures."""
         scenes, views = self.predicted.depth.shape[:2]
         matching = self.outputs["depth_predictor.transformer"].unflatten(0, (scenes, views))
         between = {

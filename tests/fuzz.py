@@ -1,11 +1,11 @@
-"""Mutated inputs of every kind, and what the commands say to them.
+"""Mutated inputs of every kind, and the reactions of the commands.
 
-    python tests/fuzz.py --count 1500 --seed 0
+python tests/fuzz.py --count 1500 --seed 0
 
-Each mutation runs in a fork of one interpreter that has imported everything, under a time limit
-and an address-space limit. A traceback, a signal, an exit code other than 0 and 2, an error of more
-than a sentence, a refused run that leaves files behind, one that outlives its limit, or one that
-takes more than 2 GB is a finding; `--only KIND:NUMBER` repeats one.
+Each mutation runs in a fork of one interpreter that has imported everything, with limits of time
+and memory. Findings are a traceback, a signal, an exit code other than 0 and 2, an error of more
+than one sentence, files left by a refused run, a timeout, and more than 2 GB of memory. `--only
+KIND:NUMBER` repeats one.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from typing import Any
 os.environ |= {"OMP_WAIT_POLICY": "PASSIVE", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 ADDRESS_SPACE = 8 << 30
 MAX_MEMORY = 2 << 20
-"""Of a run, in kilobytes."""
+"""Most memory of a run, in kilobytes."""
 LONGEST_ERROR = 300
-"""In characters, without the end of the line."""
+"""Most characters of an error, without the end of the line."""
 SIZE = 32
 
 NUMBERS: list[Any] = [
@@ -73,24 +73,24 @@ YAML += ["!!python/object:os.system x", "~", "'²'", "0", "1", "-1", "1000000000
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run on mutated files ended."""
+    """Result of a run with mutated files."""
 
     name: str
     command: list[str]
     refused: bool
     finding: str | None
-    """What is wrong about that, in a line; None where nothing is."""
+    """Problem in one line, if any."""
 
 
 Mutation = Callable[[Path, random.Random], list[str]]
-"""Changes the files of a folder; returns the words of the command."""
+"""Function that changes the files of a folder and returns the words of the command."""
 
 
 # ---- what is mutated ----------------------------------------------------------------------------
 
 
 def build(folder: Path) -> None:
-    """One valid input of every kind."""
+    """Write one valid input of every kind."""
     import numpy as np
     import torch
 
@@ -151,7 +151,7 @@ KINDS_OF_IMAGE = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 
 
 def in_every_format(images: Path) -> None:
-    """The photographs of a folder, which are .png, under the same names in other formats."""
+    """Write the .png photographs of a folder in other formats, under the same names."""
     from PIL import Image
 
     for path, kind in zip(sorted(images.iterdir()), KINDS_OF_IMAGE, strict=True):
@@ -161,7 +161,7 @@ def in_every_format(images: Path) -> None:
 
 
 def as_ascii(data: bytes) -> bytes:
-    """Our binary .ply as an ASCII one."""
+    """Convert our binary .ply to ASCII."""
     import numpy as np
 
     head, body = data.split(b"end_header\n")
@@ -176,7 +176,7 @@ COMPLETE = ["complete", "scene", "--context", "0", "1", "--out", "out", "--quiet
 
 
 def in_json(path: str, command: Sequence[str]) -> Mutation:
-    """A value of a JSON file is replaced by an odd one, or its text is damaged."""
+    """Replace a value of a JSON file by an odd one, or damage its text."""
 
     def mutate(folder: Path, chance: random.Random) -> list[str]:
         file = folder / path
@@ -195,7 +195,7 @@ def in_json(path: str, command: Sequence[str]) -> Mutation:
 
 
 def replaced(content: Any, chance: random.Random, odd: Sequence[Any] = ODD) -> Any:
-    """`content` with one value somewhere in it replaced by an odd one, or removed."""
+    """Replace one value anywhere in `content` by an odd one, or remove it."""
     if not isinstance(content, (dict, list)) or not content or chance.random() < 0.08:
         return chance.choice(odd)
     keys = list(content) if isinstance(content, dict) else range(len(content))
@@ -208,7 +208,7 @@ def replaced(content: Any, chance: random.Random, odd: Sequence[Any] = ODD) -> A
 
 
 def in_bytes(path: str, command: Sequence[str]) -> Mutation:
-    """Bytes of a file are cut, changed, doubled or replaced; of those that a pattern names, one."""
+    """Cut, change, double or replace bytes of one of the files that a pattern names."""
 
     def mutate(folder: Path, chance: random.Random) -> list[str]:
         damage(chance.choice(sorted(folder.glob(path))), chance)
@@ -218,7 +218,7 @@ def in_bytes(path: str, command: Sequence[str]) -> Mutation:
 
 
 def damage(file: Path, chance: random.Random) -> None:
-    """Change some parts of a file, most often near its beginning, or put another one there."""
+    """Change parts of a file, most often near its beginning, or replace it by another."""
     data = bytearray(file.read_bytes())
     if chance.random() < 0.05:
         data[:] = chance.choice(FILES)
@@ -271,7 +271,7 @@ EDITS = [overwrite, overwrite, insert, lose, cut, double, count_otherwise]
 
 
 def in_yaml(folder: Path, chance: random.Random) -> list[str]:
-    """A value of the settings is replaced by an odd one."""
+    """Replace a value of the settings by an odd one."""
     from dataclasses import fields, is_dataclass
 
     from gscompleter.config import CompleterConfig
@@ -289,7 +289,7 @@ def in_yaml(folder: Path, chance: random.Random) -> list[str]:
 
 
 def in_words(folder: Path, chance: random.Random) -> list[str]:
-    """A word of the command line is replaced by an odd one."""
+    """Replace a word of the command line by an odd one."""
     options = {
         "--context": ["0", "1"],
         "--target": ["2"],
@@ -315,7 +315,7 @@ def in_words(folder: Path, chance: random.Random) -> list[str]:
 
 
 def in_infos(folder: Path, chance: random.Random) -> list[str]:
-    """Values of a pickle of infos are replaced by odd ones, or by the whole in a part of it."""
+    """Replace values of a pickle of infos by odd ones, or by the whole."""
     import pickle
 
     file = folder / "infos" / "infos.pkl"
@@ -331,7 +331,7 @@ def in_infos(folder: Path, chance: random.Random) -> list[str]:
 
 
 def in_chunk(folder: Path, chance: random.Random) -> list[str]:
-    """A value of a chunk is replaced by an odd one or an odd tensor, or a name in an index."""
+    """Replace a value of a chunk by an odd one or an odd tensor, or a name in its index."""
     import torch
 
     file = folder / "chunks" / "000000.torch"
@@ -345,7 +345,7 @@ def in_chunk(folder: Path, chance: random.Random) -> list[str]:
 
 
 def in_sweep(folder: Path, chance: random.Random) -> list[str]:
-    """The sweep of a laser is damaged, or holds another array."""
+    """Damage the sweep of a laser, or replace it by another array."""
     import numpy as np
 
     file = folder / "dgp-swept" / "0.npz"
@@ -381,8 +381,7 @@ KINDS_OF_FILE = ("pipe", "folder", "zero", "null", "socket", "link", "large")
 
 
 def not_a_file(path: str, command: Sequence[str]) -> Mutation:
-    """A file gives way to a pipe, a device, a folder, or to one of a terabyte; of those that a
-    pattern names, one."""
+    """Replace one of the named files by a pipe, a device, a folder, or a file of a terabyte."""
 
     def mutate(folder: Path, chance: random.Random) -> list[str]:
         file = chance.choice([file for file in sorted(folder.glob(path)) if file.is_file()])
@@ -406,7 +405,7 @@ def not_a_file(path: str, command: Sequence[str]) -> Mutation:
 
 
 def long_line(path: str, command: Sequence[str]) -> Mutation:
-    """A line or a number of a text file has millions of characters, or there are many lines."""
+    """Make a line or number millions of characters long, or add very many lines."""
 
     def mutate(folder: Path, chance: random.Random) -> list[str]:
         file = chance.choice(sorted(folder.glob(path)))
@@ -421,7 +420,7 @@ def long_line(path: str, command: Sequence[str]) -> Mutation:
 
 
 def in_weights(folder: Path, chance: random.Random) -> list[str]:
-    """A file of weights that holds something else."""
+    """Write a file of weights with other content."""
     import torch
 
     tensors = [*odd_tensors(), *ODD]
@@ -435,18 +434,18 @@ def in_weights(folder: Path, chance: random.Random) -> list[str]:
 
 
 def posed(kind: str, pattern: str) -> Mutation:
-    """A file of a scene of a format of posed photographs, by the table of `pose_files`."""
+    """Write a file of a scene format, by the table of `pose_files`."""
     return in_bytes(f"{kind}/{pattern}", scene_words(kind))
 
 
 def scene_words(kind: str) -> list[str]:
-    """The command that completes a scene of a format of posed photographs."""
+    """Return the command that completes a scene of a format."""
     words = ["complete", kind, "--context", "0", "1", "--target", "2", "--out", "out", "--quiet"]
     return [*words, "--resolution", str(SIZE), str(SIZE)]
 
 
 def splat(name: str, pattern: str = "") -> Mutation:
-    """A file of Gaussians, or one of the files in its folder."""
+    """Return a file of Gaussians, or one of the files in its folder."""
     words = ["convert", f"splats/{name}", "out.ply", "--quiet"]
     return in_bytes(f"splats/{name}{pattern}", words)
 
@@ -524,7 +523,7 @@ KINDS: dict[str, Mutation] = {
 
 
 def in_child(work: Callable[[], None], log: Path) -> int:
-    """Run `work` in a fork of this process; returns the id of it."""
+    """Run `work` in a fork of this process, and return its id."""
     sys.stdout.flush()
     child = os.fork()
     if child:
@@ -562,8 +561,7 @@ def run_command(base: Path, folder: Path, kind: str, number: int, seed: int) -> 
 
 
 def finding_of(status: int, outlived: bool, memory: int, log: str, left: set[str]) -> str | None:
-    """What is wrong about the end of a run that took `memory` kilobytes and `left` these files
-    behind, in a line; None where nothing is."""
+    """Describe the problem of a run, which took `memory` kilobytes and `left` files, if any."""
     if outlived:
         return "outlives its limit"
     if os.WIFSIGNALED(status):
@@ -586,7 +584,7 @@ def finding_of(status: int, outlived: bool, memory: int, log: str, left: set[str
 
 @dataclass
 class Running:
-    """A fork at work."""
+    """A running fork."""
 
     name: str
     folder: Path
@@ -596,7 +594,7 @@ class Running:
 def fuzz(
     chosen: Sequence[tuple[str, int]], seed: int, limit_s: float, workers: int
 ) -> list[Outcome]:
-    """Run the mutations; how they ended, in that order."""
+    """Run the mutations, and return their outcomes in order."""
     import_everything()
     outcomes: list[Outcome] = []
     with tempfile.TemporaryDirectory() as name:
@@ -626,8 +624,10 @@ def files_below(folder: Path) -> set[str]:
 
 
 def finished(running: dict[int, Running], given: set[str]) -> list[Outcome]:
-    """Take the forks that have ended, or must, out of `running`; how they ended. The files that
-    were `given` to them are no results."""
+    """Remove ended or overdue forks from `running`, and return their outcomes.
+
+    The files that were `given` to them are no results.
+    """
     outcomes = []
     for child, run in list(running.items()):
         outlived = time.monotonic() > run.deadline
@@ -649,7 +649,7 @@ def finished(running: dict[int, Running], given: set[str]) -> list[Outcome]:
 
 
 def import_everything() -> None:
-    """Once for all forks. Nothing is computed here: threads do not survive a fork."""
+    """Import everything once for all forks. Nothing is computed, as threads do not survive."""
     sys.path.insert(0, str(Path(__file__).parent))
     import chunk_files  # noqa: F401  (its photographs are drawn in one thread)
     import gscompleter.cli

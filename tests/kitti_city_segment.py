@@ -1,6 +1,6 @@
-"""A Waymo segment of a real road: photographs and poses of `kitti_city`, and the road measured.
+"""A Waymo segment of a real road: photographs and poses of `kitti_city`, and laser points.
 
-KITTI's camera stands 1.65 m above the road. The "laser" measures a flat road near the vehicle.
+KITTI's camera is 1.65 m above the road. The "laser" measures a flat road near the vehicle.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LASER = Laser(1, poses_of(np.array([0.0, 0.0, 0.0, 1.2, 0.0, 2.0])), -0.5, 0.05)
 
 
 def road_ahead(shape: tuple[int, int] = (48, 720)) -> np.ndarray:
-    """Ranges to a flat road within 3 m of the lane and 5 to 15 m ahead; -1 elsewhere."""
+    """Compute ranges to a flat road within 3 m of the lane and 5 to 15 m ahead; -1 elsewhere."""
     h, w = shape
     down = np.linspace(LASER.high, LASER.low, 2 * h + 1)[1::2, None]
     azimuth = np.pi * (1 - 2 * (np.arange(w) + 0.5) / w)[None]

@@ -1,4 +1,4 @@
-"""The same numbers as the authors' code, to what the rounding of different CPUs leaves open."""
+"""The same numbers as the authors' code, to the rounding of different CPUs."""
 
 from torch import Tensor
 
@@ -8,19 +8,19 @@ by up to 3.5e-5 (quaternions of MVSplat); the tanh form of GELU is 2.5e-3 off.""
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Largest difference over the largest expected value, NaN where anything found is NaN."""
+    """Compute the largest difference over the largest expected value; NaN if anything is NaN."""
     assert found.shape == expected.shape, (found.shape, expected.shape)
     difference = (found.double() - expected.double()).abs().max()
     return (difference / expected.abs().max()).item()
 
 
 def assert_within(errors: dict[str, float], bound: float = PARITY) -> None:
-    """Each error, by the name of its array, lies below the bound. NaN does not."""
+    """Check that each error, by the name of its array, lies below the bound. NaN does not."""
     assert errors
     wrong = [f"{name} is off by {error:.2g}" for name, error in errors.items() if not error < bound]
     assert not wrong, f"{'; '.join(wrong)} of the largest value, and {bound:g} is allowed"
 
 
 def assert_close(found: Tensor, expected: Tensor, name: str, bound: float = PARITY) -> None:
-    """The array called `name` is what is expected, but for rounding."""
+    """Check that the array called `name` is as expected, but for rounding."""
     assert_within({name: relative_error(found, expected)}, bound)

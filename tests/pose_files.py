@@ -1,4 +1,4 @@
-"""A synthetic room photographed, written down in every format of posed photographs."""
+"""Writers of a synthetic room in every format of posed photographs."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ CAMERAS = [camera_at(x=0.1 * i, y=0.05 * i, z=-0.03 * i, yaw=4.0 * i, size=SIZE)
 VIEWS = [view_of(Room(), camera) for camera in CAMERAS]
 NAMES = [f"{i}.png" for i in range(len(VIEWS))]
 PARAMETERS = (0.9 * SIZE, 0.9 * SIZE, SIZE / 2, SIZE / 2)
-"""Of COLMAP's PINHOLE."""
+"""Number of COLMAP's PINHOLE."""
 
 
 def write_photographs(
     folder: Path, names: Sequence[str] = NAMES, views: Sequence[View] = VIEWS
 ) -> Path:
-    """The photographs of the room under these names."""
+    """Write the photographs of the room under these names."""
     for name, view in zip(names, views, strict=True):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_image(folder / name, view.image)
@@ -35,7 +35,7 @@ def write_photographs(
 
 
 def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    """Of a rotation by less than half a turn, real part first."""
+    """Return the quaternion (real part first) of a rotation by less than 180°."""
     w = np.sqrt(1 + np.trace(rotation)) / 2
     r = rotation
     axis = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
@@ -43,13 +43,13 @@ def quaternion_of(rotation: np.ndarray) -> np.ndarray:
 
 
 def world_to_camera(camera: Camera) -> tuple[list[float], list[float]]:
-    """The quaternion and the translation of COLMAP."""
+    """Return quaternion and translation as in COLMAP."""
     viewmat = np.linalg.inv(camera.c2w.double().numpy())
     return quaternion_of(viewmat[:3, :3]).tolist(), viewmat[:3, 3].tolist()
 
 
 def surface_points(count: int = 400) -> np.ndarray:
-    """Points on the surfaces that the photographs show."""
+    """Return points on the surfaces that the photographs show."""
     generator = torch.Generator().manual_seed(5)
     points = []
     for view in VIEWS:
@@ -68,7 +68,7 @@ def write_colmap_binary(
     size: tuple[int, int] = (SIZE, SIZE),
     points: np.ndarray | None = None,
 ) -> Path:
-    """cameras.bin, images.bin and points3D.bin of the room's first cameras, with features."""
+    """Write cameras.bin, images.bin and points3D.bin of the room's first cameras, with features."""
     folder.mkdir(parents=True, exist_ok=True)
     numbers = struct.pack(f"<{len(parameters)}d", *parameters)
     camera = struct.pack("<QIiQQ", 1, 7, MODELS[model].number, *size) + numbers
@@ -89,7 +89,7 @@ def write_colmap_binary(
 
 
 def write_colmap_text(folder: Path, names: Sequence[str] = NAMES, features: str = "1 2 -1") -> Path:
-    """cameras.txt, images.txt and points3D.txt of the room, each image with a line of features."""
+    """Write cameras.txt, images.txt and points3D.txt of the room, with feature lines."""
     folder.mkdir(parents=True, exist_ok=True)
     parameters = " ".join(map(repr, PARAMETERS))
     (folder / "cameras.txt").write_text(f"# Cameras\n7 PINHOLE {SIZE} {SIZE} {parameters}\n")
@@ -105,7 +105,7 @@ def write_colmap_text(folder: Path, names: Sequence[str] = NAMES, features: str 
 
 
 def write_camera_list(path: Path, names: Sequence[str] = NAMES) -> Path:
-    """A cameras.json as Inria's code writes it, with the endings of names left out."""
+    """Write a cameras.json as Inria's code does, without endings of names."""
     entries = [
         {
             "id": number,
@@ -125,7 +125,7 @@ def write_camera_list(path: Path, names: Sequence[str] = NAMES) -> Path:
 
 
 def write_llff(path: Path) -> Path:
-    """A poses_bounds.npy of the room, whose surfaces lie between 1 and 6."""
+    """Write a poses_bounds.npy of the room, with surfaces from 1 to 6."""
     rows = []
     for camera in CAMERAS:
         right, down, forward, center = camera.c2w[:3].double().numpy().T
@@ -138,7 +138,7 @@ def write_llff(path: Path) -> Path:
 
 
 def write_kitti(folder: Path, labels: bool = True, aside: float = 0.0) -> Path:
-    """calib.txt and poses.txt of the room; camera 2 stands `aside` to the right of camera 0."""
+    """Write calib.txt and poses.txt of the room; camera 2 is `aside` to the right of camera 0."""
     folder.mkdir(parents=True, exist_ok=True)
     K = CAMERAS[0].K.double().numpy()
     lines, rows = [], []
@@ -157,7 +157,7 @@ def write_kitti(folder: Path, labels: bool = True, aside: float = 0.0) -> Path:
 
 
 def write_dgp(folder: Path) -> Path:
-    """A scene of DGP with one camera and a laser."""
+    """Write a DGP scene with one camera and a laser."""
     data = [{"id": {"name": "LIDAR"}, "datum": {"point_cloud": {"filename": "0.npz"}}}]
     for name, camera in zip(NAMES, CAMERAS, strict=True):
         q = quaternion_of(camera.c2w[:3, :3].double().numpy())
@@ -224,7 +224,7 @@ def transforms(folder: Path) -> Path:
 
 
 def splits(folder: Path) -> Path:
-    """As the synthetic scenes of NeRF: three files, names without endings, one opening angle."""
+    """Write the layout of NeRF's synthetic scenes: three files, no endings, one field of view."""
     write_photographs(folder)
     parts = {"train": (0, 3), "val": (1, 4), "test": (2,)}
     for part, numbers in parts.items():
@@ -249,4 +249,4 @@ WRITERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "transforms": ("nerfstudio", transforms),
     "splits": ("nerfstudio", splits),
 }
-"""How a folder of each kind is written, and the name of its format."""
+"""Writers of each kind of folder, and the names of their formats."""

@@ -1,7 +1,7 @@
-"""Small synthetic rooms whose true geometry is known, drawn by casting rays.
+"""Small synthetic rooms of known geometry, rendered by ray casting.
 
-A room is a box seen from inside, with smaller boxes standing in it. Every surface carries a
-texture that is a fixed function of the world point, so that all views agree on colour.
+A room is a box seen from inside, with smaller boxes in it. Every surface has a texture that is a
+fixed function of the world point, so that all views agree on colour.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Room:
         ((0.9, -0.2, 3.2), (1.5, 1.5, 3.8)),
     )
     unit: float = 1.0
-    """Everything is multiplied by this factor."""
+    """Factor of all lengths."""
 
 
 def camera_at(
@@ -56,7 +56,7 @@ def camera_at(
     focal: float = 0.9,
     unit: float = 1.0,
 ) -> Camera:
-    """A square camera at (x, y, z), turned by `yaw` degrees about the downward axis.
+    """Make a square camera at (x, y, z), turned by `yaw` degrees about the downward axis.
 
     `focal` is in image widths; near and far enclose the default room.
     """
@@ -70,14 +70,14 @@ def camera_at(
 
 
 def unchecked(camera: Camera, **changes: object) -> Camera:
-    """Change a camera into one that its constructor refuses, as damaged memory might."""
+    """Change a camera into one that its constructor refuses."""
     other = copy(camera)
     vars(other).update(changes)
     return other
 
 
 def texture(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Colour of world points: waves of several lengths and directions, enough for stereo."""
+    """Compute the colour of world points: waves of several lengths and directions, for stereo."""
     generator = torch.Generator().manual_seed(7)
     colour = torch.full_like(points, 0.5)
     for wavelength, strength in ((2.5, 0.16), (1.0, 0.10), (0.45, 0.08), (0.22, 0.06)):
@@ -90,7 +90,7 @@ def texture(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
 
 
 def cast(room: Room, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """True image and z-depth at the pixel centres."""
+    """Compute the true image and z-depth at the pixel centres."""
     origin, z_rays = camera.center.double(), camera.z_rays().double()
     depth = torch.full(z_rays.shape[:2], torch.inf, dtype=torch.float64)
     for index, (low, high) in enumerate(room.boxes):
@@ -106,13 +106,13 @@ def cast(room: Room, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Float[Tens
 
 
 def view_of(room: Room, camera: Camera, frame: int | None = None) -> View:
-    """The photograph `camera` takes of the room, with its true depth."""
+    """Take a photograph of the room, with its true depth."""
     image, depth = cast(room, camera)
     return View(image, camera, frame, depth)
 
 
 def photographed(folder: Path, cameras: Sequence[Camera], room: Room = Room()) -> Path:
-    """`folder` as a scene: a photograph of the room by each camera, and a transforms.json."""
+    """Write a scene folder: a photograph of the room by each camera, and a transforms.json."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [f"{number}.png" for number in range(len(cameras))]
     for name, camera in zip(names, cameras, strict=True):
@@ -122,7 +122,7 @@ def photographed(folder: Path, cameras: Sequence[Camera], room: Room = Room()) -
 
 
 def gaussians_of(view: View, depth: Float[Tensor, "h w"] | None = None) -> Gaussians:
-    """One round, nearly opaque Gaussian per pixel at its true (or the given) z-depth."""
+    """Make one round, nearly opaque Gaussian per pixel at its true (or the given) z-depth."""
     camera = view.camera
     depth = view.depth if depth is None else depth
     assert depth is not None
@@ -138,7 +138,7 @@ def gaussians_of(view: View, depth: Float[Tensor, "h w"] | None = None) -> Gauss
 
 
 def half_a_room_of(room: Room, camera: Camera) -> tuple[View, Gaussians, Gaussians]:
-    """What the camera sees, a context that lacks the right half of it, and the right half."""
+    """Return a view, a context that lacks the right half of the room, and the right half."""
     view = view_of(room, camera)
     right = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     right[:, camera.width // 2 :] = True
@@ -149,7 +149,7 @@ def half_a_room_of(room: Room, camera: Camera) -> tuple[View, Gaussians, Gaussia
 def reconstruction_of(
     views: Sequence[View], depths: Sequence[Float[Tensor, "h w"]]
 ) -> Reconstruction:
-    """What a pixel-aligned Ψ says that finds these depths."""
+    """Return the output of a pixel-aligned Ψ that finds these depths."""
     parts = [gaussians_of(v, d) for v, d in zip(views, depths, strict=True)]
     return Reconstruction(
         merge(parts),
@@ -160,7 +160,7 @@ def reconstruction_of(
 
 
 def labelled(path: Path, scene: Gaussians) -> Path:
-    """`path`, with the scene as another program writes it: a column of its own numbers the rows."""
+    """Write the scene as another program does: with a column that numbers the rows."""
     save_ply(path, scene)
     vertex = plyfile.PlyData.read(str(path))["vertex"].data
     rows = np.zeros(len(vertex), [("label", "<i4"), *vertex.dtype.descr])
@@ -172,7 +172,7 @@ def labelled(path: Path, scene: Gaussians) -> Path:
 
 
 def random_gaussians(n: int, seed: int = 0, sh_degree: int = 0) -> Gaussians:
-    """n Gaussians of every shape in front of (and around) `camera_at()`."""
+    """Make n Gaussians of every shape in front of (and around) `camera_at()`."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:
@@ -189,7 +189,7 @@ def random_gaussians(n: int, seed: int = 0, sh_degree: int = 0) -> Gaussians:
 
 
 def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
-    """The same Gaussians in another unit of length."""
+    """Scale Gaussians to another unit of length."""
     return replace(
         gaussians,
         means=gaussians.means * factor,
@@ -199,13 +199,15 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
 
 
 def answer(phi, nearest, target, context) -> Synthesis:
-    """What a generator, or a plain function, makes of one request."""
+    """Return the output of a generator, or a plain function, for one request."""
     return as_generator(phi).synthesize([Request(nearest, target, context)])[0]
 
 
 def open_street(camera: Camera) -> View:
-    """A street under a sky without clouds: ground and two rows of houses of different heights
-    and distances. The depth of the sky is infinite."""
+    """Return a street under a clear sky: ground and two rows of houses.
+
+    The depth of the sky is infinite.
+    """
     origin, rays = camera.center.double(), camera.z_rays().double()
     down = rays[..., 1]
     depth = ((1.5 - origin[1]) / down).where(down > 0, torch.inf)

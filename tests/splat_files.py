@@ -1,4 +1,4 @@
-"""Files in every format of splats, made of given Gaussians, to test the readers with."""
+"""Writers of Gaussians in every splat format, to test the readers with."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def rgb_bytes(gaussians: Gaussians) -> np.ndarray:
 
 
 def write_ksplat(path: Path, gaussians: Gaussians, level: int, bucket_size: int = 7) -> Path:
-    """One section; buckets follow one another, each centred on its Gaussians."""
+    """Write one section; each bucket is centred on its Gaussians."""
     n, block, steps = len(gaussians), 64.0, 32767
     means = gaussians.means.numpy()
     buckets = -(-n // bucket_size)
@@ -84,7 +84,7 @@ def write_ksplat(path: Path, gaussians: Gaussians, level: int, bucket_size: int 
 
 
 def write_spz_4(path: Path, version_3: Path) -> Path:
-    """The same content as a file of version 3, in a stream for each attribute."""
+    """Convert a file of version 3 to version 4, with one stream per attribute."""
     raw = gzip.decompress(version_3.read_bytes())
     magic, _, n, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", raw)
     widths = [9, 1, 3, 3, 4, (0, 9, 24, 45)[degree]]
@@ -102,7 +102,7 @@ def write_spz_4(path: Path, version_3: Path) -> Path:
 
 
 def write_spz_2(path: Path, version_3: Path, gaussians: Gaussians) -> Path:
-    """A file of version 3 with the rotations of version 2: three bytes of xyz, w positive."""
+    """Convert a file of version 3 to the rotations of version 2: xyz in bytes, w positive."""
     raw = gzip.decompress(version_3.read_bytes())
     n = len(gaussians)
     quats = gaussians.quats.numpy() * (1, 1, -1, -1)
@@ -122,7 +122,7 @@ def webp(pixels: np.ndarray) -> bytes:
 
 
 def square(values: np.ndarray) -> np.ndarray:
-    """Bytes [n, k] as an image [h, w, 4] that is opaque where k is 3."""
+    """Arrange bytes [n, k] as an image [h, w, 4] that is opaque if k is 3."""
     n, k = values.shape
     side = int(np.ceil(np.sqrt(n)))
     image = np.full((side * side, 4), 255, np.uint8)
@@ -131,7 +131,7 @@ def square(values: np.ndarray) -> np.ndarray:
 
 
 def sog_files(gaussians: Gaussians, version: int = 2) -> dict[str, bytes]:
-    """The files of a .sog. Codebooks are even steps, so that both versions hold the same."""
+    """Make the files of a .sog, with evenly spaced codebooks, so that both versions agree."""
     n, k = len(gaussians), gaussians.sh.shape[1] - 1
     means = gaussians.means.numpy()
     logs = np.sign(means) * np.log1p(np.abs(means))
@@ -196,7 +196,7 @@ def sog_files(gaussians: Gaussians, version: int = 2) -> dict[str, bytes]:
 
 
 def write_sog(path: Path, files: dict[str, bytes]) -> Path:
-    """A bundle where the name ends in .sog, else a folder."""
+    """Write a bundle if the name ends in .sog, otherwise a folder."""
     if path.suffix == ".sog":
         with zipfile.ZipFile(path, "w") as bundle:
             for name, data in files.items():
@@ -209,7 +209,7 @@ def write_sog(path: Path, files: dict[str, bytes]) -> Path:
 
 
 def glb_table(gaussians: Gaussians) -> tuple[dict, bytes]:
-    """Description and binary part of a .glb that holds the Gaussians in its own axes."""
+    """Make description and binary part of a .glb with the Gaussians in its axes."""
     prefix = "KHR_gaussian_splatting:"
     columns = {
         "POSITION": gaussians.means,
@@ -262,7 +262,7 @@ def write_glb(path: Path, table: dict, binary: bytes) -> Path:
 
 
 def plausible(n: int = 200, degree: int = 3) -> Gaussians:
-    """Gaussians whose colours and harmonics every format has room for."""
+    """Make Gaussians with colours and harmonics within the range of every format."""
     gaussians = random_gaussians(n, seed=3, sh_degree=degree)
     sh = gaussians.sh * 0.5
     sh[:, 0] = sh[:, 0].clamp(-1.7, 1.7)
@@ -270,7 +270,7 @@ def plausible(n: int = 200, degree: int = 3) -> Gaussians:
 
 
 def made(folder: Path, name: str, gaussians: Gaussians) -> Path:
-    """A file of the Gaussians in the format that `name` asks for."""
+    """Write a file of the Gaussians in the format of `name`."""
     path = folder / name
     if name in WRITTEN:
         save_splat(path, gaussians)

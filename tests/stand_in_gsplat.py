@@ -1,7 +1,7 @@
-"""What `render/cuda.py` asks of gsplat 1.5, answered by the reference renderer on a CPU.
+"""The part of gsplat 1.5 that `render/cuda.py` calls, on the reference renderer and a CPU.
 
-Names, shapes and what is returned beside the picture are gsplat's, as far as they are used. So it
-tests how gsplat is called, and says nothing of gsplat itself.
+Names, shapes and results are gsplat's, as far as they are used. So it tests how gsplat is called,
+not gsplat itself.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def rasterization(
     render_mode: str,
     rasterize_mode: str,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """One camera, harmonics, colour and expected depth; the rows stay in their order."""
+    """Rasterize for one camera: harmonics, colour and expected depth; rows keep their order."""
     assert (eps2d, packed, render_mode) == (0.3, False, "RGB+ED")
     assert rasterize_mode in ("classic", "antialiased")
     assert colors.shape == (len(means), (sh_degree + 1) ** 2, 3)
@@ -73,7 +73,7 @@ def rasterization(
 
 
 def touches(splats: Splats, camera: Camera) -> bool:
-    """Whether the box of a single splat reaches the image."""
+    """Return True if the box of a single splat reaches the image."""
     covariance = torch.linalg.inv(splats.precisions[0])
     reach = 3.33 * covariance.diagonal().sqrt()
     size = torch.tensor([camera.width, camera.height])
@@ -93,7 +93,7 @@ def rasterize_to_pixels(
     isect_offsets: Tensor,
     flatten_ids: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Sums of four channels by weight, and of the weights, of the Gaussians in `flatten_ids`."""
+    """Sum four channels by weight, and the weights, of the Gaussians in `flatten_ids`."""
     n = means2d.shape[1]
     assert means2d.shape == (1, n, 2)
     assert conics.shape == (1, n, 3)
@@ -113,7 +113,7 @@ def rasterize_to_pixels(
 
 
 def module() -> ModuleType:
-    """It, under the name of gsplat."""
+    """Make a module named gsplat of it."""
     made = ModuleType("gsplat")
     made.rasterization, made.rasterize_to_pixels = rasterization, rasterize_to_pixels
     return made

@@ -1,5 +1,4 @@
-"""A synthesized image is compared with the photographs: its colours are brought to theirs, and
-an image of something else is told of."""
+"""Comparison of a synthesized image with the photographs: corrected colours, notes on others."""
 
 import pytest
 import torch
@@ -21,13 +20,13 @@ NOISE = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
 
 
 def observed() -> Warped:
-    """The left of the image; what is stored elsewhere means nothing."""
+    """The left half of the true image; the right half is unknown."""
     image = torch.where(SEEN[..., None], TRUTH, torch.zeros_like(TRUTH))
     return Warped(image, SEEN, torch.ones(96, 96), ())
 
 
-def told(*arguments) -> tuple[torch.Tensor, tuple[str, ...]]:
-    """The image and the notes of `checked`."""
+def paint_checked(*arguments) -> tuple[torch.Tensor, tuple[str, ...]]:
+    """Return the image and the notes of `paint_consistently`."""
     found = checked(*arguments)
     return found.image, found.notes
 
@@ -41,7 +40,7 @@ def test_a_colour_shift_is_measured_and_taken_back_in_the_unseen_part_too():
 
 
 def test_a_colour_shift_stays_where_the_paper_leaves_it():
-    image, notes = told(lambda seed: SHIFTED, 0, observed(), 0, False)
+    image, notes = paint_checked(lambda seed: SHIFTED, 0, observed(), 0, False)
     assert torch.equal(image, SHIFTED.clamp(0, 1))
     assert notes == ()
 
@@ -55,13 +54,13 @@ def test_a_fifth_of_the_image_that_shows_something_else_does_not_bend_the_colour
 
 
 def test_an_image_that_agrees_stays_and_is_worth_no_note():
-    image, notes = told(lambda seed: TRUTH, 0, observed())
+    image, notes = paint_checked(lambda seed: TRUTH, 0, observed())
     assert (image - TRUTH).abs().max() < 1e-3
     assert notes == ()
 
 
-def test_something_else_is_told_and_left_as_it_is():
-    image, notes = told(lambda seed: NOISE, 0, observed())
+def test_something_else_is_noted_and_left_as_it_is():
+    image, notes = paint_checked(lambda seed: NOISE, 0, observed())
     assert torch.equal(image, NOISE)
     assert len(notes) == 1
     assert "disagrees with the photographs" in notes[0]
@@ -72,13 +71,13 @@ def test_an_image_in_negative_is_no_colour_shift():
     found = compare(1 - TRUTH, observed().image, SEEN)
     assert not found.agrees
     assert found.residual < found.limit
-    _, (note,) = told(lambda seed: 1 - TRUTH, 0, observed())
-    assert "a channel matches only as -1.00 of itself +1.00" in note
+    _, (note,) = paint_checked(lambda seed: 1 - TRUTH, 0, observed())
+    assert "a colour channel matches only with factor -1.00 and offset +1.00" in note
 
 
 @pytest.mark.parametrize("contrast", [0.5, 1.0])
 def test_the_limit_follows_the_contrast_of_the_scene(contrast):
-    """It is a share of what a single colour would leave, so that plain grey passes for nothing."""
+    """The limit is relative to the residual of a constant colour, so that plain grey fails."""
     dull = 0.5 + contrast * (TRUTH - 0.5)
     found = compare(dull, dull, SEEN)
     assert found.agrees
@@ -103,13 +102,13 @@ def test_of_images_that_all_disagree_the_nearest_is_kept():
     assert not any(one.agrees for one in found.values())
     best = min(found, key=lambda seed: found[seed].residual)
     assert len({one.residual for one in found.values()}) == 3
-    image, _ = told(lambda seed: images[seed], 7, observed(), 2)
+    image, _ = paint_checked(lambda seed: images[seed], 7, observed(), 2)
     assert torch.equal(image, images[best])
 
 
 def test_a_seed_that_gives_nan_is_passed_over_and_nothing_but_nan_is_refused():
     broken = torch.full_like(TRUTH, float("nan"))
-    image, _ = told(lambda seed: broken if seed == 0 else TRUTH, 0, observed(), 1)
+    image, _ = paint_checked(lambda seed: broken if seed == 0 else TRUTH, 0, observed(), 1)
     assert (image - TRUTH).abs().max() < 1e-3
     with pytest.raises(InputError, match=r"no finite image \(2 seed"):
         checked(lambda seed: broken, 0, observed(), 1)
@@ -127,25 +126,25 @@ def test_further_seeds_are_tried_where_asked_and_only_until_one_agrees():
         tried.append(seed)
         return SHIFTED if seed == 9 else NOISE
 
-    image, notes = told(paint, 7, observed(), 5)
+    image, notes = paint_checked(paint, 7, observed(), 5)
     assert tried == [7, 8, 9]
     assert (image - TRUTH).abs().max() < 0.01
     assert notes[-1].startswith("3 seeds were tried")
     tried.clear()
-    _, notes = told(paint, 0, observed(), 1)
+    _, notes = paint_checked(paint, 0, observed(), 1)
     assert tried == [0, 1]
     assert "best of 2 seeds" in notes[0]
 
 
 def test_where_nothing_was_seen_nothing_is_said():
     nothing = Warped(TRUTH, torch.zeros_like(SEEN), torch.ones(96, 96), ())
-    image, notes = told(lambda seed: NOISE, 0, nothing)
+    image, notes = paint_checked(lambda seed: NOISE, 0, nothing)
     assert torch.equal(image, NOISE)
     assert notes == ()
 
 
 class Talking:
-    """A generator of a user's own that tells something."""
+    """A generator of a user that adds a note."""
 
     def __call__(self, nearest, target, context):
         image = torch.full((target.height, target.width, 3), 0.5)

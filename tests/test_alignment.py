@@ -1,4 +1,4 @@
-"""Stage 3, coarse: the affine is found, and its fallbacks say so."""
+"""Stage 3, coarse: the affine is found, and fallbacks are reported."""
 
 import pytest
 import torch
@@ -112,7 +112,7 @@ def test_an_affine_that_the_target_confirms_or_cannot_judge_stays():
 
 
 def unlike() -> torch.Tensor:
-    """Depths of no relation to any others."""
+    """Make depths without any relation to others."""
     return torch.rand(64, 64, generator=torch.Generator().manual_seed(5)) * 50
 
 

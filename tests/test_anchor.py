@@ -1,4 +1,4 @@
-"""Stage 2: the anchor rule of the paper, and what is lifted."""
+"""Stage 2: the anchor rule of the paper, and lifting."""
 
 import pytest
 import torch
@@ -39,7 +39,7 @@ def test_a_view_from_where_the_target_stands_tells_no_depth():
 
 
 def test_the_paper_excludes_no_view_for_a_small_baseline():
-    """The least turned view wins if all are turned too far, wherever it stands."""
+    """The smallest rotation wins if all exceed the limit, at any distance."""
     views, target = [view(0.001, 50), view(1.0, 60)], camera_at(0.0)
     assert select_anchor(target, views).index == 1
     assert select_anchor(target, views, CompleterConfig.paper().anchor).index == 0
@@ -92,7 +92,7 @@ def test_a_generator_that_returns_another_size_or_nan_is_refused():
 
 
 def two_views_reconstructed(aligned: bool):
-    """A reconstructor that knows the true depth of a room."""
+    """Make a reconstructor that knows the true depth of a room."""
 
     def reconstruct(views):
         truths = [view_of(Room(), v.camera) for v in views]

@@ -1,4 +1,4 @@
-"""Matching at the planes that a first guess leaves: the same costs and paths, at fewer planes."""
+"""Matching within depth bands: the same costs and paths as with all planes."""
 
 from dataclasses import replace
 
@@ -181,11 +181,11 @@ def test_what_is_lifted_shows_the_synthesized_image_as_sharply_as_it_is(rig):
     inner[45:95, 95:-5] = True
     lifted = PlaneSweep().lift(views, wanted).gaussians
     plain = replace(lifted, sh=sh_from_rgb(views[0].image[wanted]))
-    drawn, blurred = (
+    fitted, blurred = (
         load_renderer("cpu").render(g, views[0].camera).image for g in (lifted, plain)
     )
-    ratios = [gradient_energy_ratio(x, views[0].image, inner) for x in (drawn, blurred)]
+    ratios = [gradient_energy_ratio(x, views[0].image, inner) for x in (fitted, blurred)]
     assert ratios[1] < 0.9
     assert 0.9 < ratios[0] < 1.1
-    errors = [(x - views[0].image)[inner].square().mean() for x in (drawn, blurred)]
+    errors = [(x - views[0].image)[inner].square().mean() for x in (fitted, blurred)]
     assert errors[0] < 0.5 * errors[1]

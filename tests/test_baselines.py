@@ -1,4 +1,4 @@
-"""The methods ours is compared with."""
+"""Other completion methods, for comparison."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -65,9 +65,9 @@ def test_costs_loss_and_gradient_equal_upstreams(upstream):
     scale = torch.tensor(upstream["scale"].item(), dtype=torch.float32, requires_grad=True)
     larger = Mixture(a.means * scale, a.covariances * scale**2, a.weights)
     loss = mixture_wasserstein(larger, b)
-    (slope,) = torch.autograd.grad(loss, scale)
+    (gradient,) = torch.autograd.grad(loss, scale)
     assert_close(loss, upstream["loss"], "loss")
-    assert_close(slope, upstream["grad_scale"], "grad_scale")
+    assert_close(gradient, upstream["grad_scale"], "grad_scale")
 
 
 def test_the_root_squared_is_the_matrix():
@@ -177,8 +177,8 @@ def test_density_control_clones_splits_and_prunes():
     assert torch.isclose(dense.scales.amax(-1), torch.tensor(0.5 / 1.6)).sum() == 2
 
 
-def test_slopes_in_the_image_are_those_of_the_drawn_place():
-    """Against moving the principal point, which moves every Gaussian in the image alike."""
+def test_gradients_in_the_image_are_those_of_the_rendered_position():
+    """Compare with moving the principal point, which moves all Gaussians in the image alike."""
     single = camera_at(size=48)
     camera = replace(single, K=single.K.double(), c2w=single.c2w.double())
     gaussian = gaussians_of(view_of(Room(), single))[48 * 20 + 20 : 48 * 20 + 21]
@@ -189,8 +189,8 @@ def test_slopes_in_the_image_are_those_of_the_drawn_place():
         name: getattr(gaussian, name).double() for name in ("quats", "scales", "opacities", "sh")
     }
     image = renderer.render(replace(gaussian, means=means, **tensors), camera).image
-    (slope,) = torch.autograd.grad((image * weights).sum(), means)
-    length, seen = image_slopes(means.detach(), slope, camera)
+    (gradient,) = torch.autograd.grad((image * weights).sum(), means)
+    length, seen = image_slopes(means.detach(), gradient, camera)
 
     def at(shift: float) -> float:
         K = camera.K.clone()

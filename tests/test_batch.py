@@ -1,4 +1,4 @@
-"""Batches: jobs that are done once, whatever is killed, and a page on all of them."""
+"""Batches: jobs run once even if processes are killed, and a page with all of them."""
 
 import json
 import os
@@ -28,11 +28,11 @@ from simulate_batch import Fleet, Replay, replay
 
 TESTS = Path(__file__).parent
 SAME = ("completed.ply", "context.ply", "generated.ply", "targets.json")
-"""What does not depend on who computed it, nor when; images/ do not either."""
+"""Entries that do not depend on process or time; images/ do not either."""
 
 
 def until(condition, seconds: float = 120.0) -> None:
-    """Wait for a condition; a failure where it does not come."""
+    """Wait for a condition, and fail if it does not hold in time."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "what was waited for never came"
@@ -40,7 +40,7 @@ def until(condition, seconds: float = 120.0) -> None:
 
 
 def lines(folder: Path) -> dict[str, list[str]]:
-    """By the names of the files in a folder, their lines."""
+    """Read the lines of all files in a folder, by name."""
     return {path.name: path.read_text().split() for path in sorted(folder.glob("*"))}
 
 
@@ -51,7 +51,7 @@ def started(engine: str, out: Path, count: int, seconds: float, workers: int) ->
 
 
 def killed_and_started_again(engine: str, out: Path, count: int, seconds: float) -> None:
-    """A worker is killed in the middle of a job, then the driver; then it is started again."""
+    """Kill a worker during a job, then the driver, and start it again."""
     driver = started(engine, out, count, seconds, 2)
     until(lambda: len(lines(out / "ended")) >= count // 4)
     until(lambda: set(lines(out / "begun")) - set(lines(out / "ended")))
@@ -66,7 +66,7 @@ def killed_and_started_again(engine: str, out: Path, count: int, seconds: float)
     assert sorted(ended) == [job.name for job in plain_jobs(count, seconds)]
     assert {name: len(pids) for name, pids in ended.items()} == dict.fromkeys(ended, 1)
     assert len(list((out / "rows").glob("*.json"))) == count
-    assert max(len(pids) for pids in lines(out / "begun").values()) > 1  # somebody was killed
+    assert max(len(pids) for pids in lines(out / "begun").values()) > 1  # a worker was killed
     assert not list((out / "claims").glob("*"))
 
 
@@ -100,8 +100,8 @@ def test_a_job_ends_as_a_row_with_its_reason(tmp_path, monkeypatch):
     for job in jobs:
         perform(job)
     rows = {job.name: batch.read_row(place, job.name) for job in jobs}
-    told = {name: (row["state"], row["reason"], row["attempts"]) for name, row in rows.items()}
-    assert told == {
+    states = {name: (row["state"], row["reason"], row["attempts"]) for name, row in rows.items()}
+    assert states == {
         "sentence": ("failed", "The scene is broken; mend it.", 1),
         "defect": ("failed", "KeyError: 'a defect'", 3),
         "defect once": ("done", None, 2),
@@ -120,7 +120,7 @@ def test_a_job_that_kills_its_worker_is_given_up_and_the_others_are_done(tmp_pat
 def test_attempts_of_earlier_runs_count(tmp_path):
     claims = tmp_path / "claims"
     claims.mkdir()
-    (claims / "bad").write_text("3")  # as three killed processes leave it
+    (claims / "bad").write_text("3")  # as after three killed processes
     outcome = Writing(str(tmp_path), retries=2)(Job("bad"))
     assert outcome.state == "failed"
     assert "killed 3 times" in outcome.reason
@@ -189,15 +189,15 @@ def test_in_a_store_one_holds_a_claim_until_it_is_not_renewed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told", "shard"),
+    ("text", "array", "shard"),
     [
         (None, {}, (0, 1)),
         ("1/3", {}, (1, 3)),
         ("auto", {"ID": "7", "MIN": "4", "COUNT": "5"}, (3, 5)),
     ],
 )
-def test_a_shard_is_told_or_found_in_an_array(text, told, shard):
-    environment = {f"SLURM_ARRAY_TASK_{name}": value for name, value in told.items()}
+def test_a_shard_is_told_or_found_in_an_array(text, array, shard):
+    environment = {f"SLURM_ARRAY_TASK_{name}": value for name, value in array.items()}
     assert parse_shard(text, environment) == shard
 
 
@@ -244,7 +244,7 @@ def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
     [
         ({"targt": 2}, "no option --targt; the nearest is --target"),
         ({"resolution": "wide"}, "resolution"),
-        ({"out": "elsewhere"}, "no say in 'out'"),
+        ({"out": "elsewhere"}, "cannot set 'out'"),
         ({"video": "perhaps"}, "must be true or false"),
         ({"format": "--overwrite"}, "begins with a dash"),
         ({"seed": -1}, "seed must be greater than or equal to 0"),
@@ -258,7 +258,7 @@ def test_a_wrong_row_is_a_sentence(row, sentence, tmp_path):
 
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory) -> Path:
-    """Two rooms, a folder that is none, and a row with a wrong option."""
+    """Write a manifest with two rooms, a missing folder, and a wrong option."""
     root = tmp_path_factory.mktemp("rooms")
     for number in range(2):
         places = ((-0.3 + 0.1 * number, 0), (0.1, 0), (0.7, 12))
@@ -308,13 +308,13 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     before = {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")}
     capsys.readouterr()
     assert run(monkeypatch, *words[:-1]) == 0
-    told = capsys.readouterr().err
-    assert "Done 0, failed 0, there before 4, 2 of them failed (--rerun failures does" in told
+    errors = capsys.readouterr().err
+    assert "Done 0, failed 0, done earlier 4, 2 of them failed (--rerun failures repeats" in errors
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")} == before
 
 
 def test_a_store_gets_the_same_results_and_needs_no_folder_here(manifest, tmp_path):
-    """The work of a worker, without the process around it."""
+    """Run the work of a worker in this process."""
     from gscompleter.commands.batch import CompletingJob
 
     [job] = [j for j in read_manifest(str(manifest), {}) if j.name == "room-0"]

@@ -1,4 +1,4 @@
-"""`gscompleter bench`: what it measures and how it tells it; never how long anything takes."""
+"""`gscompleter bench`: its measurements and reports, without assertions on times."""
 
 import json
 from dataclasses import replace
@@ -40,7 +40,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def quick(scene, tmp_path_factory):
-    """A quick run on a room: what it writes."""
+    """Return the files of a quick run on a room."""
     out = tmp_path_factory.mktemp("bench") / "out"
     given = ("--context", 0, 1, "--target", 2, "--resolution", SIZE, SIZE, "--near", 0.5)
     methods = ("--methods", "full", "autograd", "densify-100")
@@ -55,23 +55,23 @@ def sample(seconds: float, yardstick: float = 0.5) -> Sample:
 
 
 def test_a_quick_run_tells_every_stage_of_its_case_and_its_methods(quick):
-    told = json.loads((quick / "bench.json").read_text())
-    (case,) = told["cases"]
+    report = json.loads((quick / "bench.json").read_text())
+    (case,) = report["cases"]
     assert {"context", "generate", "lift", "register", "integrate", "total"} < set(case["seconds"])
     assert case["gaussians"]["context"] == 2 * SIZE * SIZE
-    assert [method["name"] for method in told["methods"]] == [
+    assert [method["name"] for method in report["methods"]] == [
         "full",
         "autograd",
         "densify-100",
     ]
-    assert told["growth"] == []
-    assert told["machine"]["cores"] >= 1
-    assert told["settings"]["baseline_iterations"] == 2
+    assert report["growth"] == []
+    assert report["machine"]["cores"] >= 1
+    assert report["settings"]["baseline_iterations"] == 2
 
 
 def test_every_ratio_is_seconds_in_yardsticks(quick):
-    told = json.loads((quick / "bench.json").read_text())
-    for measured in (*told["cases"], *told["methods"]):
+    report = json.loads((quick / "bench.json").read_text())
+    for measured in (*report["cases"], *report["methods"]):
         for one in measured["samples"]:
             for stage, seconds in one["seconds"].items():
                 assert one["ratios"][stage] == pytest.approx(seconds / one["yardstick"])
@@ -128,8 +128,8 @@ def test_a_crowd_is_the_same_for_the_same_seed_and_may_be_smaller():
 def test_the_yardstick_is_one_gaussian_per_pixel_of_three_cameras():
     yardstick = Yardstick.on(load_renderer("cpu"), "cpu")
     assert len(yardstick.gaussians) == 3 * 256 * 256
-    slopes = yardstick.draw()
-    assert all(slope.abs().max() > 0 for slope in slopes[:4])
+    gradients = yardstick.draw()
+    assert all(gradient.abs().max() > 0 for gradient in gradients[:4])
     found, unit = yardstick.beside(lambda: "found")
     assert found == "found"
     assert unit > 0
@@ -189,9 +189,9 @@ def test_growth_is_drawn_and_told_with_its_exponents(tmp_path):
     report = Report({"cores": 2}, {"repeats": 1}, (), (), (series,))
     assert content(report)["growth"][0]["slopes"][PROCESS] == pytest.approx(1)
     assert "| exponent | 1.00 | 1.00 | 0.00 |" in report_markdown(report)
-    drawn = [plot_growth(tmp_path / f"{n}.png", [series]).read_bytes() for n in (1, 2)]
-    assert drawn[0] == drawn[1]
-    assert drawn[0].startswith(b"\x89PNG")
+    images = [plot_growth(tmp_path / f"{n}.png", [series]).read_bytes() for n in (1, 2)]
+    assert images[0] == images[1]
+    assert images[0].startswith(b"\x89PNG")
 
 
 def test_the_cases_of_the_documentation_can_be_read():
@@ -265,9 +265,9 @@ def test_results_are_not_replaced_unasked(quick, scene, monkeypatch, capsys):
 
 
 def assert_a_sentence(capsys) -> str:
-    """What stderr holds, once it is seen to be one sentence and stdout empty."""
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.startswith("gscompleter: ")
-    assert told.err.count("\n") == 1
-    return told.err
+    """Check that stderr is one sentence and stdout is empty, and return stderr."""
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("gscompleter: ")
+    assert captured.err.count("\n") == 1
+    return captured.err

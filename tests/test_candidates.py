@@ -1,4 +1,4 @@
-"""Where a scene may be completed from: moves of cameras whose surroundings are known."""
+"""Candidate cameras: moves of cameras whose surroundings are known."""
 
 import pytest
 import torch
@@ -22,13 +22,13 @@ UP = torch.tensor([0.0, -1.0, 0.0])
 
 
 def seen_by(camera: Camera, room: Room = Room()) -> Render:
-    """What a camera sees of the room itself."""
+    """Render the room itself at a camera."""
     image, depth = cast(room, camera)
     return Render(image, depth, torch.ones_like(depth))
 
 
 def tilted(camera: Camera) -> float:
-    """How far the horizon of a camera lies from level, as a sine."""
+    """Compute the tilt of a camera's horizon, as a sine."""
     return (camera.c2w[:3, 0] @ UP).abs().item()
 
 
@@ -61,7 +61,7 @@ def test_up_is_what_is_up_in_most_images():
 
 
 def test_a_candidate_behind_a_surface_is_none():
-    """The camera stands a step before the wall at z = 5, which a second one sees from afar."""
+    """The camera is one step in front of the wall at z = 5, which a second one sees from afar."""
     cameras = [camera_at(-2.0, z=4.2), camera_at(-2.0, z=1.0)]
     far = NextBestViewConfig(max_step=1.0)
     found = candidates(cameras, [seen_by(c) for c in cameras], 0.79, far)

@@ -1,4 +1,4 @@
-"""Chunks of pixelSplat: they give back their views, and what is wrong is said."""
+"""pixelSplat chunks: views survive a round trip, and errors name what is wrong."""
 
 import gc
 import json
@@ -64,7 +64,7 @@ def test_jpeg_bytes_are_photographs_too(tmp_path):
 
 
 def test_the_stored_transform_is_world_to_camera(tmp_path):
-    # The camera stands at (1, 2, 3) and looks along the world's x axis.
+    # The camera is at (1, 2, 3) and points along the world's x axis.
     R = torch.tensor([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
     one = example()
     row = torch.cat([R, -R @ torch.tensor([[1.0], [2.0], [3.0]])], dim=1).flatten()
@@ -261,7 +261,7 @@ def test_a_frame_that_does_not_exist_is_named(tmp_path, frame):
 
 
 class Trap:
-    """What would run on loading, were it allowed to."""
+    """Object that would run code when it is loaded."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -303,7 +303,7 @@ def test_an_index_that_disagrees_with_the_chunks_is_named(tmp_path):
     path = root / "test" / "index.json"
     listed = json.loads(path.read_text())
     path.write_text(json.dumps({**listed, "z": "000001.torch"}))
-    with pytest.raises(InputError, match=r"index.json says that the scene z is in .*000001.torch"):
+    with pytest.raises(InputError, match=r"index.json lists the scene z in .*000001.torch"):
         list(open_chunks(root))
     path.write_text(json.dumps({"a": "000000.torch"}))
     with pytest.raises(InputError, match=r"000000.torch holds the scene b, which is absent from"):

@@ -1,4 +1,4 @@
-"""A splat without what its photographs are better without: `gscompleter clean`."""
+"""Removal of Gaussians that make photographs worse: `gscompleter clean`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SURFACES = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[::
 
 
 def drawn(scene, camera):
-    """A photograph of a scene of Gaussians, so that none of them is wrong."""
+    """Render a photograph from Gaussians, so that none of them is wrong."""
     return View(RENDERER.render(scene, camera).image.clamp(0, 1), camera)
 
 
@@ -34,7 +34,7 @@ VIEWS = [drawn(SURFACES, camera) for camera in CAMERAS]
 
 
 def floaters():
-    """A few Gaussians halfway to the walls, in colours of nothing."""
+    """Make a few Gaussians halfway to the walls, in arbitrary colours."""
     view = view_of(Room(), CAMERAS[1])
     found = gaussians_of(view, 0.5 * view.depth)[SIZE * SIZE // 2 + 5 :: SIZE * 5]
     colours = torch.tensor([1.0, 0.0, 0.0]).repeat(len(found), 1)
@@ -49,7 +49,7 @@ ONLY_HARMFUL = CleaningConfig(idle=0.0)
 
 
 def losses(scene, taken, views=VIEWS):
-    """Decibels that each photograph loses."""
+    """Compute the PSNR that each photograph loses, in dB."""
     return [
         psnr(RENDERER.render(scene, v.camera).image, v.image)
         - psnr(RENDERER.render(scene[~taken], v.camera).image, v.image)
@@ -58,7 +58,7 @@ def losses(scene, taken, views=VIEWS):
 
 
 def test_floaters_go_and_nothing_else():
-    """But for single Gaussians of the wall behind them, which the photographs hardly miss."""
+    """Single Gaussians of the wall behind them may go, too, as photographs hardly change."""
     assert len(FLOATERS) > 3
     taken = superfluous(SCENE, VIEWS, RENDERER, ONLY_HARMFUL)
     assert taken[FLOAT].all()
@@ -101,7 +101,7 @@ def test_the_change_is_the_one_that_drawing_shows():
 
 
 def test_without_the_guard_photographs_would_get_worse():
-    """Of three Gaussians in one place each can go, but not all of them."""
+    """Each of three Gaussians in one place can be removed, but not all."""
     thrice = merge([SURFACES] * 3)
     views = [view_of(Room(), camera) for camera in CAMERAS]
     config = CleaningConfig(idle=1e3)
@@ -148,8 +148,8 @@ def test_the_command_says_what_it_did(scene, tmp_path, monkeypatch, capsys):
     words = [word for word in clean(scene, splat, tmp_path / "out") if word != "--quiet"]
     assert run(monkeypatch, *words, "--context", 0, 2) == 0
     said = capsys.readouterr()
-    assert "Gaussians taken out" in said.out
-    assert "judged by 2 photographs" in said.err
+    assert "Gaussians removed" in said.out
+    assert "compared with 2 photographs" in said.err
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ SIZE = 64
 
 @pytest.fixture(scope="module")
 def scene(room) -> Path:
-    """Photographs of a room from three places; frame 2 sees what 0 and 1 do not."""
+    """Return photographs of a room from three places; frame 2 sees what 0 and 1 do not."""
     return room
 
 
@@ -48,12 +48,12 @@ def complete(scene, out, *more, context=(0, 1), target=(2,)) -> list:
 
 
 SMALL = ("--resolution", 32, "--near", 0.5, "--far", 20, "--quiet")
-"""Where what is completed matters less than that it is."""
+"""Options of fast runs whose result does not matter."""
 
 
 @pytest.fixture(scope="module")
 def completed(completed_room) -> Path:
-    """The output of one plain run."""
+    """Return the output of one plain run."""
     return completed_room
 
 
@@ -130,9 +130,9 @@ def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch,
         assert not row["is_check"]
         for score in ("psnr_before", "psnr_after", "ssim_before", "ssim_after"):
             assert row[score] == pytest.approx(target[score], abs=1e-4)
-    assert "not used (8 scored) the mean PSNR was" in capsys.readouterr().out
+    assert "Mean PSNR of 8 photographs that were not used: " in capsys.readouterr().out
     page = (out / "report.html").read_text()
-    assert "At photographs that were not used" in page
+    assert "At held-out photographs" in page
     assert ">mean<" in page
 
     splat = ("--scene", out / "context.ply", *SMALL)
@@ -192,7 +192,7 @@ def test_the_oracle_looks_at_the_photograph_and_says_so(scene, tmp_path, monkeyp
 
 
 def broken_scene(scene: Path, folder: Path, change) -> Path:
-    """A copy of the scene whose transforms.json was changed."""
+    """Copy the scene with a changed transforms.json."""
     folder.mkdir()
     for image in scene.glob("*.png"):
         (folder / image.name).write_bytes(image.read_bytes())
@@ -203,7 +203,7 @@ def broken_scene(scene: Path, folder: Path, change) -> Path:
 
 
 def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
-    """The command exits with 2, says one sentence and writes nothing."""
+    """Check that the command exits with 2, prints one sentence and writes nothing."""
     assert run(monkeypatch, *arguments) == 2
     said = capsys.readouterr().err
     assert sentence in said
@@ -245,8 +245,8 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
     ("more", "sentence"),
     [
         (("--near", 5, "--far", 1), "near"),
-        (("--auto", 2), "Targets are named, and others are to be found besides; "),
-        (("--auto",), "complete the result for the others (--auto)."),
+        (("--auto", 2), "--target and --auto are both given; use one of them"),
+        (("--auto",), "again with the other (--auto)."),
         (("--near", 0), "near"),
         (("--generator", "oracle", "--generator=oracle"), "--generator is given twice"),
         (("--near", -1), "near"),
@@ -334,7 +334,7 @@ def test_a_splat_in_place_of_the_photographs_is_sent_to_its_option(tmp_path, mon
 
 
 def config_of(scene, tmp_path, monkeypatch, *more) -> CompleterConfig:
-    """The settings that a command leads to."""
+    """Return the settings of a command."""
     words = [str(word) for word in complete(scene, tmp_path / "out", *more)]
     return parsed(words).config
 
@@ -421,7 +421,7 @@ def test_old_option_names_of_other_commands_and_of_rows_work_too(tmp_path, capsy
 
 
 SHORT = {"complete": 13, "live": 14, "evaluate": 13, "batch": 9, "clean": 9, "bench": 10}
-"""Options, with those for help, that the help of a command shows."""
+"""Number of options in the short help, with those for help."""
 
 
 @pytest.mark.parametrize("command", SHORT)
@@ -451,7 +451,7 @@ def test_help_all_knows_every_setting(monkeypatch, capsys):
     for kind in GENERATORS.values():
         assert all(f"--generator-{f.name.replace('_', '-')}" in said for f in fields(kind))
     assert "--config.alignment.min-agreement" in said
-    assert "How many further seeds are tried" in said
+    assert "Further seeds to try if" in said
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -565,7 +565,7 @@ def test_quiet_is_quiet(scene, tmp_path, monkeypatch, capsys):
 
 
 def gscompleter(*arguments) -> subprocess.Popen:
-    """The command in a process of its own."""
+    """Start the command in a process of its own."""
     command = [sys.executable, "-c", "from gscompleter.cli import main; main()"]
     return subprocess.Popen(
         [*command, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -587,15 +587,14 @@ def test_help_does_not_wait_for_torch():
 
 
 def num_written(folder: Path) -> int:
-    """How many files and folders with a dot in their names lie in a folder that others write to:
-    `os.walk` passes over what goes while it looks."""
+    """Count files and folders with a dot in their names, in a folder that others write to."""
     return sum("." in name for _, *names in os.walk(folder) for name in chain(*names))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills with a POSIX signal")
 @pytest.mark.parametrize("written", [2, 4, 8])
 def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
-    """The process is killed once it has begun to write so many files and folders."""
+    """The process is killed after it has begun to write this many files and folders."""
     out = tmp_path / "out"
     process = gscompleter(*complete(scene, out, *SMALL))
     while process.poll() is None and num_written(tmp_path) < written:

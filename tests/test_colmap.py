@@ -1,4 +1,4 @@
-"""COLMAP's models: every layout, both ways of writing, every lens; what is damaged is said."""
+"""COLMAP models: every layout, both encodings, every lens, and damaged files."""
 
 import shutil
 import struct
@@ -135,7 +135,7 @@ def test_names_with_spaces_and_of_any_encoding_are_found(tmp_path):
 
 
 def test_intrinsics_follow_the_size_on_the_disk(tmp_path):
-    """The camera says twice the size, or half of it, and nothing that is seen changes."""
+    """The camera file has twice or half the size, and the view does not change."""
     for factor in (2.0, 0.5):
         scene = tmp_path / f"{factor}"
         write_photographs(scene / "images")
@@ -175,7 +175,7 @@ def test_of_several_models_the_largest_is_opened(tmp_path):
     check_room(photographs)
     (note,) = photographs.notes
     assert "3 models lie in" in note
-    assert "the one in 1 with 5 images was opened" in note
+    assert "1 with 5 images is used" in note
 
 
 def test_photographs_are_used_as_they_are_stored_and_that_is_said(tmp_path):
@@ -188,7 +188,7 @@ def test_photographs_are_used_as_they_are_stored_and_that_is_said(tmp_path):
     photographs = open_photographs(tmp_path)
     check_room(photographs)
     (note,) = photographs.notes
-    assert "used as they are stored, which is how COLMAP saw them" in note
+    assert "used as they are stored, like in COLMAP" in note
     (tmp_path / "images" / "0.png").write_bytes(b"no image")
     assert open_photographs(tmp_path).notes == ()
 
@@ -292,7 +292,7 @@ LENS_NUMBERS = {
 
 @dataclass(frozen=True)
 class BentCamera(Camera):
-    """A camera whose pixels look where a lens makes them look."""
+    """A camera with lens distortion."""
 
     lens: Distortion = Distortion()
 
@@ -419,7 +419,7 @@ def test_a_damaged_line_is_named(tmp_path, name, line, sentence):
 
 
 def test_masks_and_photographs_of_a_lens_are_undistorted_together(tmp_path):
-    """What is masked in the photograph is masked where the undistorted one shows it."""
+    """A masked object of the photograph is masked in the undistorted one."""
     parameters = [0.9 * SIZE, SIZE / 2, SIZE / 2, -0.2]
     write_colmap_binary(tmp_path / "sparse", ["0.png"], "SIMPLE_RADIAL", parameters)
     dark = np.zeros((SIZE, SIZE), np.uint8)
@@ -435,7 +435,7 @@ def test_masks_and_photographs_of_a_lens_are_undistorted_together(tmp_path):
 
 
 def epipolar_error(first: View, second: View) -> float:
-    """Median distance in pixels of SIFT matches from their epipolar lines."""
+    """Return the median distance of SIFT matches from their epipolar lines, in pixels."""
     sift = cv2.SIFT_create(2000)
     grey = [(view.image.mean(-1) * 255).to(torch.uint8).numpy() for view in (first, second)]
     (keys, ours), (others, theirs) = (sift.detectAndCompute(image, None) for image in grey)

@@ -1,4 +1,4 @@
-"""The whole: what holds whatever the models are."""
+"""The whole method: properties that hold for all models."""
 
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -35,7 +35,7 @@ SIZE = 64
 
 
 def cameras(unit: float = 1.0):
-    """Two context cameras side by side, and a target far enough to the right to see a hole."""
+    """Return two context cameras side by side, and a target to the right that sees a hole."""
     context = [camera_at(x, size=SIZE, unit=unit) for x in (-0.3, 0.1)]
     return context, camera_at(0.7, yaw=12, size=SIZE, unit=unit)
 
@@ -45,13 +45,13 @@ def photographs(unit: float = 1.0) -> list[View]:
 
 
 def bumps(camera: Camera) -> torch.Tensor:
-    """Depth errors, about 20 % short, that vary by 8 % over 64 pixels."""
+    """Make depth errors, about 20 % short, that vary by 8 % over 64 pixels."""
     x, y = torch.linspace(0, 3, camera.width), torch.linspace(0, 3, camera.height)
     return 0.8 * (1 + 0.08 * torch.sin(x)[None] * torch.cos(y)[:, None])
 
 
 class KnowingReconstructor:
-    """Ψ that knows the room, but errs in the depth of whatever was not photographed."""
+    """Ψ that knows the room, with depth errors where nothing was photographed."""
 
     def __init__(self, unit: float = 1.0) -> None:
         self.unit = unit
@@ -78,7 +78,7 @@ class KnowingGenerator:
 
 
 class KnowingTogether(KnowingGenerator):
-    """The same, two targets at a time."""
+    """The same generator, for two targets at a time."""
 
     at_once = 2
     takes_margin = True
@@ -99,13 +99,13 @@ def knowing(config: CompleterConfig = CompleterConfig(), unit: float = 1.0) -> G
 
 @cache
 def completed(config: CompleterConfig) -> Completion:
-    """The target, completed by models that know the room."""
+    """Complete the target by models that know the room."""
     return knowing(config)(photographs(), cameras()[1])
 
 
 @cache
 def completed_by_embedded_models(unit: float) -> Completion:
-    """The same by the models that need no weights."""
+    """Complete the target by the models that need no weights."""
     return GSCompleter(seed=3)(photographs(unit), cameras(unit)[1])
 
 
@@ -144,7 +144,7 @@ def test_only_what_was_added_is_marked_as_generated():
 
 
 def test_the_depth_error_of_the_completed_region_shrinks_through_each_stage():
-    """Lifted: 20 % short and bumpy. The affine mends the scale, the rays mend the bumps."""
+    """Lifted depths are 20 % short and bumpy: the affine corrects the scale, the rays the bumps."""
     views, (_, target) = photographs(), cameras()
     completion = knowing(replace(CompleterConfig(), margin=0.0))(views, target)
     (result,) = completion.targets
@@ -187,7 +187,7 @@ def test_several_targets_are_completed_one_after_the_other_into_one_scene():
 
 
 def test_a_target_is_widened_only_where_a_hole_reaches_its_edge():
-    """What its frame holds whole needs no more than its frame."""
+    """A hole that is enclosed by the image needs no padding."""
     completer, (_, target) = knowing(), cameras()
     wide = completer.window(completer.begin(photographs()), target).wide
     whole = gaussians_of(view_of(Room(), wide))
@@ -196,21 +196,23 @@ def test_a_target_is_widened_only_where_a_hole_reaches_its_edge():
     for where, side in {"middle": SIZE, "edge": wide.width}.items():
         completion = completer.begin(photographs(), whole[~nothing_there[where]])
         assert completer.sight(completion, target).window.wide.width == side
-        given = completer.sight(completion, target, wide)  # as an image was made for it
+        given = completer.sight(completion, target, wide)  # padding of a given image
         assert given.window.wide.width == wide.width
         assert completer.advance(completion, target).targets[0].after.image.shape[0] == SIZE
 
 
 def test_targets_are_synthesized_together_where_the_generator_can():
-    """Each has a hole that reaches its edge, whether or not those before it were completed; so it
-    is as wide among others as alone."""
+    """Each target has a hole at its border, whether or not the ones before are completed.
+
+    So it has the same padding as alone.
+    """
     views, (_, target) = photographs(), cameras()
     others = [camera_at(x, yaw=12, size=SIZE) for x in (0.9, 1.6, 2.3)]
     targets = [target, views[0].camera, *others]
     generator = KnowingTogether()
     together = GSCompleter(KnowingReconstructor(), generator)(views, targets)
     assert [len(calls) for calls in generator.calls] == [1, 2, 1]
-    assert generator.calls[0][0].target.width > SIZE  # with its margin
+    assert generator.calls[0][0].target.width > SIZE  # with padding
     renderer, added_to = load_renderer("cpu"), [together.context]
     added_to.append(merge([together.context, together.targets[0].added]))
     added_to.append(merge([added_to[1], *(t.added for t in together.targets[2:4])]))
@@ -324,7 +326,7 @@ def test_undo_is_to_go_on_from_the_former_state():
 
 @dataclass(frozen=True)
 class Counting(CpuRenderer):
-    """Remembers which cameras a scene was frozen at."""
+    """A renderer that remembers the cameras at which a scene was frozen."""
 
     frozen: list[Camera] = field(default_factory=list)
 
@@ -334,7 +336,7 @@ class Counting(CpuRenderer):
 
 
 def test_a_report_draws_no_photograph_again():
-    """What was seen of the scene before and after, to the bit, and nothing is frozen for it."""
+    """The renders before and after are exact, and nothing is frozen for them."""
     renderer = Counting()
     completer = GSCompleter(KnowingReconstructor(), KnowingGenerator(), renderer)
     done = completer(photographs(), cameras()[1])
@@ -351,7 +353,7 @@ def test_a_report_draws_no_photograph_again():
 
 
 def test_photographs_are_frozen_once_however_many_targets_there_are():
-    """Once as they are and once as a small image; what was added extends them."""
+    """Once in full and once in small size; additions extend the frozen scenes."""
     views, (_, target) = photographs(), cameras()
     targets = [target, camera_at(-0.9, yaw=-12, size=SIZE)]
     renderer = Counting()
@@ -395,7 +397,7 @@ def test_the_reference_is_the_one_that_a_step_takes():
 
 
 class Mistaken(KnowingTogether):
-    """Φ that shows something else, and is told so."""
+    """Φ whose image is inconsistent with the photographs, and that reports it."""
 
     def synthesize(self, requests):
         said = "It is another room."
@@ -419,7 +421,7 @@ def test_what_the_photographs_contradict_is_reported_and_not_added():
 
 
 class Confused(KnowingReconstructor):
-    """Ψ whose depths of an image that was not photographed have nothing to do with the room."""
+    """Ψ whose depths of a synthesized image have nothing to do with the room."""
 
     def __call__(self, views):
         random = torch.Generator().manual_seed(1)
@@ -444,7 +446,7 @@ def test_depths_that_the_scene_contradicts_are_reported_and_not_added(tmp_path):
     (said,) = summary["targets"]
     assert said["added"] == 0
     assert said["affine"]["agreement"] < 0.1
-    assert "the scene contradicts the depths of what was synthesized" in said["notes"][0]
+    assert "of the scene that the target sees agrees with the depths of the" in said["notes"][0]
     assert said["notes"][-1] == "Nothing of it was added."
     literal = replace(completer, config=CompleterConfig.paper())(context, target)
     assert len(literal.added) > 0
@@ -491,13 +493,13 @@ def test_nothing_is_added_before_what_an_earlier_target_sees(monkeypatch):
 
 @cache
 def antialiased_room() -> Gaussians:
-    """Reconstruct the photographs in Gaussians for antialiased rendering."""
+    """Reconstruct the photographs as Gaussians for antialiased rendering."""
     mode = replace(gaussians_of(photographs()[0])[:0], is_antialiased=True)
     return merge([in_mode_of(mode, gaussians_of(v), v.camera) for v in photographs()])
 
 
 def test_what_was_made_for_classic_rendering_covers_as_much_antialiased():
-    """The sums over the image of what single Gaussians show, small ones and large ones."""
+    """Compare the image sums of single Gaussians, small ones and large ones."""
     view, renderer = photographs()[0], load_renderer("cpu")
     made = gaussians_of(view)[SIZE * SIZE // 2 + SIZE // 2 :][:1]
     for factor, most in ((0.1, 0.2), (1.0, 0.7), (5.0, 0.98)):
@@ -516,7 +518,7 @@ def test_what_was_made_for_classic_rendering_covers_as_much_antialiased():
 
 @pytest.mark.parametrize("doubted", [False, True])
 def test_an_antialiased_scene_is_completed_as_one(tmp_path, doubted):
-    """As well as the classic one of the same room, within what its wider low-pass costs."""
+    """It scores like the classic one of the same room, up to its wider low-pass filter."""
     views, target = photographs(), cameras()[1]
     witnesses = [view_of(Room(), camera_at(-0.1, size=SIZE))] if doubted else None
     scene, truth = antialiased_room(), view_of(Room(), target).image

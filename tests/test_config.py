@@ -68,7 +68,7 @@ def test_a_whole_number_is_a_float_and_an_empty_file_changes_nothing(tmp_path):
 
 
 def refused(path: Path, text: str, sentence: str) -> None:
-    """The file is refused at once, in a sentence of a readable length."""
+    """Check that the file is refused with one short sentence."""
     path.write_text(text)
     with pytest.raises(InputError, match=sentence) as told:
         load_config(str(path))
@@ -88,9 +88,9 @@ def refused(path: Path, text: str, sentence: str) -> None:
         ("holes: {dilation: 2.5}", "holes.dilation must be a valid integer, got 2.5"),
         ("holes: {dilation: -1}", "holes.dilation must be greater than or equal to 0, got -1"),
         ("holes: {dilation: [1, 2]}", r"holes.dilation must be a valid integer, got \[1, 2\]"),
-        ("holes: 3", "holes holds settings of its own, got 3"),
-        ("holes: [1]", r"holes holds settings of its own, got \[1\]"),
-        ("holes:", "holes holds settings of its own, got None"),
+        ("holes: 3", "holes is a group of settings, got 3"),
+        ("holes: [1]", r"holes is a group of settings, got \[1\]"),
+        ("holes:", "holes is a group of settings, got None"),
         (
             "registration: {lr_unit: tiny}",
             "registration.lr_unit must be 'distance' or 'scene', got",

@@ -9,8 +9,7 @@ from gscompleter.kernels.continuation import LEAST_WEIGHT, means, pyramid_of
 
 
 def whole_images(levels):
-    """The means of every level at every pixel: images are enlarged and, from the widest
-    neighbourhood on, what a level lacks is taken from the one above."""
+    """Enlarge every level to the image, taking missing values from the level above."""
     h, w = levels[0].shape[:2]
     total = levels[0].sum(axis=(0, 1))
     wider, found = np.broadcast_to(total[:-1] / total[-1], (h, w, len(total) - 1)), []

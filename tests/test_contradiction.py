@@ -1,5 +1,4 @@
-"""What moved between photographs is found where they contradict each other, and is not completed
-with."""
+"""Dynamic masks cover regions that moved between photographs; completion does not use them."""
 
 from functools import cache
 
@@ -20,12 +19,11 @@ IN_FRONT = ((-0.3, -0.3, 1.8), (0.3, 1.5, 2.1))
 ROOM = Room(boxes=(OUTSIDE, IN_FRONT))
 CAMERAS = (camera_at(0, 0, size=SIZE), camera_at(0, -0.3, size=SIZE))
 PLACES = (-0.55, 0.9)
-"""Where something red stands in the first photograph, half hidden, and in the second, in x."""
+"""x of a red object in the first photograph, half hidden, and in the second."""
 
 
 def with_something_red(camera: Camera, x: float) -> tuple[View, Bool[Tensor, "h w"]]:
-    """A photograph of the room with a red box at `x`, whose texture goes with it, and its pixels.
-    The depth is that of the room."""
+    """Take a photograph with a red, textured box at `x`, and its mask; the depth is of the room."""
     box = ((x - 0.3, 0.1, 2.6), (x + 0.3, 0.9, 3.0))
     image, depth = cast(ROOM, camera)
     _, nearest = cast(Room(boxes=(*ROOM.boxes, box)), camera)
@@ -43,20 +41,20 @@ def photographed() -> tuple[list[View], list[Bool[Tensor, "h w"]]]:
 
 @cache
 def beginning(min_difference: float | None) -> Completion:
-    """The scene of these photographs, as it is without targets."""
+    """Return the scene of these photographs without targets."""
     config = CompleterConfig(dynamic_masks=DynamicMasksConfig(min_difference))
     return GSCompleter(config=config).begin(photographed()[0])
 
 
 def carried(mask: Bool[Tensor, "h w"], at: Camera, view: View) -> Bool[Tensor, "h w"]:
-    """Where a mask over the image of another camera lies in a view of the room."""
+    """Reproject a mask of another camera into a view of the room."""
     assert view.depth is not None
     pixels, _ = project(unproject(view.depth, view.camera), at)
     return sample(mask[..., None].float(), pixels)[..., 0] > 0.5
 
 
 def as_seen(views: list[View]) -> list[Render]:
-    """What Ψ makes of them at best: the room, where nothing moved."""
+    """Return the best result of Ψ: the room without moving objects."""
     return [Render(v.image, v.depth, torch.ones_like(v.depth)) for v in views]
 
 
@@ -90,7 +88,7 @@ def test_exposure_is_no_contradiction():
 
 
 def test_of_three_photographs_most_decide():
-    """Two see the wall, where something red stands before it in the first."""
+    """Two photographs show the wall behind the red object of the first."""
     third = camera_at(-0.3, -0.15, size=SIZE)
     red_view, red = with_something_red(CAMERAS[0], PLACES[0])
     views = [red_view, view_of(ROOM, CAMERAS[1]), view_of(ROOM, third)]
@@ -105,7 +103,7 @@ def test_of_three_photographs_most_decide():
 
 
 def completed(min_difference: float | None) -> TargetCompletion:
-    """A hole behind what stands in front, beside something red, from farther to the left."""
+    """Complete a hole behind an occluder, next to something red, from farther to the left."""
     target, begun = camera_at(-0.4, -0.1, size=SIZE), beginning(min_difference)
     return GSCompleter().advance(begun, target).targets[0]
 

@@ -1,4 +1,4 @@
-"""What counts as a hole is one number, and every stage that speaks of holes obeys it."""
+"""The alpha threshold of holes is one number, and every stage uses it."""
 
 from dataclasses import replace
 
@@ -21,11 +21,11 @@ THIN = torch.zeros(SIZE, SIZE, dtype=torch.bool)
 THIN[16:32, 16:32] = True
 INNER = torch.zeros_like(THIN)
 INNER[18:30, 18:30] = True
-"""Pixels of the thin square away from its border, where Gaussians of both sides show."""
+"""Pixels inside the thin square, away from its mixed border."""
 
 
 def thin_scene(depth_error: float = 1.0) -> Gaussians:
-    """The room as the target sees it, with a square that covers its pixels by about two thirds."""
+    """Make the room at the target, with a square of alpha about 2/3."""
     assert REFERENCE.depth is not None
     scene = gaussians_of(REFERENCE, torch.where(THIN, depth_error, 1.0) * REFERENCE.depth)
     opacities = torch.where(THIN.flatten(), 0.25, scene.opacities)
@@ -33,7 +33,7 @@ def thin_scene(depth_error: float = 1.0) -> Gaussians:
 
 
 def room_of(views) -> Reconstruction:
-    """Ψ that knows the room."""
+    """Make a reconstructor that knows the room."""
     depths = tuple(view_of(Room(), view.camera).depth for view in views)
     return Reconstruction(
         merge([gaussians_of(v, d) for v, d in zip(views, depths, strict=True)]),
@@ -73,7 +73,7 @@ def test_a_pixel_covered_by_less_than_max_alpha_is_a_hole_that_is_painted_and_ke
 
 
 def test_the_depth_of_a_thin_pixel_is_followed_by_default_and_carried_into_where_it_is_a_hole():
-    """The thin square is a stain that stands a tenth too far; what surrounds it is right."""
+    """The thin square is 10 % too far; its surroundings are correct."""
     renderer, scene = load_renderer("cpu"), thin_scene(1.1)
     truth = REFERENCE.depth
     everywhere = DepthMap(truth, torch.ones_like(THIN))

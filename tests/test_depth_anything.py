@@ -76,22 +76,23 @@ LONG = ("gs-giantlike_pose_v2_70x98", "gs-giantlike_pose_v3_42x56", "small_nopos
 
 
 def cases(folder: list[Path]) -> list[object]:
-    """Files with the outputs of a network."""
+    """List the fixture files of a network."""
     paths = [path for path in folder if path.stem.split("_")[0] in STAND_INS]
     return [pytest.param(path, id=path.stem) for path in paths]
 
 
 def check(path: Path) -> None:
-    """Each array that is stored, between the layers and at the end."""
+    """Compare all stored intermediate and final arrays."""
     errors = errors_in(path)
     rotations = {name: error for name, error in errors.items() if name.endswith("rotations")}
     assert_within({name: e for name, e in errors.items() if name not in rotations}, BOUND)
     stored = [name for name in Case.load(path).values if name.startswith(("out_", "mid_"))]
-    told = ("pose_scale", "align_raised", "world", "mid_stride")
+    transformed = ("pose_scale", "align_raised", "world", "mid_stride")
     missing = [
         name
         for name in stored
-        if not any(known.startswith(name) for known in errors) and not any(t in name for t in told)
+        if not any(known.startswith(name) for known in errors)
+        and not any(t in name for t in transformed)
     ]
     assert missing == []
     if rotations:
@@ -166,9 +167,9 @@ def test_cameras_are_normalised_and_aligned_as_by_the_authors(path):
     assert counts
     for count in counts:
         given = Poses(case.tensor(f"in_c2w_{count}")[None], torch.eye(3).repeat(1, count, 1, 1))
-        told = seen_from_first(given, authors_units(given.centers))
+        normalized = seen_from_first(given, authors_units(given.centers))
         expected = case.tensor(f"out_ext_norm_{count}")
-        assert relative_error(told.w2c[0], expected) < BOUND
+        assert relative_error(normalized.w2c[0], expected) < BOUND
         w2c = case.tensor(f"in_pred_w2c_{count}").double()
         found = (-w2c[:, :, :3].transpose(1, 2) @ w2c[:, :, 3:])[..., 0].numpy()
         if f"out_align_s_{count}" not in case.values:
@@ -177,17 +178,17 @@ def test_cameras_are_normalised_and_aligned_as_by_the_authors(path):
         for name, value in (("r", ours.rotation), ("t", ours.shift), ("s", ours.scale)):
             theirs = case.tensor(f"out_align_{name}_{count}")
             assert relative_error(torch.as_tensor(value, dtype=torch.float64), theirs) < BOUND, name
-        scale = similarity_between(found, told.centers[0].double().numpy()).scale
+        scale = similarity_between(found, normalized.centers[0].double().numpy()).scale
         assert scale == pytest.approx(float(case.values[f"out_pose_scale_{count}"]), rel=BOUND)
 
 
 def check_world(path: Path) -> None:
-    """What the network set before its own cameras, before the given ones."""
+    """Compare the Gaussians after the transform to the given cameras."""
     case = Case.load(path)
-    images, told = images_and_poses(case)
+    images, poses = images_and_poses(case)
     given = Poses(case.tensor("in_c2w"), case.tensor("in_intrinsics_px"))
     with torch.no_grad():
-        predicted = network_for(path.stem.split("_")[0])(images, told)
+        predicted = network_for(path.stem.split("_")[0])(images, poses)
     errors = gaussian_errors(in_world(predicted, given), case, "out_world_")
     rotations = errors.pop("out_world_rotations")
     assert rotations < ROTATIONS
@@ -211,7 +212,7 @@ def test_gaussians_are_brought_to_the_given_cameras_in_more_cases(path):
 
 
 def check_images(path: Path) -> None:
-    """Sizes, intrinsics, and pixels but for the rounding of another OpenCV."""
+    """Compare sizes, intrinsics, and pixels up to the rounding of another OpenCV."""
     case = Case.load(path)
     numbers = [name.rsplit("_", 1)[1] for name in case.values if name.startswith("in_image")]
     assert numbers
@@ -323,7 +324,7 @@ QUICK = Inference(Sizing(SIZE))
 
 
 class Knowing(DepthAnything):
-    """A network that sees the truth in a unit and in axes of its own."""
+    """A network that returns the true depth in a unit and axes of its own."""
 
     def __init__(self, depth: Tensor, raw: Tensor | None = None) -> None:
         super().__init__(TINY)
@@ -343,14 +344,14 @@ class Knowing(DepthAnything):
 
 
 def photographs(unit: float = 1.0, size: int = SIZE) -> list[View]:
-    """Two of a room, turned cameras, in a unit of the scene."""
+    """Render two views of a room by rotated cameras, scaled to a scene unit."""
     cameras = [camera_at(x, yaw=yaw, size=size) for x, yaw in ((-0.3, 20), (0.1, -5))]
     views = [view_of(Room(), camera, i) for i, camera in enumerate(cameras)]
     return [scaled(view, unit) for view in views]
 
 
 def scaled(view: View, unit: float) -> View:
-    """The same photograph in a scene of another unit."""
+    """Convert the view to a scene of another unit."""
     camera = view.camera
     c2w = camera.c2w.clone()
     c2w[:3, 3] *= unit
@@ -361,7 +362,7 @@ def scaled(view: View, unit: float) -> View:
 
 
 def knowing(views: list[View]) -> Knowing:
-    """The truth, with lengths in baselines."""
+    """Create the true network, with lengths in baselines."""
     baseline = (views[1].camera.center - views[0].camera.center).norm().clamp_min(1e-9)
     return Knowing(torch.stack([view.depth for view in views]) / baseline)
 
@@ -409,7 +410,7 @@ def test_only_wanted_gaussians_are_lifted():
 
 
 def test_gaussians_of_the_head_stand_where_the_given_cameras_see_them():
-    """Of a network whose depth is, as the head takes it, the length of the ray."""
+    """The depth of this network is the length of the ray, as the head expects it."""
     views = photographs(unit=50.0)
     network = knowing(views)
     lengths = torch.stack([v.camera.z_rays().norm(dim=-1) for v in views])
@@ -428,7 +429,7 @@ def test_gaussians_of_the_head_stand_where_the_given_cameras_see_them():
 
 
 class KnowingMetric(MetricDepthAnything):
-    """A metric network that sees the truth, and the sky in the first rows."""
+    """A metric network that returns the true depth, and sky in the first rows."""
 
     def __init__(self, metres: Tensor, focal: float) -> None:
         super().__init__(TINY_METRIC)
@@ -458,7 +459,7 @@ def test_metres_are_brought_to_the_unit_that_shared_features_tell():
 def test_photographs_without_features_tell_no_metre():
     views = [replace(view, image=torch.full_like(view.image, 0.5)) for view in photographs()]
     network = KnowingMetric(torch.stack([view.depth for view in views]), 50.0)
-    with pytest.raises(InputError, match="share 0 features .* takes 12"):
+    with pytest.raises(InputError, match="share 0 features .* needs 12"):
         MetricViewDepth(network, QUICK)(views)
 
 
@@ -509,7 +510,7 @@ def psi_of(config: DepthAnythingConfig | NestedConfig) -> FromDepth | AnyViewGau
     ids=["depth", "gaussians", "nested"],
 )
 def test_smoke_a_completion_runs_with_random_weights(config):
-    """It says nothing of quality: only that all stages take what such a model gives."""
+    """Random weights: this only checks that all stages accept the output."""
     views = [view_of(Room(), camera_at(x, size=48), i) for i, x in enumerate((-0.3, 0.1))]
     anywhere = CompleterConfig(holes=HoleConfig(min_covered=0.0))
     completion = GSCompleter(psi_of(config), config=anywhere)(
@@ -532,8 +533,8 @@ def test_the_same_views_give_the_same_bytes():
 def test_heads_and_geometry_stay_exact_where_the_transformer_runs_in_lower_precision(config):
     """On a CPU, where this can be tried."""
     batch = batch_of(photographs(), QUICK.sizing, 2)
-    told = seen_from_first(batch.poses, scene_units(batch.poses.centers))
-    given = (batch.images,) if config is TINY_METRIC else (batch.images, told)
+    poses = seen_from_first(batch.poses, scene_units(batch.poses.centers))
+    given = (batch.images,) if config is TINY_METRIC else (batch.images, poses)
     found = []
     for lower in (False, True):
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=lower):
@@ -557,7 +558,7 @@ def test_each_kind_of_network_becomes_its_own_reconstructor():
 def test_wrong_views_and_precisions_are_refused_with_a_sentence():
     with pytest.raises(InputError, match="1 view was given, and the model matches at least 2"):
         AnyViewDepth(random(TINY), QUICK)(photographs()[:1])
-    with pytest.raises(InputError, match="cpu and torch.bfloat16 was asked for"):
+    with pytest.raises(InputError, match="cpu and torch.bfloat16 needs a GPU"):
         around(random(TINY), torch.bfloat16)
 
 

@@ -63,14 +63,14 @@ def views(elsewhere) -> list[View]:
 
 
 def check_there(value: object) -> None:
-    """All tensors of a frozen value lie elsewhere, and there are some."""
+    """Check that a frozen value has tensors, all of them elsewhere."""
     found = dict(tensors_in(value, "it"))
     assert found
     assert [name for name, tensor in found.items() if not isinstance(tensor, There)] == []
 
 
 def few_steps(config: CompleterConfig) -> CompleterConfig:
-    """The same stages in less time."""
+    """Reduce the stages to a few steps."""
     registration = replace(config.registration, iterations=2)
     return replace(config, registration=registration, refine=replace(config.refine, iterations=2))
 

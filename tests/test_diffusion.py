@@ -1,7 +1,7 @@
 """PE-Field and inpainting pipelines as generators.
 
-The models are tiny and random, so that these are smoke tests: what is computed is compared with
-diffusers, and what is asked of a generator with the protocol. No image here looks like anything.
+The models are tiny and random, so these are smoke tests: results are compared with diffusers, and
+generators with the protocol.
 """
 
 from __future__ import annotations
@@ -164,8 +164,8 @@ def test_pe_field_takes_the_depth_that_the_completer_names(kontext_folder, tmp_p
     generator = PEField(load_kontext(str(kontext_folder)), steps=1)
 
     def image(generator, source):
-        asked = replace(context, source_depth=source, correct_color=False)
-        return answer(generator, context.views[1], TARGET, asked).image
+        changed = replace(context, source_depth=source, correct_color=False)
+        return answer(generator, context.views[1], TARGET, changed).image
 
     for source, depth in named.items():
         assert torch.equal(
@@ -190,28 +190,30 @@ def test_further_seeds_are_tried_and_the_best_is_kept(kontext_folder):
 
 
 def test_settings_reach_the_generators(kontext_folder, inpaint_folder, tmp_path):
-    asked = PEFieldSettings(str(kontext_folder), steps=3, retries=2, batch_size=1)
-    generator = load_generator("pe-field", 5, settings=asked)
+    chosen_settings = PEFieldSettings(str(kontext_folder), steps=3, retries=2, batch_size=1)
+    generator = load_generator("pe-field", 5, settings=chosen_settings)
     assert (generator.seed, generator.steps, generator.retries) == (5, 3, 2)
     assert generator.at_once == 1
     assert generator.depth is None
-    chosen = load_generator("pe-field", settings=replace(asked, depth="context"))
+    chosen = load_generator("pe-field", settings=replace(chosen_settings, depth="context"))
     assert chosen.depth is context_depth
-    assert load_generator("pe-field", settings=PEFieldSettings(asked.weights)).steps == 4
+    assert load_generator("pe-field", settings=PEFieldSettings(chosen_settings.weights)).steps == 4
     network = tiny_model(tmp_path)
-    with_depth = load_generator("pe-field", settings=replace(asked, depth=str(network)))
+    with_depth = load_generator("pe-field", settings=replace(chosen_settings, depth=str(network)))
     assert isinstance(with_depth.depth, MonocularDepth)
-    asked = DiffusersInpaintSettings(
+    chosen_settings = DiffusersInpaintSettings(
         str(inpaint_folder), steps=3, retries=1, prompt="a quiet street"
     )
-    painter = load_generator("diffusers-inpaint", settings=asked).function
+    painter = load_generator("diffusers-inpaint", settings=chosen_settings).function
     assert (painter.prompt, painter.steps, painter.retries) == ("a quiet street", 3, 1)
 
 
 def test_an_inpainter_reads_its_prompt(inpaint_folder):
     context = known_room()
-    asked = DiffusersInpaintSettings(str(inpaint_folder), steps=2, prompt="a quiet street")
-    painter = load_generator("diffusers-inpaint", settings=asked).function
+    chosen_settings = DiffusersInpaintSettings(
+        str(inpaint_folder), steps=2, prompt="a quiet street"
+    )
+    painter = load_generator("diffusers-inpaint", settings=chosen_settings).function
     other = replace(painter, prompt="a b c")
     images = [one(context.views[1], TARGET, context).image for one in (painter, other)]
     assert not torch.equal(*images)
@@ -278,7 +280,7 @@ def test_a_pipeline_of_another_kind_is_refused(tmp_path, kontext_folder):
 
 
 def test_a_checker_of_images_is_no_exception(tmp_path):
-    """And older names of classes are left to diffusers, which knows what became of them."""
+    """Older class names are translated by diffusers."""
     folder = tiny_diffusion.saved(tiny_diffusion.checked_stable_diffusion(), tmp_path / "whole")
     index = json.loads((folder / "model_index.json").read_text())
     index["feature_extractor"] = ["transformers", "CLIPFeatureExtractor"]
@@ -319,7 +321,7 @@ def test_weights_that_lack_a_tensor_are_refused_and_never_made_up(
 
 
 def completed(tmp_path, monkeypatch, *model) -> dict:
-    """The summary of a completion of the room by the command line."""
+    """Complete the room by the command line and return the summary."""
     scene, out = tmp_path / "scene", tmp_path / "out"
     photographed(scene, [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)])
     command = ["complete", scene, "--context", 0, 1, "--target", 2]

@@ -1,4 +1,4 @@
-"""What is said when a generator with weights cannot be had. Nothing here needs diffusers."""
+"""Messages if a generator's packages or weights are missing; needs no diffusers."""
 
 import pytest
 
@@ -23,9 +23,9 @@ from scenes import camera_at, photographed
 @pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
 def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatch):
     monkeypatch.setattr(published, "PACKAGES", ("a_package_nobody_has", "torch"))
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as caught:
         load_generator(name, settings=settings_class(name)(weights="somebody/something"))
-    message = str(told.value)
+    message = str(caught.value)
     assert "a_package_nobody_has" in message
     assert "torch" not in message
     assert "pip install 'gscompleter[diffusion]'" in message
@@ -42,11 +42,11 @@ def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatc
 )
 def test_a_setting_that_a_generator_does_not_know_is_refused(name, setting, way_out):
     ((key, value),) = setting.items()
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as caught:
         GeneratorOptions(name, setting).settings()
-    assert f"{name!r} knows no {key} ({value})" in str(told.value)
-    assert way_out in str(told.value)
-    assert told.value.argument == f"generator_{key}"
+    assert f"{name!r} has no setting {key} ({value})" in str(caught.value)
+    assert way_out in str(caught.value)
+    assert caught.value.argument == f"generator_{key}"
 
 
 def test_the_settings_of_another_generator_are_refused():
@@ -67,9 +67,9 @@ def test_the_settings_of_another_generator_are_refused():
     ],
 )
 def test_values_that_mean_nothing_are_refused(key, value, message):
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as caught:
         load_generator("pe-field", settings=PEFieldSettings(**{key: value}))
-    assert told.value.argument == f"generator_{key}"
+    assert caught.value.argument == f"generator_{key}"
 
 
 def test_the_command_refuses_them_too_and_writes_nothing(tmp_path, capsys, monkeypatch):
@@ -77,9 +77,11 @@ def test_the_command_refuses_them_too_and_writes_nothing(tmp_path, capsys, monke
     photographed(tmp_path, cameras)
     words = ["complete", tmp_path, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]
     assert run(monkeypatch, *words, "--generator-batch-size", 8) == 2
-    said = capsys.readouterr().err
-    assert "'warp-inpaint' knows no batch_size (8); leave that out, or choose pe-field" in said
-    assert "(--generator-batch-size)." in said
+    printed = capsys.readouterr().err
+    assert (
+        "'warp-inpaint' has no setting batch_size (8); leave it out, or choose pe-field" in printed
+    )
+    assert "(--generator-batch-size)." in printed
     assert not (tmp_path / "out").exists()
 
 
@@ -109,12 +111,12 @@ def test_gate_licence_and_missing_pin_are_named_before_a_download_and_a_folder_n
     announce([Source(place=str(tmp_path))])
     assert capsys.readouterr().err == ""
     announce([KONTEXT, PE_FIELD])
-    said = capsys.readouterr().err
-    assert "https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev" in said
-    assert "must be accepted on its page" in said
-    assert "https://huggingface.co/yunpeng1998/PE-Field" in said
-    assert said.count("pins nothing") == 2
-    assert said.count("Non-Commercial") + said.count("non-commercial") == 2
+    printed = capsys.readouterr().err
+    assert "https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev" in printed
+    assert "must be accepted on its page" in printed
+    assert "https://huggingface.co/yunpeng1998/PE-Field" in printed
+    assert printed.count("is not pinned") == 2
+    assert printed.count("Non-Commercial") + printed.count("non-commercial") == 2
 
 
 def test_what_is_read_twice_is_announced_once(capsys):
@@ -124,17 +126,21 @@ def test_what_is_read_twice_is_announced_once(capsys):
 
 
 def test_the_sentence_names_what_did_not_load_and_how_to_mend_it(tmp_path):
-    def said(source: Source, error: Exception, setting: str = "weights") -> str:
+    def message_for(source: Source, error: Exception, setting: str = "weights") -> str:
         return str(cannot_load(source, error, setting))
 
     lost = IncompleteWeightsError("vae", ["a", "b", "c"])
-    assert "its vae lacks the tensor a and 2 more" in said(PE_FIELD, lost)
-    assert "accepted its terms" not in said(PE_FIELD, lost)
-    assert "yunpeng1998/PE-Field" in said(PE_FIELD, lost)
-    assert "accepted its terms at https://huggingface.co/black" in said(KONTEXT, OSError("gated"))
+    assert "its vae lacks the tensor a and 2 more" in message_for(PE_FIELD, lost)
+    assert "accepted its terms" not in message_for(PE_FIELD, lost)
+    assert "yunpeng1998/PE-Field" in message_for(PE_FIELD, lost)
+    assert "accepted its terms at https://huggingface.co/black" in message_for(
+        KONTEXT, OSError("gated")
+    )
     depth = source_of("somebody/depth", "transformers")
-    assert "give a folder as its depth" in said(depth, OSError("?"), "depth")
-    assert "see that it is complete" in said(source_of(str(tmp_path)), OSError("no config.json"))
+    assert "give a folder as its depth" in message_for(depth, OSError("?"), "depth")
+    assert "see that it is complete" in message_for(
+        source_of(str(tmp_path)), OSError("no config.json")
+    )
     with pytest.raises(InputError, match="a folder that transformers saved"):
         source_of("nothing", "transformers")
 

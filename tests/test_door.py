@@ -1,4 +1,4 @@
-"""The door of `complete`: sizes, chosen frames, what is said first, and a user's own file."""
+"""Input of `complete`: sizes, chosen frames, the printed summary, and a user's splat."""
 
 import json
 import re
@@ -33,7 +33,7 @@ TARGET = 2
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
-    """A room photographed from five places, of which frame 3 shows the other side."""
+    """Return a room photographed from five places, of which frame 3 shows the other side."""
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in PLACES]
     return photographed(tmp_path_factory.mktemp("door"), cameras)
 
@@ -44,7 +44,7 @@ def complete(scene: Path, out: Path, *more: object) -> list[object]:
 
 @pytest.fixture(scope="module")
 def chosen(scene, tmp_path_factory) -> tuple[Path, list[str]]:
-    """The output where no context was named, and what was said before the work."""
+    """Return the output without named context, and the lines before the work."""
     out = tmp_path_factory.mktemp("runs") / "out"
     with pytest.MonkeyPatch.context() as monkeypatch:
         said: list[str] = []
@@ -112,7 +112,7 @@ def test_four_lines_come_before_the_work(scene, chosen):
 
 
 def opened_with(scene: Path, *words: object) -> tuple[CompleteOptions, Task]:
-    """What is asked of `scene`, and what is to be done there; nothing is completed."""
+    """Open `scene` with these options; nothing is completed."""
     options = parsed([str(word) for word in ("complete", scene, *words, "--out", "OUT")])
     photographs = open_photographs(scene, near=0.5, far=20.0)
     return options, read_task(options, Opened(photographs, "nerfstudio", 5), "cpu")
@@ -126,7 +126,7 @@ def test_fewer_photographs_are_chosen_where_there_is_no_memory_for_more(scene, m
         assert len(task.views) == chosen
         said = budget_line(options, task, "cpu")
         assert said.startswith(f"at most {chosen} of 4 photographs for the context")
-        assert (", for there is no memory for 3 (" in said) == (chosen < 3)
+        assert (" (memory is too small for 3) (" in said) == (chosen < 3)
     for memory in (needed_bytes(pixels, 3), needed_bytes(pixels, 3) - 1):
         monkeypatch.setattr("gscompleter.memory.memory_bytes", lambda memory=memory: memory)
         assert images_that_fit(pixels) == (3 if memory == needed_bytes(pixels, 3) else 2)
@@ -179,20 +179,20 @@ def test_too_few_photographs_beside_the_targets_are_refused(scene, tmp_path, mon
     words = ["complete", scene, "--out", tmp_path / "out", "--target", 0, 1, 2, 3]
     assert run(monkeypatch, *words) == 2
     assert (
-        "Besides the targets there is 1 photograph that can be used, and at least 2 are needed;"
+        "1 usable photograph is left without the targets, and the context needs at least 2;"
     ) in capsys.readouterr().err
     assert run(monkeypatch, *words, 4) == 2
     assert (
-        "Besides the targets there are 0 photographs that can be used, and at least 2 are needed;"
+        "0 usable photographs are left without the targets, and the context needs at least 2;"
     ) in capsys.readouterr().err
 
 
 SMALL = ("--resolution", 32, "--config.reconcile.iterations", 10, "--quiet", "--no-prune")
-"""Where what is completed matters less than that it is."""
+"""Options of fast runs whose result does not matter."""
 
 
 def foreign(given: Path, path: Path) -> Path:
-    """The same Gaussians as another program writes them: a comment, normals, columns of its own."""
+    """Write the Gaussians like another program: a comment, normals, extra columns."""
     vertex = plyfile.PlyData.read(str(given))["vertex"].data
     names = list(vertex.dtype.names)
     rows = np.zeros(len(vertex), [("label", "<i4"), *((name, "<f4") for name in reversed(names))])
@@ -239,7 +239,7 @@ def test_rows_that_were_dropped_stay_out_of_the_users_layout(scene, chosen, tmp_
 
 
 def test_a_splat_with_infinite_logits_keeps_its_bytes(scene, chosen, tmp_path, monkeypatch, capsys):
-    """It is opaque there, which is said once; its rows stay as they are, and so does the file."""
+    """Such Gaussians are opaque. A note says so, and the file keeps its rows."""
     given = foreign(chosen[0] / "context.ply", tmp_path / "given.ply")
     data = plyfile.PlyData.read(str(given), mmap=False)
     data["vertex"].data["opacity"][[3, 8]] = np.inf, -np.inf
@@ -248,7 +248,7 @@ def test_a_splat_with_infinite_logits_keeps_its_bytes(scene, chosen, tmp_path, m
     aloud = [word for word in SMALL if word != "--quiet"]
     assert run(monkeypatch, *complete(scene, out, *aloud, "--scene", given)) == 0
     said = capsys.readouterr().err
-    assert said.count("1 have a logit of opacity of +infinity and 1 of -infinity") == 1
+    assert said.count("Gaussians have an opacity logit of +infinity and 1 of -infinity") == 1
     rows = plyfile.PlyData.read(str(out / "completed.ply"))["vertex"].data
     assert rows["opacity"][rows["generated"] == 0].tobytes() == data["vertex"]["opacity"].tobytes()
     assert load_ply(out / "context.ply").opacities[[3, 8]].tolist() == pytest.approx([1, 0])
@@ -296,7 +296,7 @@ def test_evaluate_tells_the_notes_of_what_it_opens_once(tmp_path):
 
 
 def test_a_splat_is_doubted_by_photographs_that_are_near_and_by_some_from_everywhere():
-    """Half of them stand beside the target; of a path that is long, no stretch goes without."""
+    """Half of the check views are near the target, the others spread over a long path."""
     path = {2 * n: camera_at(0.1 * n) for n in range(60)}
     chosen = near_and_far([camera_at(0.45)], path, 16)
     assert chosen == sorted(set(chosen))

@@ -1,4 +1,4 @@
-"""Driving data sets on real files: cameras where the files put them, and their sweeps as depth."""
+"""Driving data sets on real files: camera poses, and sweeps as depth."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def write_sweep(path: Path, points: np.ndarray) -> None:
 
 
 def nuscenes(shared: Path, folder: Path) -> tuple[Path, dict]:
-    """The real infos of one sample, beside photographs of the size that nuScenes has."""
+    """Write the real infos of one sample, beside photographs of nuScenes size."""
     info = folder / "info.pkl"
     shutil.copy(real(shared, "nuscenes_mmdet3d/info.pkl"), info)
     content = load_plain(info)
@@ -127,7 +127,7 @@ def test_a_pickle_of_anything_but_plain_values_is_refused(tmp_path, name):
 def test_a_pickle_runs_nothing(tmp_path):
     path, marker = tmp_path / "infos.pkl", tmp_path / "made"
     path.write_bytes(pickle.dumps({"data_list": [Evil(marker)]}))
-    with pytest.raises(InputError, match=r"it asks for posix\.mkdir"):
+    with pytest.raises(InputError, match=r"it names posix\.mkdir"):
         open_photographs(path)
     assert not marker.exists()
 
@@ -166,7 +166,7 @@ def test_kitti_odometry_with_a_sweep(shared, tmp_path):
 
 
 def raw_drive(shared: Path, folder: Path) -> Path:
-    """A drive whose calibrations are real, but for what the files lack: 20 m north in two steps."""
+    """Write a drive with real calibrations that moves 20 m north in two steps."""
     cameras = real(shared, "kitti/raw_calib_cam_to_cam.partial.txt").read_text().rstrip("\n")
     rectify = "R_rect_00: 1 0 0 0 1 0 0 0 1"
     (folder / "calib_cam_to_cam.txt").write_text(
@@ -262,7 +262,7 @@ POSE = {
         "z": -0.26473513174921903,
     },
 }
-"""As PandaSet publishes the first pose of a front camera."""
+"""First pose of a front camera as PandaSet publishes it."""
 
 
 def pandaset(folder: Path) -> Path:
@@ -289,7 +289,7 @@ def test_a_sequence_of_pandaset_begins_with_its_front_camera(tmp_path):
     assert center == pytest.approx([*POSE["position"].values()], abs=1e-6)
     (clip,) = open_clips(tmp_path / "002")
     assert len(clip) == 2
-    assert any("pickles of pandas" in note for note in clip.notes)
+    assert any("pandas pickles" in note for note in clip.notes)
 
 
 def test_a_sequence_of_pandaset_with_damaged_poses_is_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""The vehicle that carries the camera: it stays the same while the camera moves."""
+"""Detection of the vehicle that carries the camera, which is fixed in the image."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ Painter = Callable[[Tensor, int], Tensor]
 
 
 def bonnet(size: int = SIZE, height: float = 0.17) -> Tensor:
-    """Mask of a bonnet: arched, over the bottom of the image."""
+    """Return the mask of an arched bonnet at the bottom of the image."""
     x = torch.linspace(-1, 1, size)
     top = size * (1 - height + 0.07 * x.abs() ** 2.5)
     return torch.arange(size)[:, None] + 0.5 >= top
 
 
 def with_bonnet(image: Tensor, number: int) -> Tensor:
-    """A photograph with a bonnet that reflects what is above it, with seams, and noisy."""
+    """Render a noisy bonnet with reflections and seams into a photograph."""
     size = image.shape[0]
     shade = 0.05 + 0.2 * torch.linspace(-1, 1, size)[:, None, None] ** 2
     paint = torch.where((torch.arange(size) % 40 == 3)[None, :, None], 0.3, shade)
@@ -57,7 +57,7 @@ def untouched(image: Tensor, number: int) -> Tensor:
 
 
 def with_even_road(image: Tensor, number: int) -> Tensor:
-    """A photograph of a road of one colour between kerbs that lead to the vanishing point."""
+    """Render an even road between kerbs that lead to the vanishing point."""
     size = image.shape[0]
     y, x = torch.arange(size)[:, None] + 0.5, torch.arange(size)[None] + 0.5
     on_road = (x - size / 2).abs() < 0.9 * (y - size / 2)
@@ -67,7 +67,7 @@ def with_even_road(image: Tensor, number: int) -> Tensor:
 def drive(
     folder: Path, paint: Painter = with_bonnet, cameras: Sequence[Camera] | None = None
 ) -> Photographs:
-    """A clip of a straight drive down the street."""
+    """Return a clip of a straight drive down the street."""
     folder.mkdir(exist_ok=True)
     given = cameras or [camera_at(z=STEP * n, size=SIZE) for n in range(COUNT)]
     names = [f"{number:02}.png" for number in range(len(given))]
@@ -126,7 +126,7 @@ def test_nothing_is_told_without_a_drive(tmp_path, cameras):
 
 
 def test_each_camera_of_a_vehicle_is_looked_at_alone(tmp_path):
-    """The bonnet is before one of two cameras, whose photographs alternate."""
+    """The bonnet is visible to one of two cameras, whose photographs alternate."""
     places = [STEP * n for n in range(COUNT)]
     both = [camera_at(z=z, size=SIZE, focal=focal) for z in places for focal in (0.7, 0.9)]
     alternating = drive(

@@ -1,4 +1,4 @@
-"""A sentence quotes what was given, and stays a sentence."""
+"""Quotes of the input in sentences."""
 
 from pathlib import Path
 
@@ -109,7 +109,7 @@ def test_every_reader_tells_a_pointer_of_git_lfs_in_the_same_words(tmp_path):
 
 
 def old_name() -> None:
-    """A function of the public interface that has a new name."""
+    """Act as a public function under an old name."""
     warn_deprecated("witnesses=", "check_views=")
 
 

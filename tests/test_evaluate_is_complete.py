@@ -22,7 +22,7 @@ TARGET = camera_at(0.5, -0.5, yaw=10, size=SIZE)
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A room in which something moved between frames 0 and 1; frame 2 is the target."""
+    """Make a room with an object that moves between frames 0 and 1; frame 2 is the target."""
     folder = tmp_path_factory.mktemp("moving")
     views = [*photographed()[0], view_of(ROOM, TARGET)]
     names = [f"{number}.png" for number in range(len(views))]

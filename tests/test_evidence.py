@@ -1,4 +1,4 @@
-"""What supports a Gaussian, by compiled loops and by plain tensors."""
+"""Trust in Gaussians, by compiled loops and by plain tensors."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from scenes import camera_at, random_gaussians
 
 
 def some_evidence(n: int, k: int) -> tuple[Evidence, torch.Tensor, torch.Tensor]:
-    """Of n Gaussians and k photographs, with the means and what a camera sees; a third of each is
-    nothing."""
+    """Make evidence of n Gaussians and k photographs, their means and sums; a third is zero."""
     random = torch.Generator().manual_seed(0)
     centers, means = torch.randn(k, 3, generator=random), torch.randn(n, 3, generator=random)
     areas, agreement = torch.rand(2, k, n, generator=random)
@@ -27,7 +26,7 @@ def some_evidence(n: int, k: int) -> tuple[Evidence, torch.Tensor, torch.Tensor]
 
 
 def expected_support(evidence, means, sums, camera, config):
-    """The docstring of `stages/support.py` in plain tensors of twice the precision."""
+    """Evaluate the definition in `stages/support.py` in plain tensors of twice the precision."""
     rays = normalize(means - camera.center, dim=-1).double()
     seen = normalize(means[None] - evidence.centers[:, None], dim=-1).double()
     turn = torch.rad2deg(torch.acos((seen * rays).sum(-1).clamp(-1, 1)))

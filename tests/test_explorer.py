@@ -1,4 +1,4 @@
-"""Targets found by itself, on a room of which the right of it was never seen."""
+"""Targets chosen by the planner, in a room whose right part was never observed."""
 
 from dataclasses import replace
 
@@ -161,7 +161,7 @@ def test_nothing_is_added_before_what_a_bystander_sees(begun):
 
 
 def nearer(scene: Gaussians, before: Gaussians, camera: Camera) -> float:
-    """Share of what a camera saw of a scene before that something new hides."""
+    """Compute the fraction of a camera's view that new Gaussians occlude."""
     renderer = load_renderer("cpu")
     seen, now = renderer.render(before, camera).depth_map(), renderer.render(scene, camera)
     return (seen.valid & (now.depth < 0.9 * seen.depth)).float().mean().item()

@@ -1,4 +1,4 @@
-"""Ψ without weights, of photographs that were exposed differently: one even scene."""
+"""Plane-sweep Ψ on differently exposed photographs: one scene of normalized exposure."""
 
 from dataclasses import replace
 
@@ -17,20 +17,20 @@ from scenes import Room, camera_at, view_of
 
 SIZE = 64
 EXPOSURES = torch.tensor([[1.2, 1.2, 1.2], [0.8, 0.8, 0.8], [1.0, 1.1, 0.9], [0.9, 1, 1.12]])
-"""Of four photographs; the last two differ by their white balance, too."""
+"""Exposures of four photographs; the last two differ in white balance, too."""
 PLACES = (-0.4, -0.2, 0.2, 0.4)
-"""Where they are taken."""
+"""Camera positions."""
 GAINS = EXPOSURES / EXPOSURES.log().mean(dim=0).exp()
-"""Relative to the mean of all."""
+"""Exposures relative to their mean."""
 
 
 def even_views(size: int = SIZE) -> list[View]:
-    """What the cameras see, in one exposure."""
+    """Views of the cameras in one exposure."""
     return [view_of(Room(), camera_at(x, size=size)) for x in PLACES]
 
 
 def photographs(size: int = SIZE) -> list[View]:
-    """The same as the cameras take it: each exposed on its own, white where too bright."""
+    """The same views with individual exposures, clipped at white."""
     return [
         replace(view, image=(view.image * exposure).clamp(0, 1))
         for view, exposure in zip(even_views(size), EXPOSURES, strict=True)
@@ -38,7 +38,7 @@ def photographs(size: int = SIZE) -> list[View]:
 
 
 def found_gains(views: list[View]) -> np.ndarray:
-    """What perfect stereo tells of their gains."""
+    """Gains that perfect stereo gives."""
     rig = rig_of(views)
     inverses = [np.float32(rig.unit) / view.depth.numpy() for view in views]
     layers = [Layer(i, d, np.ones_like(d)) for i, d in zip(rig.images, inverses, strict=True)]
@@ -46,7 +46,7 @@ def found_gains(views: list[View]) -> np.ndarray:
 
 
 def at_best_gain(image: torch.Tensor, truth: torch.Tensor) -> float:
-    """PSNR in dB after the one gain for all pixels and channels that suits `truth` best."""
+    """Compute the PSNR in dB after the best single gain for all pixels and channels."""
     return psnr(image * (image * truth).sum() / image.square().sum(), truth)
 
 
@@ -57,7 +57,7 @@ def made():
 
 @pytest.fixture(scope="module")
 def uneven():
-    """What is made of the same photographs by who takes them for alike."""
+    """Reconstruction of the same photographs without exposure correction."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(splatter, "gains_of", lambda layers, _: np.ones((len(layers), 3)))
         return PlaneSweep()(photographs())
@@ -104,16 +104,16 @@ def test_the_scene_has_one_exposure_and_shows_places_between_better(made, uneven
         even, mixed = (renderer.render(m.gaussians, truth.camera).image for m in (made, uneven))
         assert at_best_gain(even, truth.image) > at_best_gain(mixed, truth.image) + 0.5
         ratios.append((even * truth.image).sum((0, 1)) / even.square().sum((0, 1)))
-    # By channel, what is drawn is as much too dark here as there.
+    # Each channel has the same error of brightness at all positions.
     assert (torch.stack(ratios).amax(0) / torch.stack(ratios).amin(0)).max() < 1.012
 
 
 def test_each_photograph_is_what_is_drawn_times_its_gain(made):
     renderer = load_renderer("cpu")
     for view, gain in zip(photographs(), made.gains, strict=True):
-        drawn = renderer.render(made.gaussians, view.camera).image
-        assert psnr(gain * drawn, view.image) > 26
-        assert psnr(drawn, view.evened(gain).image) > 26
+        image = renderer.render(made.gaussians, view.camera).image
+        assert psnr(gain * image, view.image) > 26
+        assert psnr(image, view.evened(gain).image) > 26
 
 
 def test_two_photographs_keep_their_exposures():

@@ -49,14 +49,14 @@ NETWORKS = ("mvsplat", "small-s1-u4-l4")
 
 @cache
 def network(name: str) -> MVSplat | DepthSplat:
-    """With the weights of the fixtures. Do not change it: take `changed`."""
+    """Return the shared network with the fixtures' weights; copy it with `changed` to modify it."""
     if name == "mvsplat":
         return with_rule_v1(MVSplat(), "mvsplat")
     return with_rule_v1(DepthSplat(VARIANTS[ARCHITECTURES[name]]), "depthsplat")
 
 
 def changed(name: str, config: MVSplatConfig | DepthSplatConfig | None = None, **biases: float):
-    """The network with another configuration, and with all values of some biases replaced."""
+    """Copy the network with another configuration and constant values for some biases."""
     same = deepcopy(network(name))
     if config is not None:
         weights = same.state_dict()
@@ -68,7 +68,7 @@ def changed(name: str, config: MVSplatConfig | DepthSplatConfig | None = None, *
 
 
 def check(path: Path, name: str) -> None:
-    """The network gives what the authors' gave, between the layers and at the end."""
+    """Compare intermediate and final values with those of the authors' code."""
     case = Case.load(path)
     run = Pass.through(network(name), case.images, case.cameras)
     between = run.of_mvsplat() if name == "mvsplat" else run.of_depthsplat()
@@ -187,7 +187,7 @@ def test_harmonics_of_degree_one_have_their_pole_along_y():
 
 
 def camera_pair(near: float = 1.0, far: float = 100.0) -> Cameras:
-    """Two cameras side by side, 0.4 apart."""
+    """Create two parallel cameras, 0.4 apart."""
     c2w = torch.eye(4).repeat(1, 2, 1, 1)
     c2w[0, 1, 0, 3] = 0.4
     K = torch.tensor([[0.9, 0.0, 0.5], [0.0, 0.9, 0.5], [0.0, 0.0, 1.0]])
@@ -279,14 +279,14 @@ def test_depth_stays_within_the_range_of_each_view(name):
 
 
 def silent(*layers: torch.nn.Module) -> None:
-    """Let layers say 0 whatever they are given."""
+    """Set weights and biases of layers to 0."""
     for layer in layers:
         for weight in layer.parameters():
             torch.nn.init.zeros_(weight)
 
 
 def ranged_pair() -> Cameras:
-    """Each view with a depth range of its own."""
+    """Create two views with different depth ranges."""
     near, far = torch.tensor([[1.0, 2.0]]), torch.tensor([[50.0, 80.0]])
     return replace(camera_pair(), near=near, far=far)
 
@@ -364,7 +364,7 @@ def test_scenes_of_a_batch_do_not_know_of_each_other(name):
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_gaussians_move_with_the_cameras(name):
-    """Only the frame changes: where the cameras stand as a whole tells nothing of the scene."""
+    """Only the frame changes: the network is invariant to a common motion of the cameras."""
     here = camera_pair()
     turned = random_rotations(1)[0].float()
     move = torch.eye(4)
@@ -396,7 +396,7 @@ def test_geometry_stays_exact_where_the_network_runs_in_lower_precision(name):
 
 
 def off_centre(x: float, height: int, width: int, **known: float | None) -> View:
-    """A photograph whose principal point lies beside the centre and whose size fits no patch."""
+    """Create a view with an off-centre principal point, not divisible into patches."""
     camera = camera_at(x, y=0.1 * x, yaw=5 * x, size=width)
     K = torch.tensor([[70.0, 0.0, 0.47 * width], [0.0, 66.0, 0.56 * height], [0.0, 0.0, 1.0]])
     return view_of(Room(), replace(camera, K=K, height=height, **known))
@@ -494,7 +494,7 @@ def test_wrong_views_are_refused_with_a_sentence():
         model([view])
     with pytest.raises(InputError, match="15 x 64 pixels in common, .* needs at least 16 x 16"):
         model([view, off_centre(0, 15, 80)])
-    with pytest.raises(InputError, match="cpu and torch.bfloat16 was asked for"):
+    with pytest.raises(InputError, match="cpu and torch.bfloat16 needs a GPU"):
         FeedForward(network("mvsplat"), torch.bfloat16)
 
 
@@ -510,7 +510,7 @@ def test_variants_need_the_patches_they_were_trained_with():
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_smoke_a_completion_runs_with_random_weights(name):
-    """It says nothing of quality: only that all stages take what such a model gives."""
+    """Random weights: this only checks that all stages accept the output."""
     views = [view_of(Room(), camera_at(x, size=64), i) for i, x in enumerate((-0.3, 0.1))]
     target = camera_at(0.7, yaw=12, size=64)
     completion = GSCompleter(reconstructor=FeedForward(network(name)))(views, target)

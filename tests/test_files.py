@@ -1,4 +1,4 @@
-"""Writing happens completely or leaves things as they were, whatever stops it."""
+"""Writing is complete or leaves things as they were, whatever stops it."""
 
 import contextlib
 import errno
@@ -16,14 +16,14 @@ from gscompleter.io.files import check_output, output_folder, replacing
 
 
 def tree(folder: Path) -> dict[str, str]:
-    """Every file below `folder` with its text."""
+    """Read every file below `folder` as text."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {str(path.relative_to(folder)): path.read_text() for path in files}
 
 
 @pytest.fixture
 def results(tmp_path) -> Path:
-    """The results of an earlier run, beside a file of the user's."""
+    """Write the results of an earlier run, beside a file of the user's."""
     out = tmp_path / "out"
     (out / "images").mkdir(parents=True)
     for name in ("mine.txt", "completed.ply", "images/old.png", "summary.json"):
@@ -237,7 +237,7 @@ with output_folder(out, overwrite=True) as folder:
 
 @contextlib.contextmanager
 def writing(out: Path, renames: int = -1) -> Iterator[subprocess.Popen]:
-    """A process that writes to `out` and waits: before it publishes, or after so many renames."""
+    """Start a process that writes to `out` and waits, before it publishes or after renames."""
     command = [sys.executable, "-c", WRITES, str(out), str(renames)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

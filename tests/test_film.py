@@ -1,4 +1,4 @@
-"""The film of a completion: its way, its frames, and the file."""
+"""The video of a completion: path, frames and file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 
 def pitched(camera: Camera, degrees: float) -> Camera:
-    """`camera` looking so much further down."""
+    """Tilt a camera downwards."""
     angle = math.radians(degrees)
     cos, sin = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[1, 0, 0], [0, cos, sin], [0, -sin, cos]])
@@ -41,14 +41,14 @@ def pitched(camera: Camera, degrees: float) -> Camera:
 
 
 def on_a_circle(degrees: float) -> Camera:
-    """A camera that stands a unit away from (0, 0, 0), which it looks at."""
+    """Return a camera one unit from the origin that faces it."""
     angle = math.radians(degrees)
     return camera_at(math.sin(angle), 0, -math.cos(angle), -degrees, size=SIZE)
 
 
 @pytest.fixture(scope="module")
 def completion() -> Completion:
-    """A room of which the right half was added at a target beside the only photograph."""
+    """A room whose right half was added at a target beside the only photograph."""
     camera = camera_at(size=SIZE)
     view, context, right = half_a_room_of(Room(), camera)
     target = camera_at(0.4, yaw=6, size=SIZE)
@@ -60,7 +60,7 @@ def completion() -> Completion:
 
 
 def decoded(path: Path) -> tuple[dict, np.ndarray]:
-    """What a file says of itself, and its frames [n, h, w, 3]."""
+    """Read the metadata and the frames [n, h, w, 3] of a video."""
     reader = imageio_ffmpeg.read_frames(str(path))
     meta = next(reader)
     width, height = meta["size"]

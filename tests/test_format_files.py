@@ -17,7 +17,7 @@ OPENED = {
     "re10k/000000.torch": (93, None, 640),
     "waymo_mmdet3d/waymo_infos_val.pkl": (1, 2059.0, 1920),
 }
-"""How many frames, the focal length of the first one where no lens is removed, and its width."""
+"""Number of frames, focal length of the first one (None with distortion), and its width."""
 
 NOTHING = "There are no posed photographs in"
 NO_FRAMES = "lists no frames"
@@ -62,8 +62,8 @@ REFUSED = {
     "lfs_pointers/point_cloud.ply": NOTHING,
     "lfs_pointers/splat.ply": NOTHING,
     "llff": NOTHING,
-    "llff/gnomes_poses_bounds.npy": "has 103 rows, which belong to as many photographs",
-    "llff/liberty_poses_bounds.npy": "has 135 rows, which belong to as many photographs",
+    "llff/gnomes_poses_bounds.npy": "has 103 rows, one per photograph",
+    "llff/liberty_poses_bounds.npy": "has 135 rows, one per photograph",
     "NOTES.md": NOTHING,
     "nuscenes_mmdet3d/info.pkl": "size of the photograph of CAM_FRONT at .* is not known",
     "re10k/0d4de33c6888a754.head.txt": "size of frame 0 of .* is not known",
@@ -86,7 +86,7 @@ SPLATS = {
     "gaussians/playbot_sog": (8_406, 2, (-0.01, -0.02, -0.02)),
     "gaussians/playbot_sog/meta.json": (8_406, 2, (-0.01, -0.02, -0.02)),
 }
-"""As files of Gaussians: how many, the degree of their harmonics, the medians of their means."""
+"""Number of Gaussians, SH degree, and medians of the means."""
 
 UNKNOWN = "holds no Gaussians in a format that is known"
 OTHER_JSON = r"is no \.sog: its .* describes something else"
@@ -105,7 +105,7 @@ NO_SPLATS = {
     "nerfstudio_fox/transforms.json": OTHER_JSON,
     "re10k/000000.torch": OTHER_ZIP,
 }
-"""As files of Gaussians; what is in neither table is `UNKNOWN`."""
+"""Errors of files without Gaussians; those in neither table raise `UNKNOWN`."""
 
 
 def place(shared: Path, name: str) -> Path:

@@ -1,4 +1,4 @@
-"""The one door: every format gives the same views, and what is wrong is said."""
+"""All input formats give the same views, and errors are reported in a sentence."""
 
 import json
 from pathlib import Path
@@ -22,7 +22,7 @@ from pose_files import write_colmap_binary, write_photographs
 
 
 def save_camera_file(path: Path, frames: str | None = None, views: list[View] = VIEWS) -> Path:
-    """A RealEstate10K camera file; its photographs lie in the folder `frames` beside it."""
+    """Write a RealEstate10K camera file, with its photographs in the folder `frames` beside it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = ["https://www.youtube.com/watch?v=room"]
     for number, view in enumerate(views):
@@ -154,7 +154,7 @@ def test_a_camera_file_without_frames_is_named(tmp_path):
 
 
 def complete(monkeypatch, scene: Path, out: Path, *more: object) -> int:
-    """The exit code of `complete` for frame 2 of a scene."""
+    """Run `complete` for frame 2 of a scene and return its exit code."""
     where = ("--context", 0, 1, "--target", 2, "--out", out, "--quiet")
     return run(monkeypatch, "complete", scene, *where, *more)
 

@@ -1,4 +1,4 @@
-"""A splat in a frame that its trainer left word of; large splats, and remote photographs."""
+"""Splats in a frame described by a trainer's files; large splats, and remote photographs."""
 
 import json
 
@@ -58,7 +58,7 @@ def found_for(path, scene, room, origin=(0.0, 0.0, 0.0)):
 
 
 def write_cameras(path, transform, room, count=4):
-    """The list of cameras that a trainer leaves which worked in the frame of `transform`."""
+    """Write the camera list of a trainer that worked in the frame of `transform`."""
     entries = []
     for number, frame in enumerate(open_photographs(room).frames[:count]):
         pose = moved_pose(frame.c2w, transform)
@@ -71,7 +71,7 @@ def write_cameras(path, transform, room, count=4):
 
 
 def put_on_map(room, by):
-    """Add `by` to the places of all cameras."""
+    """Add `by` to the positions of all cameras."""
     content = json.loads((room / "transforms.json").read_text())
     for frame in content["frames"]:
         for row in range(3):
@@ -231,7 +231,8 @@ def test_little_of_a_flat_wall_is_no_sign():
 def test_details_that_are_off_are_told():
     off = SplatFrame("given", np.eye(4), fit_of(5.0, 5.0, drift=4.2), fit_of())
     assert off.sentence() == (
-        "The splat fits the photographs as it is, at 15.0 dB; but details are 4.2 px (of 320) off."
+        "The splat fits the photographs as it is, at 15.0 dB; but details are off by 4.2 px in "
+        "images of 320 px."
     )
 
 

@@ -1,4 +1,4 @@
-"""Where a user's splat lies: as given, as a trainer leaves it, or found by the images."""
+"""The frame of an input splat: as given, as normalised by a trainer, or found by the images."""
 
 import json
 from dataclasses import replace
@@ -65,7 +65,7 @@ def find(views, splat, transform=None, **more):
 
 
 def assert_takes_to(found, truth, tolerance):
-    """Both take the photographs' frame to the same one, to `tolerance` of the scene's unit."""
+    """Compare two transforms of the photographs' frame, to `tolerance` of the scene's unit."""
     assert np.abs(np.linalg.inv(truth) @ found - np.eye(4)).max() < tolerance
 
 

@@ -1,4 +1,4 @@
-"""What a photograph saw through stays empty."""
+"""Space that a photograph observed as empty stays empty."""
 
 from dataclasses import replace
 
@@ -17,13 +17,13 @@ TARGET, WITNESS = camera_at(0.5, size=SIZE), camera_at(-0.5, size=SIZE)
 
 
 def wall(depth: float, alpha: float = 1.0) -> Render:
-    """What a camera sees of a wall that fills its image."""
+    """Render a wall that fills the image of a camera."""
     shape = (SIZE, SIZE)
     return Render(torch.zeros(*shape, 3), torch.full(shape, depth), torch.full(shape, alpha))
 
 
 def floaters(depth: float) -> Gaussians:
-    """Small Gaussians before the target camera."""
+    """Make small Gaussians in front of the target camera."""
     x = torch.linspace(-0.3, 0.3, 7)
     means = torch.stack([x, 0 * x, torch.full((7,), depth)], dim=-1)
     return observed(
@@ -65,7 +65,7 @@ def test_what_finds_no_place_is_told():
 
 
 def test_a_gaussian_just_beyond_the_border_shows_and_is_judged_by_the_border(monkeypatch):
-    # 1 m before the witness, 1.5 pixels left of its image.
+    # 1 m in front of the camera, 1.5 pixels left of its image.
     x = (-1.5 - SIZE / 2) / WITNESS.K[0, 0].item() - 0.5
     just_outside = torch.tensor([[x, 0.0, 1.0]])
     far_outside = torch.tensor([[x - 1.0, 0.0, 1.0]])
@@ -88,7 +88,7 @@ def test_the_unit_of_the_scene_does_not_matter(unit):
 
 @pytest.mark.parametrize("behind", [4.0, 8.0 * WITNESS.far], ids=["a wall", "the sky"])
 def test_without_steps_nothing_is_checked(behind):
-    """Neither a surface nor the sky behind the candidates moves them."""
+    """Neither a surface nor the sky behind the Gaussians moves them."""
     candidates, config = floaters(2.0), FreeSpaceConfig(num_steps=0)
     moved, placed = respect_free_space(
         candidates, TARGET, [WITNESS], [wall(behind)], "constant", config
@@ -98,7 +98,7 @@ def test_without_steps_nothing_is_checked(behind):
 
 
 def test_nothing_stands_where_a_camera_stood():
-    """Behind the camera too, nearer to it than anything it sees: there it would fill the image."""
+    """No Gaussian is nearer to a camera than all that it sees, not even behind it."""
     behind = WITNESS.center + torch.tensor([[0.0, 0.0, -0.3], [0.0, 0.0, -0.6]])
     assert WITNESS.near == 0.5
     assert seen_through(behind, [WITNESS], [wall(4.0)]).tolist() == [True, False]

@@ -1,4 +1,4 @@
-"""A few of the mutations of `fuzz.py`, which by hand does thousands."""
+"""A few of the mutations of `fuzz.py`, which runs thousands by hand."""
 
 import re
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def test_mutated_inputs_end_in_a_sentence_or_a_result():
-    """In a process of its own, whose forks inherit no threads."""
+    """It runs in a process of its own, whose forks inherit no threads."""
     script = Path(__file__).parent / "fuzz.py"
     # A machine that is busy with other tests is no hang.
     words = ["--count", "40", "--seed", "1", "--workers", "2", "--limit", "120"]

@@ -1,4 +1,4 @@
-"""Φ: what was photographed is shown, what was not is filled plausibly, always the same way."""
+"""Φ: photographed surfaces are shown, holes are filled plausibly, and results are repeatable."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def within(mask: torch.Tensor, image: torch.Tensor, truth: torch.Tensor) -> floa
 
 
 def test_the_observed_part_is_sharper_than_the_render_and_the_hole_follows_its_border():
-    """Deep in the hole the room's texture of waves is anybody's guess; at its border it is not."""
+    """The wave texture is predictable only near the border of the hole."""
     context, truth = known_room(), view_of(Room(), TARGET).image
     image = synthesized(context)
     hole = context.at_target.alpha < 0.5
@@ -57,7 +57,7 @@ def test_the_observed_part_is_sharper_than_the_render_and_the_hole_follows_its_b
 
 
 def test_a_photograph_of_another_exposure_leaves_no_seam():
-    """The farther photograph is 1.3 times as bright; the surfaces both show tell."""
+    """The farther photograph is 1.3 times as bright; shared surfaces show the ratio."""
     truth = view_of(Room(), TARGET).image
     even, uneven = known_room(), known_room(gain=1.3)
     seen = even.at_target.alpha >= 0.5

@@ -1,4 +1,4 @@
-"""Rays and projection undo each other, and cameras know how they lie to each other."""
+"""Rays and projection undo each other, and relations between cameras are right."""
 
 import math
 
@@ -131,7 +131,7 @@ def test_of_the_two_ways_to_turn_the_shorter_one_is_shared():
 
 
 def test_what_a_camera_sees_within_a_mask_reaches_it():
-    """Large and small Gaussians around a camera, each of them opaque and drawn by itself."""
+    """Large and small Gaussians around a camera, each of them opaque and rendered by itself."""
     camera, mask = camera_at(size=32), torch.zeros(32, 32, dtype=torch.bool)
     mask[4:9, 20:30] = True
     gaussians = random_gaussians(120, seed=3)

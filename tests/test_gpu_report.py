@@ -1,4 +1,4 @@
-"""`make gpu` without a GPU: its parts run small on the CPU, and one that fails is a row."""
+"""`make gpu` without a GPU: its parts run small on the CPU, and a failed one is a row."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ main(parts, lambda: {{"device": "a test"}}, "Parts.")
 
 
 def call(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """The script as a person calls it, writing into `folder`."""
+    """Run the script as a user does, writing to `folder`."""
     script = folder / "script.py"
     script.write_text(SCRIPT.format(benchmarks=str(BENCHMARKS)))
     command = [sys.executable, str(script), "--out", str(folder), *options]
@@ -69,7 +69,7 @@ def test_a_part_that_fails_or_never_ends_is_a_row_and_the_rest_goes_on(tmp_path)
     assert (first["what"], first["value"], first["failed"]) == ("first", 1.0, False)
     assert reason["failed"]
     assert reason["note"] == "ValueError: no / such kernel"
-    assert [row["note"] for row in rows["needy"]] == ["left out, for 'Fails' failed"]
+    assert [row["note"] for row in rows["needy"]] == ["left out, because 'Fails' failed"]
     assert [row["value"] for row in rows["endless"]] == [2.0, None]
     assert rows["endless"][1]["note"] == "stopped after 3 s"
     assert rows["crash"][0]["failed"]
@@ -94,14 +94,14 @@ def test_all_parts_together_keep_to_their_time(tmp_path):
     parts = json.loads((tmp_path / "gpu.json").read_text())["parts"]
     for part in parts.values():
         assert [row["note"] for row in part["rows"]] == [
-            "left out, for the 0 s of all parts were over"
+            "left out, because the 0 s of all parts are over"
         ]
 
 
 def test_a_part_that_is_none_is_refused(tmp_path):
     done = call(tmp_path, "--only", "speed")
     assert done.returncode != 0
-    assert "no part 'speed'; choose of failing, needy" in done.stderr
+    assert "no part 'speed'; choose one of failing, needy" in done.stderr
     assert not (tmp_path / "gpu.json").exists()
 
 
@@ -130,7 +130,7 @@ def test_every_part_gives_rows(part):
     assert [row for row in rows if row.failed or row.value is None] == []
     if part == "agreement":
         assert max(row.value for row in rows if "image" in row.what) < 1e-2
-        assert max(row.value for row in rows if "slopes in sh" in row.what) < 1e-2
+        assert max(row.value for row in rows if "gradients in sh" in row.what) < 1e-2
 
 
 def test_every_reconstructor_completes_a_room_and_one_that_fails_is_a_row(monkeypatch):

@@ -1,4 +1,4 @@
-"""Stage 4: no photograph is matched worse for what is added."""
+"""Stage 4: additions make no photograph worse."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ CAMERA = camera_at(size=SIZE)
 
 
 def half_a_room():
-    """A context that lacks the right half of what the camera sees, and the right half."""
+    """Return a context that lacks the right half of a view, and the right half."""
     return half_a_room_of(ROOM, CAMERA)
 
 
@@ -36,12 +36,12 @@ def mse(view: View, limit: float) -> ErrorBudget:
 
 
 MENDED = PsnrGuardConfig(max_opacity_loss=None)
-"""However much it takes away."""
+"""Budgets without a limit on the lost opacity."""
 
 
 @pytest.mark.parametrize(("halvings", "removals"), [(0, 0), (0, 12), (16, 12)])
 def test_no_photograph_is_matched_worse_than_allowed(halvings, removals, monkeypatch):
-    """Gaussians of wrong colour stand in front of everything the camera sees."""
+    """Gaussians of wrong colour occlude everything that the camera sees."""
     view = view_of(ROOM, CAMERA)
     context = gaussians_of(view)
     harmful = replace(gaussians_of(view, torch.full((SIZE, SIZE), 1.0)), sh=-context.sh)
@@ -97,7 +97,7 @@ def test_drawings_that_are_known_already_are_asked_instead():
 
 
 def test_where_halving_does_not_help_only_the_worst_pixels_are_given_up(monkeypatch):
-    """Half of the image is filled rightly; something wrong stands before the other half."""
+    """Half of the image is filled correctly; something wrong occludes the other half."""
     view, context, added = half_a_room()
     frozen = load_renderer("cpu").freeze(context, CAMERA)
     near = gaussians_of(view, torch.full((SIZE, SIZE), 1.0))
@@ -111,7 +111,7 @@ def test_where_halving_does_not_help_only_the_worst_pixels_are_given_up(monkeypa
 
 
 def test_the_whole_photograph_is_judged_with_the_holes_of_the_context():
-    """A hole may not become worse by what is added in it."""
+    """Additions may not make a hole worse."""
     view, context, added = half_a_room()
     dark = replace(view, image=0.02 * view.image)
     frozen = load_renderer("cpu").freeze(context, CAMERA)
@@ -129,7 +129,7 @@ def test_the_whole_photograph_is_judged_with_the_holes_of_the_context():
 
 
 def test_what_keeps_psnr_but_loses_ssim_gives_way():
-    """A veil takes contrast away; only SSIM is limited."""
+    """A veil reduces contrast; only SSIM is limited."""
     view = view_of(ROOM, CAMERA)
     context = gaussians_of(view)
     frozen = load_renderer("cpu").freeze(context, CAMERA)

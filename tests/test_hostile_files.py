@@ -1,4 +1,4 @@
-"""Files that claim, hold or hide what they must not: one sentence each, and soon."""
+"""Files with false claims, too much or hidden content: one sentence each, and soon."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scenes import random_gaussians
 
 
 def sentence(call, *arguments) -> str:
-    """What the user is told."""
+    """Return the message of the error."""
     with pytest.raises(InputError) as error:
         call(*arguments)
     assert len(str(error.value)) < 1000
@@ -34,7 +34,7 @@ def sentence(call, *arguments) -> str:
 
 
 def ply(tmp_path: Path, ahead: str, file_format: str = "ascii") -> Path:
-    """A scene of one Gaussian behind another element."""
+    """Write a scene of one Gaussian behind another element."""
     path = tmp_path / "scene.ply"
     save_ply(path, random_gaussians(1))
     head, body = path.read_bytes().split(b"end_header\n")
@@ -91,7 +91,7 @@ def test_a_pipe_is_no_scene_and_nobody_waits_for_it(tmp_path):
 
 
 def png(width: int, height: int) -> bytes:
-    """A PNG that claims that size and holds one byte of it."""
+    """Write a PNG that claims this size and has one byte of it."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return (

@@ -1,4 +1,4 @@
-"""Photographs with poses that hold what they must not: a short sentence each, and soon."""
+"""Photographs with poses that have damaged files: a short sentence each, and soon."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pose_files import WRITERS, write_photographs
 
 
 def sentence(path: Path) -> str:
-    """Read all of a scene; return the error message."""
+    """Read all of a scene, and return the message of the error."""
     with pytest.raises(InputError) as error:
         read(path)
     assert len(str(error.value)) < LONGEST_MESSAGE
@@ -49,7 +49,7 @@ def endless() -> list[Any]:
 
 
 def repeated(times: int) -> list[Any]:
-    """A list of a few kilobytes that is endless when it is walked."""
+    """Create a list of a few kilobytes that is endless if it is traversed."""
     content: list[Any] = [0.0] * 10
     for _ in range(times):
         content = [content] * 10
@@ -174,7 +174,7 @@ def test_a_chunk_that_claims_more_than_there_is_room_for_is_refused(tmp_path):
     claimed = data.replace(b"M" + count.to_bytes(2, "little"), b"\x8a\x06" + b"\xff" * 5 + b"\x7f")
     assert claimed != data
     path.write_bytes(claimed)
-    assert "asks for more memory" in sentence(path)
+    assert "needs more memory" in sentence(path)
 
 
 def test_cameras_that_were_trained_are_read(tmp_path):

@@ -1,4 +1,4 @@
-"""Photographs that are ignored in part: nothing is made of it, and nothing held against it."""
+"""Ignored parts of photographs: nothing is made of them or compared with them."""
 
 from dataclasses import replace
 
@@ -30,14 +30,14 @@ RENDERER = load_renderer("cpu")
 
 
 def square(low: int = 12, high: int = 30) -> torch.Tensor:
-    """A square of pixels to ignore."""
+    """Make a square mask of ignored pixels."""
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     mask[low:high, low:high] = True
     return mask
 
 
 def with_something_red(view: View) -> View:
-    """The photograph, with something red that is to be ignored."""
+    """Take the photograph with a red object that is to be ignored."""
     mask = square()
     red = torch.tensor([1.0, 0.0, 0.0])
     return replace(view, image=torch.where(mask[..., None], red, view.image), ignored=mask)
@@ -61,7 +61,7 @@ def test_nothing_is_made_of_what_is_ignored(aligned):
 
 
 def test_what_is_ignored_forbids_nothing():
-    """What is added to the right half differs from a photograph that is black there."""
+    """Additions to the right half differ from a photograph that is black there."""
     view, context, added = half_a_room_of(ROOM, CAMERA)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     mask[:, SIZE // 2 :] = True
@@ -152,7 +152,7 @@ def box_at(center: tuple[float, ...], side: float, speed: float | None, turn: fl
 
 
 def test_a_box_covers_its_outline():
-    """A cube with its front face 2 ahead: 1.1 wide once it is widened, 0.55 to either side."""
+    """A cube with its front face 2 m ahead is widened to 1.1 m: 0.55 m to either side."""
     mask = covered([box_at((0.0, 0.0, 2.55), 1.0, 3.0)], CAMERA, CAMERA.center.double().numpy())
     half = 0.55 / 2.0 * 0.9 * SIZE
     rows, columns = torch.nonzero(torch.from_numpy(mask), as_tuple=True)

@@ -1,4 +1,4 @@
-"""Stage 4: only what lies in the holes, and only its opacities."""
+"""Stage 4: only Gaussians in holes are kept, and only opacities are refined."""
 
 from dataclasses import replace
 
@@ -54,12 +54,12 @@ def test_other_gaussians_are_kept_by_where_they_project():
 
 
 def half_a_room():
-    """A context that lacks the right half of what the camera sees, and the right half."""
+    """Return a context that lacks the right half of a view, and the right half."""
     return half_a_room_of(ROOM, CAMERA)
 
 
 def refined_by(added, frozen, reference, views, config=RefineConfig()):
-    """`added` refined at one camera, which the photographs were taken with, too."""
+    """Refine `added` at one camera, which also took the photographs."""
     plan = frozen.plan(added)
     return refine_opacities(added, plan, reference, [plan] * len(views), views, config)
 
@@ -79,7 +79,7 @@ def test_opacities_rise_where_the_hole_shows_and_nothing_else_moves(parametrizat
 
 
 def test_a_floater_before_a_photograph_loses_opacity():
-    """The photograph is black where the new Gaussians would show."""
+    """The photograph is black where the new Gaussians would be visible."""
     view, context, added = half_a_room()
     photograph = view.image.clone()
     photograph[:, SIZE // 2 :] = 0
@@ -91,7 +91,7 @@ def test_a_floater_before_a_photograph_loses_opacity():
 
 
 def test_refinement_ends_where_nothing_is_to_be_gained():
-    """The image at the target is the scene's own, and no photograph sees what is new."""
+    """The image at the target equals the render, and no photograph shows the new Gaussians."""
     _, context, added = half_a_room()
     frozen = load_renderer("cpu").freeze(context, CAMERA)
     shown = View(frozen.composite(added).image, CAMERA)

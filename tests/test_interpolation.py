@@ -1,4 +1,4 @@
-"""What is known in part is continued smoothly."""
+"""Values known in a part of an image are interpolated smoothly."""
 
 import torch
 

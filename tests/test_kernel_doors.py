@@ -1,6 +1,6 @@
-"""No number, however odd, makes a compiled loop read or write where it must not.
+"""No number, however odd, makes a compiled loop read or write out of bounds.
 
-What would crash the process is tried in another one.
+Cases that could crash the process run in another one.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ print(ran)
 
 
 def lines_of(code: str, *words: object) -> list[str]:
-    """What a process of its own says; a signal that kills it fails the test."""
+    """Run a process and return its lines; a signal that kills it fails the test."""
     command = [sys.executable, "-c", code, *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -102,13 +102,13 @@ def test_whatever_becomes_an_index_lies_within_the_image(odd):
 @pytest.mark.parametrize("size", [(0, 5), (-1, 5), (MAX_SIDE + 1, 5), (10**9, 10**9)])
 def test_an_image_that_cannot_be_numbered_is_refused(size):
     camera = unchecked(camera_at(size=16), width=size[0], height=size[1])
-    with pytest.raises(InputError, match="cannot be drawn"):
+    with pytest.raises(InputError, match="cannot be rendered"):
         CpuRenderer().render(random_gaussians(3), camera)
 
 
 def test_more_entries_than_can_be_numbered_are_refused(monkeypatch):
     monkeypatch.setattr("gscompleter.render.cpu.MAX_ENTRIES", 10)
-    with pytest.raises(InputError, match="take fewer or smaller ones"):
+    with pytest.raises(InputError, match="use fewer or smaller Gaussians"):
         CpuRenderer().render(random_gaussians(100), camera_at(size=64))
 
 

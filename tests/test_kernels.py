@@ -1,4 +1,4 @@
-"""What all compiled loops have in common: the same input gives the same bytes."""
+"""The same input gives the same bytes, for all compiled loops."""
 
 import os
 import subprocess
@@ -50,10 +50,10 @@ def test_kernels_of_others_find_blas_all_the_same():
 def test_a_process_that_compiles_and_one_that_finds_it_done_give_the_same_bytes(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", COMPLETE, str(Path(__file__).parent)]
-    said = []
+    outputs = []
     for _ in range(2):
         life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        said.append(life.stdout)
+        outputs.append(life.stdout)
     assert list(tmp_path.rglob("*.nbc"))
-    assert len(said[0].split()) == 12
-    assert said[0] == said[1]
+    assert len(outputs[0].split()) == 12
+    assert outputs[0] == outputs[1]

@@ -21,7 +21,7 @@ LENSES = {
 
 
 def opencv_matrix(pinhole: Pinhole) -> np.ndarray:
-    """Its intrinsics with the centre of the top-left pixel at (0, 0)."""
+    """Return its intrinsics with the centre of the top-left pixel at (0, 0)."""
     return np.array(
         [[pinhole.fl_x, 0, pinhole.cx - 0.5], [0, pinhole.fl_y, pinhole.cy - 0.5], [0, 0, 1]]
     )

@@ -1,4 +1,4 @@
-"""Numbers are checked once, at the door: what no pipeline could carry gets one sentence."""
+"""Validation of numbers in the input, with one sentence each."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ PLACES = ((-0.3, 0), (0.1, 0), (0.7, 12))
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory) -> Path:
-    """A synthetic room photographed from three places."""
+    """Return a synthetic room photographed from three places."""
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in PLACES]
     return photographed(tmp_path_factory.mktemp("room"), cameras)
 
 
 def changed(scene: Path, folder: Path, change) -> Path:
-    """A copy of a scene whose first frame was changed by `change(content, frame)`."""
+    """Copy a scene with its first frame changed by `change(content, frame)`."""
     shutil.copytree(scene, folder)
     content = json.loads((folder / "transforms.json").read_text())
     change(content, content["frames"][0])
@@ -36,7 +36,7 @@ def changed(scene: Path, folder: Path, change) -> Path:
 
 
 def refused(monkeypatch, capsys, scene: Path, *more, target: object = 2) -> str:
-    """What `complete` says of a scene, in one sentence; it exits with 2 and writes nothing."""
+    """Return the sentence of `complete`, which exits with 2 and writes nothing."""
     out = scene.parent / "out"
     where = ("--context", 0, 1, "--target", target, "--out", out)
     assert run(monkeypatch, "complete", scene, *where, *more) == 2
@@ -130,7 +130,7 @@ def test_a_photograph_on_its_side_is_refused(tmp_path):
         Image.new("RGB", (w, h)).save(tmp_path / "a.png")
         assert load_views(tmp_path)[0].camera.width == w
     Image.new("RGB", (20, 30)).save(tmp_path / "a.png")
-    with pytest.raises(InputError, match="is 20 × 30 pixels and its `w` and `h` say 60 × 40"):
+    with pytest.raises(InputError, match="has 20 × 30 pixels, but its `w` and `h` are 60 × 40"):
         load_views(tmp_path)
 
 
@@ -143,7 +143,7 @@ def test_a_strip_that_would_become_too_long_is_refused(tmp_path):
 
 
 def moved(scene: Path, folder: Path, by: tuple[float, float, float]) -> Path:
-    """A copy of a scene whose cameras all stand `by` farther on, written in float64."""
+    """Copy a scene with its cameras moved by `by`, in float64."""
     shutil.copytree(scene, folder)
     content = json.loads((folder / "transforms.json").read_text())
     for frame in content["frames"]:
@@ -181,7 +181,7 @@ def test_a_remote_scene_is_completed_around_a_local_origin(room, tmp_path, monke
     cameras["frames"] = cameras["frames"][2:]
     target.write_text(json.dumps(cameras))
     assert run(monkeypatch, "complete", far, *where, "--target", 2, target) == 0
-    assert "the result is relative to" in capsys.readouterr().out
+    assert "the result has its origin at" in capsys.readouterr().out
     summary = json.loads((out / "summary.json").read_text())
     assert summary["frame"]["method"] == "given"
     assert np.allclose(np.array(summary["frame"]["transform"])[:3, 3], -origin)

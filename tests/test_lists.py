@@ -17,7 +17,7 @@ RANDOM = np.random.default_rng(0)
 
 
 def some_splats(n: int, size: int) -> Splats:
-    """Boxes anywhere in an image, some of them empty, at depths many of which are equal."""
+    """Make boxes anywhere in an image, some of them empty, at depths of which many are equal."""
     columns = RANDOM.random((n, NUM_SPLAT_COLUMNS), np.float32)
     columns[:, DEPTH] = RANDOM.integers(1, 60, n) / np.float32(7)
     low, high = np.sort(RANDOM.integers(0, size + 1, (2, n, 2)), axis=0)
@@ -28,7 +28,7 @@ def some_splats(n: int, size: int) -> Splats:
 
 
 def expected_list(splats: Splats, tile: int, tiles_x: int, limit: float) -> list[int]:
-    """The splats that touch a tile up to a depth, stably sorted."""
+    """Sort the splats that touch a tile up to a depth, stably."""
     left, top = TILE * (tile % tiles_x), TILE * (tile // tiles_x)
     x_from, x_to, y_from, y_to = splats.boxes.astype(int).T
     inside = (x_from < left + TILE) & (x_to > left) & (y_from < top + TILE) & (y_to > top)

@@ -1,4 +1,4 @@
-"""`gscompleter live`, as far as no browser is needed: steps, undo, and what is saved."""
+"""`gscompleter live` without a browser: steps, undo and saving."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians
 SIZE = 48
 CAMERAS = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.4, 4))]
 HOLES = [camera_at(0.7, 0.1, 0.05, yaw=14, size=SIZE), camera_at(-0.7, yaw=-16, size=SIZE)]
-"""Where the room has holes, to the right and to the left of what is observed."""
+"""Cameras at holes of the room, to the right and to the left of the photographs."""
 ELSEWHERE = similarity(
     0.3, Rotation.from_rotvec([0.9, -1.7, 0.4]).as_matrix(), np.array([5.0, 3.0, -2.0])
 )
@@ -102,7 +102,7 @@ def test_stages_are_heard_as_they_begin(begun):
 
 
 def the_same_as_complete(monkeypatch, ready: live.Prepared, tmp_path: Path, *more) -> bool:
-    """Whether `complete`, told the cameras that were saved, writes the same bytes."""
+    """Compare the saved files with those of `complete` at the saved cameras."""
     out, other = ready.options.out, tmp_path / "by complete"
     context = json.loads((out / "summary.json").read_text())["settings"]["context"]
     arguments = ("--context", *context, "--target", out / "targets.json", "--out", other)
@@ -121,7 +121,7 @@ def test_what_is_saved_is_what_complete_writes(ready, begun, tmp_path, monkeypat
     assert str(ready.options.out) in saver.save(session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path)
     session, _ = completed(session, HOLES[1])
-    saver.save(session)  # it replaces what it wrote itself
+    saver.save(session)  # replaces its own files
     assert len(json.loads((ready.options.out / "summary.json").read_text())["targets"]) == 2
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--overwrite")
 
@@ -134,7 +134,7 @@ def test_what_others_wrote_is_not_replaced(room, tmp_path):
 
 
 def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeypatch):
-    """Cameras are written in the frame of the photographs, and lose nothing on the way."""
+    """Cameras are written in the frame of the photographs without loss."""
     room = photographed(tmp_path / "room", CAMERAS)
     told = {"transform": (np.diag([1 / 0.3] * 3 + [1]) @ ELSEWHERE)[:3].tolist(), "scale": 0.3}
     (room / "dataparser_transforms.json").write_text(json.dumps(told))
@@ -218,7 +218,7 @@ def test_an_error_is_a_sentence_and_ends_nothing(capsys):
         raise ZeroDivisionError("division by zero")
 
     assert answer(mended) == "Name another one."
-    assert "the scene is as it was" in answer(broken)
+    assert "the scene is unchanged" in answer(broken)
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
@@ -241,7 +241,7 @@ def test_what_was_generated_is_shown_tinted_or_hidden_and_undone(page, begun):
     page._look.value = "tint"
     assert len(page._generated.buffer) == len(shown)
     assert not np.array_equal(page._generated.buffer, shown)
-    assert "0 of what was completed are left" in page.undo(client, seen)
+    assert "0 completions are left" in page.undo(client, seen)
     assert page.session == begun
     assert page._generated is None
     assert page._targets == []

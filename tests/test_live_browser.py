@@ -1,4 +1,4 @@
-"""`gscompleter live` in a real browser: fly, complete, undo, find a hole, complete it, save."""
+"""`gscompleter live` in a real browser: fly, complete, undo, find a hole and save."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def out(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def served(room, out) -> Iterator[str]:
-    """Where the page is; the process ends by an interrupt, and says nothing of it."""
+    """Address of the page; the process ends silently on SIGTERM."""
     words = ["live", room, "--context", 0, 1, "--out", out, "--no-open", *SMALL]
     program = "from gscompleter.cli import main; main()"
     process = subprocess.Popen(
@@ -60,7 +60,7 @@ def page(served) -> Iterator[Any]:
         asked: list[str] = []
         page.on("request", lambda request: asked.append(request.url))
         page.goto(served)
-        wait_for(page, "Fly to where something is missing")
+        wait_for(page, "Fly to a hole in the scene")
         yield page
         assert [url for url in asked if not url.startswith((served, "data:", "blob:"))] == []
 
@@ -70,7 +70,7 @@ def press(page: Any, name: str) -> None:
 
 
 def wait_for(page: Any, said: str) -> str:
-    """What the page says, once it begins like this."""
+    """Wait for a status text and return it."""
     status = page.get_by_role("status").filter(has_text=said)
     status.wait_for()
     return status.text_content()
@@ -84,11 +84,11 @@ def test_a_hole_that_is_flown_to_closes_opens_again_and_is_saved(
     page.mouse.move(160, 250, steps=4)
     page.mouse.up()
     press(page, "Complete what I see")
-    assert "Gaussians were added" in wait_for(page, "Completed in")
+    assert "Gaussians are added" in wait_for(page, "Completed in")
     press(page, "Undo")
-    wait_for(page, "Undone. 0 of what was completed are left.")
+    wait_for(page, "Undone: 0 completions are left.")
     press(page, "Find a hole")
-    wait_for(page, "Here something is missing.")
+    wait_for(page, "The scene has a hole here")
     press(page, "Complete what I see")
     wait_for(page, "Completed in")
     press(page, "Save")

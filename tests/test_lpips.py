@@ -27,7 +27,7 @@ CHANNELS = {"vgg": (64, 128, 256, 512, 512), "alex": (64, 192, 384, 256, 256)}
 
 
 def random_weights(network: str) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Backbone and linear weights, named as published, with the classifier's leftovers."""
+    """Make random backbone and linear weights, named as published, with a classifier."""
     generator = torch.Generator().manual_seed(3)
     shapes = [(*row, 3) for row in VGG] if network == "vgg" else ALEX
     backbone = {"classifier.6.bias": torch.zeros(1000)}
@@ -95,7 +95,7 @@ def alex_features(x: Tensor, w: dict[str, Tensor]) -> list[Tensor]:
 
 
 def recomputed(image: Tensor, truth: Tensor, network: str) -> float:
-    """LPIPS by its formula, in float64 and one network pass after the other."""
+    """Compute LPIPS by its formula, in float64."""
     backbone, linear = (
         {k: v.double() for k, v in part.items()} for part in random_weights(network)
     )
@@ -185,17 +185,17 @@ def test_a_download_goes_to_the_cache_and_names_the_hash(
     source = tmp_path / "published"
     source.mkdir()
     publish(source, "alex", monkeypatch, *random_weights("alex"))
-    asked = []
+    fetched = []
 
     def fetch(url: str, path: str, sha256: str, progress: bool) -> None:
-        asked.append((url.rsplit("/", 1)[1], sha256))
+        fetched.append((url.rsplit("/", 1)[1], sha256))
         Path(path).write_bytes((source / url.rsplit("/", 1)[1]).read_bytes())
 
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
     monkeypatch.setattr(torch.hub, "download_url_to_file", fetch)
     load_lpips("alex")
     files = (NETWORKS["alex"].backbone, NETWORKS["alex"].linear)
-    assert asked == [(file.name, file.sha256) for file in files]
+    assert fetched == [(file.name, file.sha256) for file in files]
     load_lpips("alex", download=False)
     assert (tmp_path / "hub/checkpoints/lpips_v0.1/alex.pth").is_file()
 
@@ -221,7 +221,7 @@ def test_another_file_under_the_name_is_refused(tmp_path: Path):
 
 
 class Trap:
-    """An object that a plain unpickling would run."""
+    """An object that plain unpickling would execute."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return (pytest.fail, ("code of the file was run",))

@@ -1,4 +1,4 @@
-"""Ψ without weights, of many views: who is matched with whom, each surface once, one joint fit."""
+"""Plane-sweep Ψ on many views: neighbours, fusion to single surfaces, joint fit."""
 
 from dataclasses import replace
 
@@ -22,13 +22,13 @@ SIZE = 64
 
 
 def row_of_views(count: int, size: int = SIZE) -> list[View]:
-    """Photographs taken side by side, 0.2 apart."""
+    """Render photographs side by side, 0.2 apart."""
     offsets = (torch.arange(count) - (count - 1) / 2) * 0.2
     return [view_of(Room(), camera_at(x, size=size)) for x in offsets.tolist()]
 
 
 def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[Layer], dict]:
-    """What perfect stereo says of them."""
+    """Layers of perfect stereo."""
     rig = rig_of(views)
     layers = []
     for view, image in zip(views, rig.images, strict=True):
@@ -39,7 +39,7 @@ def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[Layer], 
 
 @pytest.fixture(scope="module")
 def found():
-    """Five views, and what is made of four of them; the one in the middle is held back."""
+    """Five views, and the reconstruction of four of them; the middle one is held out."""
     views = row_of_views(5)
     given = [*views[:2], *views[3:]]
     return given, views[2], PlaneSweep()(given)
@@ -141,9 +141,9 @@ def test_many_views_show_a_place_between_them(found):
     renderer = load_renderer("cpu")
     for view in given:
         assert psnr(renderer.render(made.gaussians, view.camera).image, view.image) > 26
-    drawn = renderer.render(made.gaussians, between.camera)
-    assert psnr(drawn.image, between.image) > 24
-    assert (drawn.alpha > 0.5).float().mean() > 0.98
+    render = renderer.render(made.gaussians, between.camera)
+    assert psnr(render.image, between.image) > 24
+    assert (render.alpha > 0.5).float().mean() > 0.98
 
 
 def test_the_indices_tell_where_each_gaussian_came_from(found):

@@ -1,4 +1,4 @@
-"""What cannot fit is refused in a sentence, before any of it is made."""
+"""Completions that do not fit into memory are refused in a sentence, before any work."""
 
 import pytest
 
@@ -63,7 +63,7 @@ def test_a_scene_that_does_not_fit_is_refused_with_both_numbers(sixteen_gigabyte
     with pytest.raises(
         InputError,
         match=r"^The 10,000,000 Gaussians of the scene and 30 photographs need about 17 GB of "
-        r"memory, and there are 16 GB; bring a part",
+        r"memory, and there are 16 GB; crop the scene",
     ):
         check_scene_memory(10**7, 30, 16 * 10**9 + 1)
 

@@ -1,4 +1,4 @@
-"""What judges the results is judged here, against plain recomputation."""
+"""Metrics against plain recomputation."""
 
 import sys
 from dataclasses import replace
@@ -88,7 +88,7 @@ def test_ssim_asks_for_a_window():
 
 
 def test_ssim_is_the_formula_of_wang_et_al():
-    """Written out with scipy's Gaussian window; the covariances are those of a sample."""
+    """Compare with scipy's Gaussian window and sample covariances."""
     image, truth = (values.double().numpy() for values in images(seed=3))
 
     def blurred(values: np.ndarray) -> np.ndarray:
@@ -124,7 +124,7 @@ def test_masked_psnr_of_no_pixel_is_none():
     assert masked_psnr(image, truth, torch.zeros(truth.shape[:2], dtype=torch.bool)) is None
 
 
-# What does not reward blur
+# Metrics that do not reward blur
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
@@ -136,7 +136,7 @@ def left_half(image: Tensor) -> Tensor:
 
 
 def test_haarpsi_is_that_of_piq():
-    """Its answers to the same images, in float64."""
+    """Compare with values of piq for the same images, in float64."""
     generator = torch.Generator().manual_seed(0)
     for size, expected in (((32, 40), 0.6336810476687134), ((64, 64), 0.6368790044733689)):
         truth = torch.rand(*size, 3, generator=generator)
@@ -145,8 +145,7 @@ def test_haarpsi_is_that_of_piq():
 
 
 def test_haarpsi_of_a_step_by_hand():
-    """A black image has no wavelets: at half the size the similarity is c / (step² + c) where the
-    other has the step of its scale, and the weight is the step of the coarsest."""
+    """Compare with the formula: similarity c / (step² + c), as a black image has no wavelets."""
     truth, image = torch.zeros(32, 32, 3), torch.zeros(32, 32, 3)
     truth[:, 16:] = 1.0
     inner = torch.zeros(32, 32, dtype=torch.bool)
@@ -175,7 +174,7 @@ def test_blur_costs_by_haarpsi_and_takes_gradient_energy():
 
 
 def test_gradient_energy_by_hand():
-    """A ramp of half the slope has a quarter of the energy, and a constant none."""
+    """A ramp of half the gradient has a quarter of the energy, and a constant none."""
     ramp = torch.linspace(0, 1, 12)[None, :, None].expand(10, 12, 3)
     everywhere = torch.ones(10, 12, dtype=torch.bool)
     assert gradient_energy_ratio(ramp / 2, ramp, everywhere) == pytest.approx(0.25)
@@ -316,14 +315,14 @@ def room_context(unit: float = 1.0) -> Gaussians:
 
 
 def completed(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> TargetCompletion:
-    """A result that added `added` to `context`."""
+    """Make a result that added `added` to `context`."""
     before = RENDERER.render(context, target)
     mask = hole_mask(before.alpha)
     return TargetCompletion(target, before, before, mask, None, 0, False, DepthAffine(), added)
 
 
 def filling(context: Gaussians, factor: float = 1.0, dilation: int = 3) -> Gaussians:
-    """The truth at the target in the dilated hole, its depths multiplied by `factor`."""
+    """Make the true Gaussians of the dilated hole, with depths multiplied by `factor`."""
     hole = dilate(hole_mask(RENDERER.render(context, TARGET).alpha), dilation)
     assert 0.05 < hole.double().mean() < 0.7
     view = view_of(Room(), TARGET)
@@ -423,7 +422,7 @@ def test_all_that_was_lifted_is_compared_with_what_the_target_sees_of_the_contex
 
 
 def test_primitives_with_gaps_between_them_are_measured_like_all():
-    """Rendered, what is thinned out covers less and is measured over less."""
+    """Renders of thinned Gaussians cover less and are measured over less."""
     context, view = room_context(), view_of(Room(), TARGET)
     lifted = gaussians_of(view, 1.1 * view.depth)
     few = lifted[::7]
@@ -441,7 +440,7 @@ def test_scores_count_the_pixels_that_they_are_measured_over():
     truth = Truth((), replace(view, depth=depth))
     scores, seen = score(
         context[:0], context, context, Truth((), view), RENDERER
-    )  # all is a hole, which the context fills
+    )  # everything is a hole that the context fills
     assert (scores.depth_observed, scores.depth_observed_pixels) == (None, 0)
     assert scores.depth_hole_pixels == seen.after.depth_map().valid.sum() > 500
     after = merge([context, added])

@@ -1,4 +1,4 @@
-"""What other programs keep cameras in is refused, with the export to choose instead."""
+"""Camera files of other programs are refused, with advice on the export to choose."""
 
 import json
 from pathlib import Path
@@ -14,17 +14,17 @@ METASHAPE = '<?xml version="1.0"?>\n<document version="2.0.0">\n  <chunk label="
 REALITYSCAN = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n0.png,1,2,3,4,5,6\n"
 KEYFRAME = json.dumps({"fx": 1400, "fy": 1400, "cx": 960, "cy": 720, "t_00": 1.0, "t_01": 0.0})
 EXPORTS = {
-    "cameras.xml": (METASHAPE, "Metashape keeps them"),
+    "cameras.xml": (METASHAPE, "cameras of Metashape"),
     "project.PSX": ('<document version="1.2.0" path="{projectname}.files"/>', "since 2.2"),
     "cameras.csv": (REALITYSCAN, "export its registration as COLMAP"),
-    "internal.csv": ("\ufeff#cameras 3\n" + REALITYSCAN, "RealityScan keeps them"),
+    "internal.csv": ("\ufeff#cameras 3\n" + REALITYSCAN, "cameras of RealityScan"),
     "keyframes/cameras/17.json": (KEYFRAME, "ns-process-data polycam"),
-    "keyframes/corrected_cameras/17.json": (KEYFRAME, "Polycam keeps them"),
+    "keyframes/corrected_cameras/17.json": (KEYFRAME, "cameras of Polycam"),
 }
 
 
 def written(scene: Path, name: str) -> Path:
-    """The file of cameras, in a folder of photographs."""
+    """Write the camera file into a folder of photographs."""
     write_photographs(scene / "keyframes" / "images")
     (scene / name).parent.mkdir(parents=True, exist_ok=True)
     (scene / name).write_text(EXPORTS[name][0], encoding="utf-8")

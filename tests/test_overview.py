@@ -1,4 +1,4 @@
-"""Which photographs stand for a scene where no target is named."""
+"""Selection of context views without a target."""
 
 from itertools import pairwise
 
@@ -33,7 +33,7 @@ def test_the_order_of_the_photographs_does_not_matter():
 
 
 def test_each_photograph_has_another_that_sees_the_same():
-    """Three directions with nothing in common, four photographs each."""
+    """Three directions without overlap, four photographs each."""
     cameras = [camera_at(x, yaw=yaw) for yaw in (0, 120, 240) for x in (0.0, 0.1, 0.2, 0.3)]
     chosen = select_overview(cameras, points(cameras), 6)
     assert [sum(i // 4 == side for i in chosen) for side in range(3)] == [2, 2, 2]

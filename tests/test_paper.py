@@ -1,4 +1,4 @@
-"""What the code says of the paper is what the paper says: equations and sections by number."""
+"""Equations and sections that the code cites have the numbers of the paper."""
 
 import re
 from pathlib import Path
@@ -24,7 +24,7 @@ EQUATIONS = {
     12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [integration.hole_mask]),
     13: (r"\mathcal{L}_{\text{mv}} =", [integration.refine_opacities]),
 }
-"""The paper's equations by number: a piece of each, and what of the code obeys it."""
+"""For each equation of the paper by number, a piece of it and the code that implements it."""
 
 SECTIONS = {
     "III-C": ("Feed-Forward Metric Context Initialization", [context]),

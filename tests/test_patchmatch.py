@@ -1,4 +1,4 @@
-"""The kernels of patches do what is written down here in plain numpy."""
+"""The patch kernels agree with plain numpy."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ COSTS = patchmatch.Costs(*map(np.float32, (0.1, 0.3, 0.02, 0.002, 30.0)))
 
 
 def matched(seed=0):
-    """A noisy image with a hole at its corner, and two sources."""
+    """Make a noisy image with a hole at its corner, and two sources."""
     rng = np.random.default_rng(seed)
     image = rng.random((H, W, 3), np.float32)
     weight = rng.random((H, W), np.float32)
@@ -39,14 +39,14 @@ def matched(seed=0):
 
 
 def at_random(found, seed=1):
-    """A usable match for each query."""
+    """Make a random usable match for each query."""
     usable = np.argwhere(found.usable)
     rows = np.random.default_rng(seed).integers(len(usable), size=len(found.queries))
     return np.ascontiguousarray(usable[rows])
 
 
 def plain_cost(found, number, match):
-    """The cost of a match and its shift, pixel by pixel in float64."""
+    """Compute the cost of a match and its shift, pixel by pixel in float64."""
     y, x = found.queries[number]
     s, sy, sx = match
     here = np.s_[y : y + SIDE, x : x + SIDE]

@@ -48,12 +48,12 @@ IDS, TINY = stored("ids"), stored("tiny_transformer")
 
 
 def levels_of(arrays: dict[str, torch.Tensor], name: str) -> torch.Tensor:
-    """The stored positions of all levels side by side."""
+    """Join the stored positions of all levels."""
     return torch.cat([arrays[name.format(level)] for level in range(3)], dim=-1)
 
 
 def authors_cameras() -> tuple[Camera, Camera]:
-    """The fixture's cameras. Its principal point is W/2 counted from the first pixel's centre."""
+    """Load the fixture's cameras; (cx, cy) = (W/2, H/2) is relative to the first pixel's centre."""
     fx, fy = float(IDS["fx"]), float(IDS["fy"])
     K = torch.tensor([[fx, 0, SIZE[1] / 2 + 0.5], [0, fy, SIZE[0] / 2 + 0.5], [0, 0, 1]])
     source = Camera(torch.eye(4), K, SIZE[1], SIZE[0])
@@ -82,7 +82,7 @@ def test_the_source_positions_are_the_authors():
 
 
 def test_the_target_positions_are_rounded_on_level_2_alone():
-    """Which the authors' bfloat16 does at 1024 pixels, by up to an eighth of a token."""
+    """The authors' bfloat16 rounds by up to an eighth of a token at 1024 pixels."""
     exact, rounded = (
         target_ids((1024, 1024), (64, 64), d) for d in (torch.float32, torch.bfloat16)
     )
@@ -98,7 +98,7 @@ def test_pixels_and_depths_in_the_target_are_the_authors():
 
 
 def plain_ids() -> torch.Tensor:
-    """Row and column of each token, as FLUX.1 Kontext has them."""
+    """Create row and column of each token as in FLUX.1 Kontext."""
     rows, columns = torch.meshgrid(torch.arange(GRID[0]), torch.arange(GRID[1]), indexing="ij")
     return torch.stack([rows, columns], dim=-1).reshape(-1, 2).float()
 
@@ -222,7 +222,7 @@ def tiny_transformer():
 
 
 def repeated(level_0: torch.Tensor) -> torch.Tensor:
-    """Positions of which all levels are level 0: what plain FLUX does."""
+    """Repeat level 0 for all levels, as in plain FLUX."""
     return level_0.repeat(1, 21)
 
 

@@ -1,4 +1,4 @@
-"""PLY scenes: exact round trips, foreign files, and a sentence for every damaged one."""
+"""PLY scenes: exact round trips, files of others, and a sentence for every damaged one."""
 
 import os
 import subprocess
@@ -25,7 +25,7 @@ def saved(tmp_path: Path, gaussians: Gaussians, name: str = "scene.ply") -> Path
 
 
 def rewritten(path: Path, out: Path, **options) -> Path:
-    """The file as plyfile writes it with `options` (text, byte_order)."""
+    """Write the file again with plyfile and its `options` (text, byte_order)."""
     data = plyfile.PlyData.read(str(path))
     plyfile.PlyData(list(data.elements), **options).write(str(out))
     return out
@@ -133,7 +133,7 @@ def test_every_byte_order_and_ascii_are_read(tmp_path, options):
 
 
 def foreign(path: Path, out: Path, byte_order: str = "<", text: bool = False) -> Path:
-    """The scene in doubles, shuffled, among other properties and elements, one of them of lists."""
+    """Write the scene in doubles, shuffled, among other properties and elements with lists."""
     vertex = plyfile.PlyData.read(str(path))["vertex"].data
     names = [n for n in reversed(vertex.dtype.names) if not n.startswith("n")]
     table = np.zeros(len(vertex), [("segment", "i2"), *((n, "f8") for n in names), ("r", "u1")])
@@ -227,7 +227,7 @@ def test_damaged_gaussians_are_counted_and_dropped_if_asked(tmp_path, name, valu
 
 
 def with_logits(path: Path, rows: dict[int, float]) -> Path:
-    """The file with other logits of opacity in some rows."""
+    """Replace opacity logits in some rows of the file."""
     data = plyfile.PlyData.read(str(path), mmap=False)
     for row, logit in rows.items():
         data["vertex"].data["opacity"][row] = logit
@@ -236,7 +236,7 @@ def with_logits(path: Path, rows: dict[int, float]) -> Path:
 
 
 def test_infinite_logits_are_opacities_of_one_and_zero(tmp_path):
-    """They are no damage, NaN still is; and what is written is finite."""
+    """They are valid, NaN is not, and written values are finite."""
     scene, infinity = random_gaussians(20), float("inf")
     path = with_logits(saved(tmp_path, scene), {2: infinity, 5: -infinity, 7: infinity})
     loaded = load_ply(path)
@@ -245,8 +245,8 @@ def test_infinite_logits_are_opacities_of_one_and_zero(tmp_path):
     assert torch.allclose(loaded.opacities[others], scene.opacities[others])
     note = note_infinite_opacities(loaded)
     assert note == (
-        "Of 20 Gaussians 2 have a logit of opacity of +infinity and 1 of -infinity; they are taken "
-        "as opaque and as transparent."
+        "2 of 20 Gaussians have an opacity logit of +infinity and 1 of -infinity; they are "
+        "rendered as opaque and as transparent."
     )
     for finite in (scene, load_ply(saved(tmp_path, scene, "finite.ply"))):
         assert note_infinite_opacities(finite) is None
@@ -300,7 +300,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
 def test_community_files_are_read_or_refused(shared):
     folder = shared / "formats"
     guitar = folder / "gaussians" / "guitar.from-compressed.ply"
-    assert (load_ply(guitar).opacities == 1).sum() == 667  # whose logit was written as infinity
+    assert (load_ply(guitar).opacities == 1).sum() == 667  # written as infinite logits
     assert load_ply(folder / "gaussians" / "playbot_lod4.from-sog.ply").sh_degree > 0
     with pytest.raises(InputError, match="compressed PLY"):
         load_ply(folder / "gaussians" / "biker.compressed.ply")
@@ -347,7 +347,7 @@ def test_an_infinite_scale_is_written_as_a_finite_one(tmp_path):
 
 
 def test_part_of_a_loaded_scene_keeps_its_bits(tmp_path):
-    """Decoding must not depend on where in the array a Gaussian stands."""
+    """Decoding must not depend on the position of a Gaussian in the array."""
     loaded = load_ply(saved(tmp_path, random_gaussians(10_007)))
     odd = load_ply(saved(tmp_path, loaded[1::2], "odd.ply"))
     assert same(odd, loaded[1::2])

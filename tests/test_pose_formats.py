@@ -1,4 +1,4 @@
-"""Every format of posed photographs shows the room that was photographed from where it says."""
+"""Every format of posed photographs gives the cameras that took them."""
 
 import json
 import shutil
@@ -45,14 +45,14 @@ def check(camera: Camera, truth: Camera) -> None:
 
 
 def check_room(photographs: Photographs, numbers: list[int] | None = None) -> None:
-    """The photographs are those of the room from their cameras, for both are compared."""
+    """Check that the photographs show the room from their cameras."""
     numbers = list(range(len(CAMERAS))) if numbers is None else numbers
     assert len(photographs) == len(numbers)
     for view, number in zip(photographs.views(range(len(numbers))), numbers, strict=True):
         check(view.camera, CAMERAS[number])
         seen = view_of(Room(), view.camera).image
         assert (view.image - seen).abs().mean() < 0.003
-        # From any other place the room looks different.
+        # The room differs from any other place.
         other = view_of(Room(), CAMERAS[number - 1]).image
         assert (view.image - other).abs().mean() > 0.01
 
@@ -93,7 +93,7 @@ def test_cameras_come_from_every_file_of_cameras(tmp_path):
 
 
 def supersplat_pose(camera: Camera) -> dict:
-    """A pose as SuperSplat keeps it: in a world turned by half a turn about z."""
+    """Return a pose in SuperSplat's world, rotated by 180° about z."""
     turn = np.array([-1.0, -1.0, 1.0])
     position, forward = camera.center.double().numpy(), camera.c2w[:3, 2].double().numpy()
     return {
@@ -117,7 +117,7 @@ def test_poses_of_supersplat_show_the_room_upright(tmp_path, project):
     # The opening angle is that of the longer side.
     wide = load_cameras(path, (SIZE, 2 * SIZE))[0]
     assert wide.K[0, 0] == pytest.approx(0.9 * 2 * SIZE, rel=1e-4)
-    with pytest.raises(InputError, match="do not say how large the images are; give a resolution"):
+    with pytest.raises(InputError, match="have no image size; give a resolution"):
         load_cameras(path)
 
 
@@ -334,7 +334,7 @@ def test_planes_enclose_the_points_in_sight():
     camera = CAMERAS[0]
     depths = torch.linspace(2.0, 4.0, MIN_POINTS + 1)
     points = depths[:, None] * torch.tensor([0.1, 0.0, 1.0])
-    # Points behind the camera and beside the image tell nothing.
+    # Points behind the camera and beside the image are ignored.
     behind, beside = torch.tensor([[0.0, 0, -9]]), torch.tensor([[50.0, 0, 9]])
     near, far = depth_range_of_points(torch.cat([points, behind, beside]), [camera])
     assert (near, far) == (pytest.approx(0.5 * 2.02), pytest.approx(2 * 3.98))

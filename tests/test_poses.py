@@ -1,4 +1,4 @@
-"""The cameras of photographs that come without any."""
+"""Camera poses for photographs without any."""
 
 import json
 import os
@@ -35,7 +35,7 @@ ORIENTATION, FOCAL_35 = 0x0112, 0xA405
 
 
 def photographs(folder: Path) -> Path:
-    """Eight photographs of the room, numbered from 5, so that 10.png is no second."""
+    """Write eight photographs of the room, numbered from 5, so that 10.png is not second."""
     folder.mkdir()
     for number, camera in enumerate(CAMERAS, start=5):
         write_image(folder / f"{number}.png", view_of(Room(), camera).image)
@@ -43,7 +43,7 @@ def photographs(folder: Path) -> Path:
 
 
 def blank(folder: Path, count: int) -> Path:
-    """Photographs with nothing to see in them."""
+    """Write photographs without content."""
     folder.mkdir()
     for number in range(count):
         Image.new("RGB", (64, 48), "grey").save(folder / f"{number}.png")
@@ -51,7 +51,7 @@ def blank(folder: Path, count: int) -> Path:
 
 
 def similarity_removed(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """`found` positions [n, 3] moved, turned and scaled as one to lie on the `true` ones."""
+    """Align `found` positions [n, 3] to the `true` ones by a similarity."""
     a, b = found - found.mean(0), true - true.mean(0)
     U, S, Vt = np.linalg.svd(b.T @ a)
     signs = np.array([1, 1, np.sign(np.linalg.det(U @ Vt))])
@@ -60,7 +60,7 @@ def similarity_removed(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> None:
-    """Let a script stand in for the process that runs COLMAP."""
+    """Replace the process that runs COLMAP by a script."""
     (tmp_path / "stand_in_mapping.py").write_text(script)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(structure_from_motion, "PROCESS", "stand_in_mapping")
@@ -101,7 +101,7 @@ def test_the_next_run_keeps_what_was_found(tmp_path, monkeypatch):
 def model_script(
     registered: list[str], points: int = 90, defect: str | None = None, focal: float | None = None
 ) -> str:
-    """A stand-in that says that these photographs were registered."""
+    """Write a script that reports these photographs as registered."""
     result = {
         "registered": registered,
         "models": [len(registered)],
@@ -130,7 +130,7 @@ def test_photographs_without_a_camera_are_named(tmp_path, monkeypatch, capsys):
     assert run(monkeypatch, "poses", blank(tmp_path / "p", 4), "--out", tmp_path / "out") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "No camera was found for 1.png; they are left out."
-    assert said[1].startswith("3 of 4 cameras and 90 points, 0.50 px off on average: ")
+    assert said[1].startswith("3 of 4 cameras and 90 points, mean error 0.50 px: ")
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_a_drive_is_placed_with_its_focal_length_held(shared, tmp_path):
 
 def test_parts_that_do_not_connect_are_told():
     parts, missing = FoundPoses(9, ("a.png",), (5, 4), 100, 0.5).notes
-    assert "2 parts that do not connect, of 5 and 4 cameras; the largest is kept." in parts
+    assert "2 parts that do not connect, with 5 and 4 cameras; the largest is kept." in parts
     assert missing == "No camera was found in it for a.png; they are left out."
 
 
@@ -264,7 +264,7 @@ def test_neighbours_are_those_of_the_numbers_however_they_are_written(tmp_path):
 def test_a_file_that_is_no_image_is_named(tmp_path):
     folder = blank(tmp_path / "p", 3)
     (folder / "1.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match="1.png is no image that can be read"):
+    with pytest.raises(InputError, match="1.png cannot be read as an image"):
         find_poses(folder, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -1,4 +1,4 @@
-"""What is shown of what goes on: on a terminal, in a log, and nowhere."""
+"""Progress on a terminal, in a log, and nowhere."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from gscompleter.progress import (
 from scenes import random_gaussians
 
 CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f]")
-"""Characters that have no place in a log."""
+"""Characters that do not belong into a log."""
 
 
 SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "--far", 20)
 
 
 class Clock:
-    """A time that passes when it is told to."""
+    """A clock that tests advance."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 1000.0
@@ -59,7 +59,7 @@ def written(console: Console) -> str:
 
 
 def work_at_target() -> None:
-    """A stage, and two steps of which each has a stage with steps of its own."""
+    """Run a stage, and two steps with a stage and steps of its own each."""
     with stage("context"):
         pass
     for _ in track(range(2), "target"):

@@ -1,4 +1,4 @@
-"""Protocols: which frames of a clip are given and which are to be synthesized."""
+"""Protocols: which frames of a clip are context and which are targets."""
 
 import json
 import os
@@ -27,7 +27,7 @@ from gscompleter.types import View
 
 
 class Frames(PosedPhotographs):
-    """A clip that has numbers only."""
+    """A clip with frame numbers only."""
 
     name, names, origin = "", (), np.zeros(3)
 
@@ -101,7 +101,7 @@ def test_a_case_has_one_target_and_loads_its_views():
     assert second.targets == (4,)
     assert first.load(first.context) == [VIEWS[0], VIEWS[2]]
     assert tasks_of(index, Frames("b", 5)) == []
-    with pytest.raises(InputError, match="The protocol x asks for frame 4 of a, which has 4"):
+    with pytest.raises(InputError, match="The protocol x needs frame 4 of a, which has 4"):
         tasks_of(index, Frames("a", 4))
 
 

@@ -1,4 +1,4 @@
-"""A proxy of a large scene: fewer Gaussians that its photographs do not tell from all of them."""
+"""Proxies of large scenes: fewer Gaussians, with the same photographs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ PROXY = run_by_run(CROWD, CAMERAS)
 
 
 def pixel_at(scene: Gaussians) -> torch.Tensor:
-    """What the smallest pixel of the cameras covers at each Gaussian."""
+    """Compute the smallest pixel of the cameras at each Gaussian."""
     apart = [(scene.means - camera.center).norm(dim=1) / camera.K[0, 0] for camera in CAMERAS]
     return torch.stack(apart).amin(0)
 
@@ -136,18 +136,18 @@ def test_the_same_runs_on_any_number_of_threads(monkeypatch):
     assert torch.equal(again.scene.scales, PROXY.scene.scales)
 
 
-def evidence_of(drawn: Gaussians) -> Evidence:
-    frozen = [RENDERER.freeze(drawn, camera) for camera in CAMERAS]
-    return gather_evidence(drawn, VIEWS, frozen, TrustConfig())
+def evidence_of(scene: Gaussians) -> Evidence:
+    frozen = [RENDERER.freeze(scene, camera) for camera in CAMERAS]
+    return gather_evidence(scene, VIEWS, frozen, TrustConfig())
 
 
-def believed(drawn: Gaussians) -> torch.Tensor:
-    frozen = RENDERER.freeze(drawn, TARGET)
-    return believed_alpha(frozen, support(evidence_of(drawn), weight_sums(frozen), TARGET))
+def trusted_alpha(scene: Gaussians) -> torch.Tensor:
+    frozen = RENDERER.freeze(scene, TARGET)
+    return believed_alpha(frozen, support(evidence_of(scene), weight_sums(frozen), TARGET))
 
 
 def test_of_a_proxy_as_much_is_believed_as_of_the_scene():
-    ours, truth = believed(PROXY.scene), believed(CROWD)
+    ours, truth = trusted_alpha(PROXY.scene), trusted_alpha(CROWD)
     assert truth.std() > 0.2
     assert (ours - truth).abs().mean() < 0.05
 

@@ -1,5 +1,4 @@
-"""Reconstructors by the names of their published weights, with files of random tensors in place of
-the authors' (which were not at hand): what is loaded, what is refused, and a whole completion."""
+"""Reconstructors by published names, with random tensors in place of the published weights."""
 
 import json
 from pathlib import Path
@@ -20,7 +19,7 @@ VIEWS = [view_of(Room(), camera_at(x, size=SIZE)) for x in (-0.3, 0.1)]
 
 
 def saved(path: Path, network: torch.nn.Module) -> Path:
-    """A file as the authors' training writes it."""
+    """Save a file like the authors' training."""
     state = {f"encoder.{name}": tensor for name, tensor in network.state_dict().items()}
     torch.save({"state_dict": state, "epoch": 3}, path)
     return path
@@ -79,7 +78,7 @@ def test_without_a_file_it_is_said_where_to_get_it(monkeypatch, tmp_path):
 
 
 def test_a_completion_with_random_weights_runs_end_to_end(mvsplat_file, tmp_path, monkeypatch):
-    """A smoke test of frames, shapes and stages: random weights reconstruct nothing."""
+    """Random weights: this only checks frames, shapes and stages."""
     cameras = [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)]
     scene = photographed(tmp_path / "scene", cameras)
     arguments = ["complete", scene, "--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20]

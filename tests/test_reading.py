@@ -1,4 +1,4 @@
-"""Files are opened where they are regular ones, and read as far as they may be long."""
+"""Only regular files are opened, and none is read beyond its limit."""
 
 import os
 import socket
@@ -12,7 +12,7 @@ from splat_files import made, plausible
 
 @pytest.fixture
 def others(tmp_path):
-    """Create something that is no regular file, by its kind."""
+    """Create a path that is not a regular file, by its kind."""
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "device").symlink_to("/dev/zero")

@@ -29,7 +29,7 @@ def everywhere(depth: torch.Tensor) -> DepthMap:
 
 
 def lifted(reference: View, anchor: View, error: torch.Tensor | float) -> Lift:
-    """The truth lifted with its z-depths multiplied by `error`."""
+    """Lift the truth with its z-depths multiplied by `error`."""
     assert reference.depth is not None
     assert anchor.depth is not None
     depth = reference.depth * error
@@ -47,7 +47,7 @@ def registered(
     unit: float = 1.0,
     renderer: Renderer = CPU,
 ):
-    """The room known from two cameras, and the target's Gaussians registered to it."""
+    """Register the target's Gaussians to the room known from two cameras."""
     room = Room(unit=unit)
     target, anchor = camera_at(0.2, size=SIZE, unit=unit), camera_at(-0.2, size=SIZE, unit=unit)
     reference, anchor_view = view_of(room, target), view_of(room, anchor)
@@ -67,14 +67,14 @@ def registered(
 
 
 def depth_error(result, reference: View) -> float:
-    """Median relative error of z-depth against the truth."""
+    """Compute the median relative error of z-depth."""
     _, z = project(result.gaussians.means, reference.camera)
     truth = reference.depth.flatten()
     return ((z - truth).abs() / truth).median().item()
 
 
 def bumpy() -> torch.Tensor:
-    """Depth errors of up to 6 % that no affine can mend."""
+    """Make depth errors of up to 6 % that no affine can correct."""
     x = torch.linspace(0, 12, SIZE)
     return 1 + 0.06 * torch.sin(x)[None] * torch.cos(x)[:, None]
 
@@ -107,7 +107,7 @@ def test_a_registered_primitive_still_projects_to_its_pixel(config):
 
 @dataclass(frozen=True)
 class Plain(CpuRenderer):
-    """Draws everything anew each time, with the same kernels."""
+    """A renderer without shortcuts, with the same kernels."""
 
     def freeze(self, context, camera):
         return ReferenceView(CPU, context, camera)
@@ -124,10 +124,10 @@ class Plain(CpuRenderer):
     ids=["target", "anchor", "ours", "paper"],
 )
 def test_what_is_fixed_while_candidates_slide_changes_no_loss(config, bound):
-    """Every iteration has the loss, of the largest, that drawing everything anew has.
+    """Every loss equals that of rendering everything again, relative to the largest.
 
-    Where two absolute errors pull against each other, rounding decides which way a candidate goes:
-    sizes that differ by 3e-7 make plain runs differ by 3e-4.
+    If two absolute errors balance, rounding decides the direction of a Gaussian: sizes that differ
+    by 3e-7 make plain runs differ by 3e-4.
     """
     ours, _ = registered(bumpy(), config)
     plain, _ = registered(bumpy(), config, renderer=Plain())
@@ -142,8 +142,10 @@ def test_what_is_fixed_while_candidates_slide_changes_no_loss(config, bound):
 
 @pytest.mark.parametrize("config", [RegistrationConfig(), PAPER], ids=["ours", "paper"])
 def test_only_candidates_that_reach_what_is_compared_are_drawn(config, monkeypatch):
-    """Neither camera of a room of which only a corner is known compares what lies elsewhere. The
-    result has the bytes of a run that draws all candidates."""
+    """In a room of which only a corner is known, Gaussians elsewhere are compared nowhere.
+
+    The result has the bytes of a run that renders all of them.
+    """
     drawn = []
 
     @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def test_only_candidates_that_reach_what_is_compared_are_drawn(config, monkeypat
         return register(lift, *scene, reference, ANCHOR, Counting(), generator, config)
 
     fewer = registered_to_a_corner()
-    # The paper's loss of colour looks at all of the target.
+    # The paper's colour loss covers the whole target.
     assert 0 < max(drawn) <= (SIZE**2 if config.rgb_weight > 0 else 0.3 * SIZE**2)
     monkeypatch.setattr(
         Objective, "reached_by", lambda _, candidates, *__: torch.ones(len(candidates)) > 0
@@ -260,8 +262,10 @@ def test_the_unit_of_the_scene_scales_the_result_and_changes_nothing_else(unit):
 
 
 def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
-    """A wall 4 m away, of which a panel 1 m before the anchor hides all. The target's candidates
-    lie on the wall; the literal stereo loss drags them to the panel, the masked one does not."""
+    """A panel 1 m in front of the anchor hides a wall 4 m away, with the target's Gaussians.
+
+    The literal stereo loss pulls them onto the panel; the masked one does not.
+    """
     renderer = load_renderer("cpu")
     wall = torch.full((SIZE, SIZE), 4.0)
     colours = torch.rand(2, SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))

@@ -1,4 +1,4 @@
-"""Kernels are compiled in advance: all of them, once, and nobody is left in the dark about it."""
+"""Compilation of all kernels in advance, once, with a message."""
 
 import io
 import os
@@ -30,7 +30,7 @@ print(len(found.buffer))
 
 
 def complete() -> None:
-    """Complete a room for what lies beside two and three photographs, reconstructed and given."""
+    """Complete a room beside two and three photographs, reconstructed and given."""
     target = camera_at(0.7, yaw=12, size=64)
     for places in ((-0.3, 0.1), (-0.3, 0.1, 0.3)):
         views = [view_of(Room(), camera_at(x, size=64)) for x in places]
@@ -39,7 +39,7 @@ def complete() -> None:
 
 
 def signatures() -> set[tuple[str, str]]:
-    """Names and argument types of all kernels that ran in this process."""
+    """Return the names and argument types of all kernels that ran in this process."""
     return {
         (f"{module.name}.{name}", str(types))
         for module in iter_modules(kernels.__path__)
@@ -51,7 +51,7 @@ def signatures() -> set[tuple[str, str]]:
 
 @pytest.fixture
 def marked(monkeypatch, tmp_path) -> list[str]:
-    """Marks stand in an empty folder, and parts are rehearsed by writing their names down."""
+    """Use an empty folder of marks, and rehearse parts by writing their names."""
     done: list[str] = []
     monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(compilation, "PARTS", ("cpu", "plane-sweep"))
@@ -62,7 +62,7 @@ def marked(monkeypatch, tmp_path) -> list[str]:
 
 
 def test_a_rehearsal_meets_every_kernel_of_a_completion():
-    """In a process of its own, for kernels that ran here before would prove nothing."""
+    """It runs in a process of its own, because kernels may have run here before."""
     said = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -120,7 +120,7 @@ def test_warmup_says_what_it_did(marked, monkeypatch, capsys):
 
 
 def test_a_model_that_is_asked_for_is_begun_before_anything_is_known(tmp_path):
-    """In a process of its own, which stops what it began."""
+    """It runs in a process of its own, which stops its child."""
     begun = """
 from gscompleter import compilation
 from gscompleter.compilation import begin

@@ -1,4 +1,4 @@
-"""What is released: the wheel by itself, in another folder, and what is said of it."""
+"""Wheel and sdist, installed in another folder, and the documentation of extras."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def sdist(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def unpacked(sdist, tmp_path_factory) -> Path:
-    """The sources of the sdist, with other times and permissions than ours."""
+    """Return the sources of the sdist, with other times and permissions."""
     folder = tmp_path_factory.mktemp("sources")
     with tarfile.open(sdist) as archive:
         archive.extractall(folder, filter="data")
@@ -56,7 +56,7 @@ def unpacked(sdist, tmp_path_factory) -> Path:
 
 
 def extras() -> set[str]:
-    """The extras of pyproject.toml."""
+    """Read the extras of pyproject.toml."""
     text = (ROOT / "pyproject.toml").read_text()
     table = text.split("[project.optional-dependencies]")[1].split("\n[")[0]
     return set(re.findall(r"^([\w-]+) = ", table, re.M))
@@ -80,7 +80,7 @@ def test_the_wheel_holds_the_package_the_viewer_and_the_licences(wheel):
 def test_the_same_sources_give_the_same_bytes_wherever_they_lie(
     wheel, sdist, unpacked, tmp_path, monkeypatch
 ):
-    """An sdist brings the viewer's libraries along, and so needs no connection."""
+    """An sdist contains the viewer's libraries, and so needs no connection."""
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path / "nothing"))
     monkeypatch.setenv("npm_config_registry", "http://127.0.0.1:9")
     assert built("wheel", tmp_path / "wheel", unpacked).read_bytes() == wheel.read_bytes()
@@ -88,7 +88,7 @@ def test_the_same_sources_give_the_same_bytes_wherever_they_lie(
 
 
 def test_the_wheel_runs_by_itself_in_another_folder(wheel, room, tmp_path):
-    """In an environment that has the wheel, and borrows from ours what the wheel depends on."""
+    """The environment has the wheel, and borrows its requirements from ours."""
     programs = environment(sys.executable, tmp_path / "environment")
     install(programs, "--no-deps", str(wheel))
     (packages,) = (tmp_path / "environment").glob("lib/*/site-packages")
@@ -104,7 +104,7 @@ def test_the_wheel_runs_by_itself_in_another_folder(wheel, room, tmp_path):
 
 
 def borrow_kernels(package: Path) -> None:
-    """What our kernels compiled to holds for the same sources elsewhere, by their times."""
+    """Copy our compiled kernels, which are valid for the same sources and times."""
     compile_kernels(list(PARTS))
     ours = Path(gscompleter.__file__).parent
     for source in (ours / "kernels").glob("*.py"):

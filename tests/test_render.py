@@ -29,7 +29,7 @@ ROUNDING = 1e-5
 """Largest difference of drawings and of gradients, of the largest value. At most 5.1e-6 was
 measured, and 6.4e-6 with kernels compiled without fused multiplications."""
 FOLDED = 3e-4
-"""The same of what is drawn of fragments: a pixel may be closed a few faint splats later."""
+"""The same for renders of fragments: a pixel may be full a few faint splats later."""
 
 
 def in_dtype(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
@@ -37,7 +37,7 @@ def in_dtype(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
 
 
 def strange(sh_degree: int = 0) -> Gaussians:
-    """Behind the camera, before the near plane, beside the image, transparent, huge and tiny."""
+    """Make Gaussians behind, before the near plane, outside, transparent, huge and tiny."""
     gaussians = random_gaussians(60, seed=4, sh_degree=sh_degree)
     gaussians.means[0:5, 2] = -2.0
     gaussians.means[5:10, 2] = 0.003
@@ -50,8 +50,7 @@ def strange(sh_degree: int = 0) -> Gaussians:
 
 
 def smooth(gaussians: Gaussians) -> Gaussians:
-    """Without what has no gradient to compare: round Gaussians, which turn into themselves, and
-    the blackest black, where the colour has a kink."""
+    """Avoid parameters without comparable gradients: round Gaussians, and the kink at black."""
     flat = gaussians.scales * torch.tensor([1.2, 1.0, 0.5])
     turned = gaussians.quats + torch.tensor([0.0, 0.3, -0.2, 0.4])
     return replace(gaussians, sh=0.9 * gaussians.sh, scales=flat, quats=turned)
@@ -71,18 +70,18 @@ SCENES |= {
 MODES = pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
 
 
-def assert_same_drawing(ours: Render, truth: Render) -> None:
-    """In every pixel, but for the depth of those that show next to nothing."""
+def assert_same_render(ours: Render, truth: Render) -> None:
+    """Compare every pixel, but the depth only where alpha is not negligible."""
     covered = truth.alpha > 0.01
     assert_close(ours.image, truth.image, "image", ROUNDING)
     assert_close(ours.alpha, truth.alpha, "alpha", ROUNDING)
     assert_close(ours.depth * covered, truth.depth * covered, "depth", ROUNDING)
 
 
-def assert_same_slopes(
+def assert_same_gradients(
     ours: dict[str, torch.Tensor], truth: dict[str, torch.Tensor], bound: float = ROUNDING
 ) -> None:
-    """Of every Gaussian; each parameter has a gradient that is no rounding itself."""
+    """Compare the gradients of every Gaussian; none of them is rounding noise alone."""
     for name, expected in truth.items():
         rows = expected.flatten(1) if expected.dim() > 1 else expected[:, None]
         assert (rows.abs().amax(dim=1) > 1e-3).float().mean() > 0.2, name
@@ -93,12 +92,12 @@ def assert_same_slopes(
 def test_cpu_and_reference_draw_the_same(name):
     ours = CPU.render(SCENES[name], CAMERA)
     truth = REFERENCE.render(in_dtype(SCENES[name], torch.float64), CAMERA)
-    assert_same_drawing(ours, truth)
+    assert_same_render(ours, truth)
     assert truth.alpha.max() > 0.5
 
 
 def gradients(renderer, gaussians: Gaussians, camera=CAMERA) -> dict[str, torch.Tensor]:
-    """Of a fixed random weighting of image, depth and alpha."""
+    """Compute gradients of a fixed random weighting of image, depth and alpha."""
     leaves = {n: getattr(gaussians, n).detach().clone().requires_grad_() for n in PARAMETERS}
     render = renderer.render(replace(gaussians, **leaves), camera)
     generator = torch.Generator().manual_seed(9)
@@ -112,11 +111,11 @@ def gradients(renderer, gaussians: Gaussians, camera=CAMERA) -> dict[str, torch.
 @pytest.mark.parametrize("name", SCENES)
 def test_cpu_and_reference_have_the_same_gradients(name):
     truth = gradients(REFERENCE, in_dtype(SCENES[name], torch.float64))
-    assert_same_slopes(gradients(CPU, SCENES[name]), truth)
+    assert_same_gradients(gradients(CPU, SCENES[name]), truth)
 
 
 def one(mean, opacity=0.8, scale=0.05, colour=(1.0, 0.5, 0.25)) -> Gaussians:
-    """A round Gaussian."""
+    """Make a round Gaussian."""
     return observed(
         torch.tensor([mean]),
         torch.tensor([[1.0, 0, 0, 0]]),
@@ -142,8 +141,7 @@ def test_one_gaussian_on_a_pixel_centre_by_hand(renderer):
 @pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
 @pytest.mark.parametrize("scales", [(0.05, 0.05, 0.05), (0.05, 0.01, 0.3)], ids=["round", "thin"])
 def test_one_antialiased_gaussian_by_hand(renderer, scales):
-    """The low-pass widens a splat and lowers its opacity as much: the sum over the image is
-    that of a Gaussian without it."""
+    """The low-pass widens a splat and lowers its opacity, so that its sum does not change."""
     camera = camera_at(size=33, focal=1.0)
     gaussian = replace(one((0.0, 0.0, 2.0)), scales=torch.tensor([scales]), is_antialiased=True)
     across, down = (33 * scale / 2 for scale in scales[:2])
@@ -205,7 +203,7 @@ def test_any_image_size_is_drawn(size):
     scene = SCENES["random"]
     ours = CPU.render(scene, camera)
     assert ours.image.shape == (height, width, 3)
-    assert_same_drawing(ours, REFERENCE.render(in_dtype(scene, torch.float64), camera))
+    assert_same_render(ours, REFERENCE.render(in_dtype(scene, torch.float64), camera))
 
 
 def context_and_new(antialiased: bool = False) -> tuple[Gaussians, Gaussians]:
@@ -221,13 +219,13 @@ def test_a_composite_is_the_render_of_both_together(renderer, antialiased):
     context, new = context_and_new(antialiased)
     whole = renderer.render(merge([context, new]), CAMERA)
     parts = renderer.freeze(context, CAMERA).composite(new)
-    assert_same_drawing(parts, whole)
+    assert_same_render(parts, whole)
 
 
 def test_what_is_frozen_alone_is_its_own_render():
     context, _ = context_and_new()
     frozen, alone = CPU.freeze(context, CAMERA).context, CPU.render(context, CAMERA)
-    assert_same_drawing(frozen, alone)
+    assert_same_render(frozen, alone)
 
 
 @MODES
@@ -254,7 +252,7 @@ def test_a_frozen_view_keeps_no_splat_that_no_tile_draws():
     frozen = CPU.freeze(opaque, CAMERA)
     assert len(frozen.layer.splats) < 0.8 * len(opaque)
     assert set(frozen.layer.entries) == set(range(len(frozen.layer.splats)))
-    assert_same_drawing(frozen.context, CPU.render(opaque, CAMERA))
+    assert_same_render(frozen.context, CPU.render(opaque, CAMERA))
 
 
 def test_tiles_find_their_splats_in_the_order_in_which_they_name_them():
@@ -265,7 +263,7 @@ def test_tiles_find_their_splats_in_the_order_in_which_they_name_them():
 
 
 def test_only_tiles_that_something_new_touches_are_drawn(monkeypatch):
-    """Of the nine tiles the new Gaussian lies within one, forward and backward."""
+    """The new Gaussian touches one of the nine tiles, forward and backward."""
     drawn = count_tiles(monkeypatch)
     frozen = CpuRenderer(threads=1).freeze(SCENES["random"], CAMERA)
     assert drawn.pop() == 9
@@ -279,9 +277,9 @@ def test_only_tiles_that_something_new_touches_are_drawn(monkeypatch):
 
 
 def count_tiles(monkeypatch) -> list[int]:
-    """How many tiles each call of the two kernels that draw will visit, as it happens.
+    """Record how many tiles each call of the two compositing kernels visits.
 
-    It is one call a drawing where a single thread draws.
+    A single thread makes one call per render.
     """
     drawn: list[int] = []
 
@@ -312,17 +310,17 @@ def test_a_plan_is_the_composite_with_other_opacities(renderer, antialiased):
     frozen = renderer.freeze(context, CAMERA)
     plan = frozen.plan(new)
     for opacities in (new.opacities, 1 - new.opacities):
-        planned, slope = opacity_gradient(plan, opacities)
+        planned, grad = opacity_gradient(plan, opacities)
         truth, expected = opacity_gradient(
             lambda values: frozen.composite(replace(new, opacities=values)), opacities
         )
-        assert_same_drawing(planned, truth)
-        assert_same_slopes({"opacities": slope}, {"opacities": expected})
+        assert_same_render(planned, truth)
+        assert_same_gradients({"opacities": grad}, {"opacities": expected})
 
 
 @MODES
 def test_a_plan_of_depths_is_the_composite_at_these_depths(antialiased):
-    """Where it is asked for; elsewhere tiles may show the context alone."""
+    """It holds in the mask; other tiles may show the context alone."""
     context, new = context_and_new(antialiased)
     frozen, left = CPU.freeze(context, CAMERA), torch.zeros(48, 48, dtype=torch.bool)
     left[:, :16] = True
@@ -333,9 +331,9 @@ def test_a_plan_of_depths_is_the_composite_at_these_depths(antialiased):
             lambda values: frozen.composite(at_depths(new, CAMERA, values)), depths, left
         )
         for where in (left, torch.ones_like(left)):
-            planned, slope = depth_gradient(frozen.plan_depths(new, where), depths, left)
-            assert_same_drawing(*(masked(render, where) for render in (planned, truth)))
-            assert_close(slope, expected, "slope of depths")
+            planned, grad = depth_gradient(frozen.plan_depths(new, where), depths, left)
+            assert_same_render(*(masked(render, where) for render in (planned, truth)))
+            assert_close(grad, expected, "gradient of depths")
         beside = frozen.plan_depths(new, left)(depths)
         assert torch.equal(beside.image[:, 16:], frozen.context.image[:, 16:])
     before_the_lens = frozen.plan_depths(new, torch.ones_like(left))(1e-3 * before)
@@ -358,7 +356,7 @@ def test_a_plan_of_colours_tells_what_the_composite_in_these_colours_lacks(antia
 
 @pytest.mark.parametrize("name", ["random", "harmonics", "room", "antialiased-room"])
 def test_a_plan_of_appearances_is_the_composite_that_looks_like_this(name):
-    """In front of the context, within it and behind it; to what a closed pixel may be off by."""
+    """In front of the context, within it and behind it, to the tolerance of full pixels."""
     _, new = context_and_new(SCENES[name].is_antialiased)
     frozen = CPU.freeze(SCENES[name], CAMERA)
     plan, generator = frozen.plan_appearance(new, EVERYWHERE), torch.Generator().manual_seed(0)
@@ -367,27 +365,29 @@ def test_a_plan_of_appearances_is_the_composite_that_looks_like_this(name):
             "opacities": share * new.opacities,
             "sh": torch.randn(len(new), 4, 3, generator=generator),
         }
-        planned, slopes = image_gradients(plan, leaves)
+        planned, grads = image_gradients(plan, leaves)
         truth, expected = image_gradients(
             lambda opacities, sh: frozen.composite(replace(new, opacities=opacities, sh=sh)).image,
             leaves,
         )
         assert_close(planned, truth, "image", FOLDED)
-        assert_close(slopes["opacities"], expected["opacities"], "slope of opacities", 10 * FOLDED)
-        assert_close(slopes["sh"], expected["sh"], "slope of harmonics", FOLDED)
+        assert_close(
+            grads["opacities"], expected["opacities"], "gradient of opacities", 10 * FOLDED
+        )
+        assert_close(grads["sh"], expected["sh"], "gradient of harmonics", FOLDED)
 
 
 def image_gradients(function, values: dict[str, torch.Tensor]):
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     image = function(**leaves)
     weight = torch.linspace(0, 1, image.numel()).view_as(image)
-    slopes = torch.autograd.grad((image * weight).sum(), list(leaves.values()))
-    return image.detach(), dict(zip(leaves, slopes, strict=True))
+    grads = torch.autograd.grad((image * weight).sum(), list(leaves.values()))
+    return image.detach(), dict(zip(leaves, grads, strict=True))
 
 
 @MODES
 def test_what_a_plan_compares_is_its_image(antialiased):
-    """Weights are 0 in places, and what nothing new shows in counts all the same."""
+    """Weights are 0 in places, and pixels without new fragments count all the same."""
     context, new = context_and_new(antialiased)
     generator = torch.Generator().manual_seed(0)
     wanted = torch.rand(CAMERA.height, CAMERA.width, 3, generator=generator)
@@ -396,46 +396,45 @@ def test_what_a_plan_compares_is_its_image(antialiased):
     plans = [view.plan_appearance(new, EVERYWHERE) for view in frozen]
     leaves = {"opacities": 0.5 * new.opacities, "sh": 0.9 * new.sh}
 
-    def told(opacities, sh):
+    def full_error(opacities, sh):
         return (weights * (plans[0](opacities, sh) - wanted).square().sum(dim=-1)).sum()
 
-    true_error, true_slopes = value_and_gradients(told, leaves)
+    true_error, true_gradients = value_and_gradients(full_error, leaves)
     errors = [plan.compared(wanted, weights) for plan in plans]
     assert errors[0](**leaves) == errors[1](**leaves)
     for compared in errors:
-        error, slopes = value_and_gradients(partial(tripled, compared), leaves)
+        error, grads = value_and_gradients(partial(tripled, compared), leaves)
         assert_close(error / 3, true_error, "error", 1e-4)
         for name in leaves:
-            assert_close(slopes[name] / 3, true_slopes[name], f"slope of {name}", 1e-3)
+            assert_close(grads[name] / 3, true_gradients[name], f"gradient of {name}", 1e-3)
 
 
 @pytest.mark.parametrize("name", ["random", "room", "antialiased-room"])
 def test_a_plan_of_appearances_has_fragments_only_where_it_is_asked_for(name):
-    """A disk within four tiles, and a pixel far from it: there all is as in a plan of the whole
-    image, and the rest is the frozen scene."""
+    """In a disk and a pixel all is as in a mask of the image; the rest is the frozen scene."""
     _, new = context_and_new(SCENES[name].is_antialiased)
     frozen = CPU.freeze(SCENES[name], CAMERA)
     rows, columns = torch.meshgrid(torch.arange(48), torch.arange(48), indexing="ij")
     where = (rows - 16) ** 2 + (columns - 18) ** 2 < 100
     where[40, 41] = True
     whole, part = (frozen.plan_appearance(new, asked) for asked in (EVERYWHERE, where))
-    looks = 0.7 * new.opacities, 0.9 * new.sh
-    assert_close(part(*looks)[where], whole(*looks)[where], "image", ROUNDING)
-    assert torch.equal(part(*looks)[~where], frozen.context.image[~where])
+    appearance = 0.7 * new.opacities, 0.9 * new.sh
+    assert_close(part(*appearance)[where], whole(*appearance)[where], "image", ROUNDING)
+    assert torch.equal(part(*appearance)[~where], frozen.context.image[~where])
     wanted = torch.rand(48, 48, 3, generator=torch.Generator().manual_seed(0))
-    leaves = dict(zip(("opacities", "sh"), looks, strict=True))
-    told = [plan.compared(wanted, where.float()) for plan in (whole, part)]
-    (error, slopes), (expected, true_slopes) = (value_and_gradients(t, leaves) for t in told)
+    leaves = dict(zip(("opacities", "sh"), appearance, strict=True))
+    errors = [plan.compared(wanted, where.float()) for plan in (whole, part)]
+    (error, grads), (expected, true_gradients) = (value_and_gradients(t, leaves) for t in errors)
     assert_close(error, expected, "error", ROUNDING)
     for name in leaves:
-        assert_close(slopes[name], true_slopes[name], f"slope of {name}", ROUNDING)
+        assert_close(grads[name], true_gradients[name], f"gradient of {name}", ROUNDING)
     of_pixels, of_part = fragments_of(whole), fragments_of(part)
     assert torch.equal(of_part, of_pixels * where)
     assert 0 < of_part.sum() < of_pixels.sum() / 4
 
 
 def fragments_of(plan) -> torch.Tensor:
-    """How many each pixel has [h, w]."""
+    """Count the fragments of each pixel [h, w]."""
     side = rasterizer.TILE
     counts = torch.zeros(CAMERA.height // side, CAMERA.width // side, side, side, dtype=torch.long)
     for piece in plan.fragments:
@@ -451,12 +450,12 @@ def tripled(function, **leaves):
 def value_and_gradients(function, values: dict[str, torch.Tensor]):
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     value = function(**leaves)
-    slopes = torch.autograd.grad(value, list(leaves.values()))
-    return value.detach(), dict(zip(leaves, slopes, strict=True))
+    grads = torch.autograd.grad(value, list(leaves.values()))
+    return value.detach(), dict(zip(leaves, grads, strict=True))
 
 
 def test_what_is_closed_by_something_solid_is_closed_at_the_same_splat():
-    """A wall behind a wall behind a wall, of which a pixel drops the very one that closes it."""
+    """Three walls, one behind the other, of which one pixel drops the one that fills it."""
     wall = gaussians_of(view_of(Room(), camera_at(size=64)))
     context = merge([placed(wall, 1.0), placed(wall, 1.02)])
     frozen, new = CPU.freeze(context, CAMERA), merge([placed(wall, 0.98), placed(wall, 1.01)])
@@ -468,12 +467,12 @@ def test_what_is_closed_by_something_solid_is_closed_at_the_same_splat():
 
 
 def placed(gaussians: Gaussians, share: float) -> Gaussians:
-    """The Gaussians at a share of their distance from the world's origin."""
+    """Move the Gaussians to a share of their distance from the world's origin."""
     return replace(gaussians, means=share * gaussians.means)
 
 
 def test_what_looks_otherwise_costs_what_is_new_however_much_is_frozen():
-    """Faint splats all over the image: ten times as many of them leave the fragments as many."""
+    """Faint splats fill the image: ten times as many of them leave the fragments as many."""
     _, new = context_and_new()
     few, many = (random_gaussians(count, seed=7) for count in (200, 2000))
     counts = []
@@ -508,7 +507,7 @@ def test_composites_have_the_gradients_of_the_render_of_both(antialiased):
         def render(self, gaussians, camera):
             return CPU.render(merge([context, gaussians]), camera)
 
-    assert_same_slopes(gradients(Composites(), new), gradients(Together(), new))
+    assert_same_gradients(gradients(Composites(), new), gradients(Together(), new))
 
 
 @pytest.mark.parametrize("unit", [0.001, 1000.0])
@@ -517,7 +516,7 @@ def test_the_unit_of_the_scene_changes_no_image(renderer, unit):
     scene = SCENES["harmonics"]
     ours = renderer.render(scene, camera_at(size=32))
     theirs = renderer.render(scaled(scene, unit), camera_at(size=32, unit=unit))
-    assert_same_drawing(replace(theirs, depth=theirs.depth / unit), ours)
+    assert_same_render(replace(theirs, depth=theirs.depth / unit), ours)
 
 
 def test_the_same_input_gives_the_same_bytes_on_any_number_of_threads():
@@ -565,7 +564,7 @@ class SlowDrawing(ReferenceRenderer):
 
 
 def check_frozen(view, plain, new: Gaussians, bound: float) -> None:
-    """Two frozen views draw the same, composite and plan, with the same gradients in `new`."""
+    """Compare the renders of two frozen scenes, and their gradients in `new`."""
 
     def composited(frozen):
         return lambda leaves: frozen.composite(replace(new, **leaves))
@@ -577,13 +576,13 @@ def check_frozen(view, plain, new: Gaussians, bound: float) -> None:
         ours, theirs = ((lambda ls, p=plan: p(ls["opacities"])) for plan in plans)
         pairs.append((ours, theirs, {"opacities": opacities}))
     for ours, theirs, values in pairs:
-        found, expected = slopes_of(ours, values), slopes_of(theirs, values)
+        found, expected = render_and_gradients(ours, values), render_and_gradients(theirs, values)
         for name, truth in expected.items():
             assert (found[name] - truth).norm() <= bound * (truth.norm() + 1e-3), name
 
 
-def slopes_of(draw, values: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Image, depth, alpha, and the gradient of a weighting of all three in each of `values`."""
+def render_and_gradients(draw, values: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Compute image, depth, alpha, and the gradient of a weighting of them in each of `values`."""
     variables = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
     render = draw(variables)
     weight = torch.linspace(0, 1, render.image.numel()).view_as(render.image).to(render.image)

@@ -1,4 +1,4 @@
-"""The page on a completion and on an evaluation: what it shows, and that it needs nothing else."""
+"""Report pages of completions and evaluations: content, escaping, and no external requests."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ HOSTILE = '</script><script>alert(1)</script><img src=x onerror="alert(2)">&\''
 
 
 class Page(HTMLParser):
-    """A page as its tags, each of which has to be closed where it was opened."""
+    """Tags and words of a page; asserts that every tag is closed in order."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -69,12 +69,12 @@ class Page(HTMLParser):
 
 @pytest.fixture
 def out(completed_room, tmp_path) -> Path:
-    """A completion that may be changed."""
+    """A copy of a completion that tests may change."""
     return Path(shutil.copytree(completed_room, tmp_path / "out"))
 
 
 def changed(path: Path, change) -> None:
-    """Rewrite a JSON file as `change` leaves its content."""
+    """Apply `change` to the content of a JSON file."""
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
@@ -255,11 +255,11 @@ def a_file(out: Path) -> None:
     [
         (broken_json, "is not JSON"),
         (other_version, "was written by version 0.0.1"),
-        (a_list, "does not hold what a report needs"),
-        (wrong_type, "does not hold what a report needs (targets.0.hole_fraction"),
+        (a_list, "is damaged"),
+        (wrong_type, "is damaged (targets.0.hole_fraction"),
         (no_summary, "has no summary.json"),
         (no_record, "has no report.json"),
-        (other_record, "differ in cameras"),
+        (other_record, "list different numbers of cameras"),
         (no_folder, "There is no folder"),
         (a_file, "There is no folder"),
     ],
@@ -414,7 +414,7 @@ TABLES = {
     },
     "gain_by_distance": {"1": {"full": 2.0, "reggs": None}, "2": {"full": 1.0, "reggs": 0.5}},
     "notes": [f"reggs is not the paper's {HOSTILE}"],
-    "fid": {"values": {}, "reason": "not asked for"},
+    "fid": {"values": {}, "reason": "not requested"},
     "failures": [{"case": "b", "method": "reggs", "reason": HOSTILE}],
 }
 TIMINGS = {
@@ -448,7 +448,7 @@ def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypat
 @pytest.mark.parametrize("name", ["tables.json", "timings.json"])
 def test_damaged_tables_are_refused(evaluated, name):
     (evaluated / name).write_text('{"methods": 5}')
-    with pytest.raises(InputError, match="does not hold what a report needs"):
+    with pytest.raises(InputError, match="is damaged"):
         evaluation_page(evaluated)
 
 

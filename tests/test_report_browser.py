@@ -1,4 +1,4 @@
-"""The report in a real browser: without any request, with sliders that move."""
+"""The report in a real browser: no requests, and sliders that move."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PLACES = """(drawing) => {
     return [(box.left - whole.left) / whole.width, (box.top - whole.top) / whole.height];
   });
 }"""
-"""Where each part of a drawing begins, as shares of its sides."""
+"""Script that returns the corner of each part of a drawing, as fractions of its size."""
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +50,12 @@ def test_the_slider_goes_from_after_to_before_by_the_keyboard(tab):
     before = pixels_of(frame.screenshot())
     height, width, _ = after.shape
     middle = np.s_[height // 4 : -height // 4, width // 4 : -width // 4]
-    assert np.abs(after - before)[middle].max() > 0.2  # the hole, which the other has not
-    assert before[middle].mean() < after[middle].mean()  # and which is black
+    assert np.abs(after - before)[middle].max() > 0.2  # the filled hole
+    assert before[middle].mean() < after[middle].mean()  # which is black before
 
 
 def test_the_cameras_turn(tab):
-    """Told from where all is drawn: on a busy machine a picture may not come after a key."""
+    """Compares positions: on a busy machine a screenshot may not follow a key press."""
     drawing = tab.page.locator(".turning svg").first
     first = drawing.evaluate(PLACES)
     tab.page.locator(".turning .yaw").first.focus()

@@ -1,4 +1,4 @@
-"""Runs of methods over tasks: what is written, what a stopped run leaves, what is refused."""
+"""Runs of methods over tasks: files, resumed runs, and refused input."""
 
 import copy
 import json
@@ -51,7 +51,7 @@ ROOMS = {"box": Room(), "wide": Room(boxes=(((-4.0, -1.5, -1.0), (4.0, 1.5, 6.0)
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory) -> Path:
-    """Two rooms photographed from four places, frames 2 and 3 beyond what 0 and 1 see."""
+    """Write two rooms with four views each; frames 2 and 3 see more than 0 and 1."""
     root = tmp_path_factory.mktemp("rooms")
     places = ((-0.3, 0), (0.1, 0), (0.7, 12), (0.8, 14))
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in places]
@@ -83,7 +83,7 @@ def tasks(scenes) -> list[Task]:
 
 @pytest.fixture(scope="module")
 def finished(tasks, tmp_path_factory) -> Path:
-    """An uninterrupted run and its tables."""
+    """Return an uninterrupted run and its tables."""
     out = tmp_path_factory.mktemp("runs") / "out"
     assert evaluate(tasks, METHOD_NAMES, out, CONFIG) == RowCounts(8, 0, 0)
     tables(out)
@@ -113,13 +113,13 @@ def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
     assert full["hole_flip"]["value"] < 0.8 * before["hole_flip"]["value"]
     assert full["hole_haarpsi"]["value"] > before["hole_haarpsi"]["value"]
     assert 0 < full["hole_gradients"]["value"] < 10
-    assert "### Looks" in (finished / "tables.md").read_text()
+    assert "### Perceptual quality" in (finished / "tables.md").read_text()
     assert "seconds" not in json.dumps(content)
     assert set(read_json(finished / "timings.json")) == set(METHOD_NAMES)
 
 
 def scores_of(out: Path, method: str) -> list[dict]:
-    """The scores of a method in each task of one step."""
+    """Return the scores of a method in each task of one step."""
     rows = [read_json(path) for path in sorted((out / "tasks").glob(f"*/{method}.json"))]
     return [row["steps"][0]["scores"] for row in rows]
 
@@ -178,7 +178,7 @@ def test_rows_of_a_version_that_had_fewer_scores_still_make_tables(finished, tmp
     assert now["hole_haarpsi"] == {"value": None, "cases": 0}
     text = (out / "tables.md").read_text()
     assert "HaarPSI" not in text
-    assert "scoring again adds the columns" in text
+    assert "score the run again to add the columns" in text
     assert "AbsRel" not in text
     assert "which counted no pixels, so their geometry is left out" in text
 
@@ -227,13 +227,12 @@ for delay in delays:
         live(delay)
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""Runs one after the other, each killed some seconds after it has written something new, or never.
-What they import is imported once, before anything is computed."""
+"""Program of runs in sequence, each killed seconds after it wrote something new, or never."""
 
 
 @pytest.mark.skipif(os.name != "posix", reason="forks, and kills with a POSIX signal")
 def test_a_run_killed_five_times_ends_as_one_that_was_not(scenes, finished, tmp_path):
-    """Every life is a process of its own, as it is for a user."""
+    """Each run is its own process, as for a user."""
 
     def live(*delays: float | str) -> list[int]:
         words = [scenes / "cases.json", out, " ".join(METHOD_NAMES), 6, *delays]
@@ -261,7 +260,9 @@ def test_failures_and_scores_can_be_done_again(tasks, tmp_path, monkeypatch):
     monkeypatch.setitem(METHODS, "no-rc", original)
     assert evaluate(tasks[:1], methods, out, CONFIG, again="failures") == RowCounts(1, 0, 1)
 
-    monkeypatch.setitem(METHODS, "no-rc", defect)  # what is saved is scored, and nothing run
+    monkeypatch.setitem(
+        METHODS, "no-rc", defect
+    )  # saved predictions are scored without running a method
     assert evaluate(tasks[:1], methods, out, CONFIG, again="scores") == RowCounts(2, 0, 0)
 
 
@@ -271,13 +272,13 @@ def test_pictures_are_saved_and_plots_are_drawn(finished):
     before, after, truth = (read_image(box / f"{name}.png") for name in names)
     assert psnr(after, truth) > psnr(before, truth)
     assert read_image(box / "context" / "step-001.png").equal(before)
-    drawn = plots(tables(finished), finished)
-    assert [path.name for path in drawn] == ["gain_by_hole.png", "seconds.png"]
-    for path in drawn:
+    paths = plots(tables(finished), finished)
+    assert [path.name for path in paths] == ["gain_by_hole.png", "seconds.png"]
+    for path in paths:
         ink = read_image(path) < 0.9
         assert ink.any(dim=-1).float().mean() > 0.005
     again = plots(tables(finished), finished)
-    assert again == drawn
+    assert again == paths
 
 
 def test_time_and_memory_are_told_apart_from_scores(finished):
@@ -320,7 +321,7 @@ def test_fid_is_a_number_or_a_reason(finished, monkeypatch):
     assert calls == [[(SIZE, SIZE, 3)] * 2] * len(METHOD_NAMES)
     assert "| full | 2.00 |" in (finished / "tables.md").read_text()
     tables(finished)
-    assert "FID: not asked for" in (finished / "tables.md").read_text()
+    assert "FID: not requested" in (finished / "tables.md").read_text()
 
 
 def test_groups_of_methods():
@@ -332,7 +333,7 @@ def test_groups_of_methods():
 
 
 def test_peak_memory_sees_what_was_let_go_of():
-    # Pages of its own: what earlier tests let go of may still lie about and be used again.
+    # Fresh pages: memory released by earlier tests could be reused.
     with peak_memory() as much, mmap.mmap(-1, 2**28) as pages:
         for page in range(0, 2**28, mmap.PAGESIZE):
             pages[page] = 1
@@ -383,7 +384,7 @@ def test_a_broken_case_is_a_row_with_its_reason(scenes, tasks, tmp_path, monkeyp
 
 @dataclass(frozen=True)
 class CoarseRegGS(RegGSConfig):
-    """Few clusters, for the distance between two sets of them costs their number squared."""
+    """RegGS with few clusters, because its time is quadratic in them."""
 
     components: int = 50
 
@@ -406,7 +407,7 @@ def test_baselines_run(tasks, tmp_path, monkeypatch):
 
 def test_wrong_runs_are_refused(finished, tasks, tmp_path):
     with pytest.raises(
-        InputError, match="no method 'nope'; choose of ablations, baselines, all, context, full"
+        InputError, match="no method 'nope'; choose one of ablations, baselines, all, context, full"
     ):
         check_methods(["context", "nope"])
     with pytest.raises(InputError, match="twice"):
@@ -420,7 +421,7 @@ def test_wrong_runs_are_refused(finished, tasks, tmp_path):
     with pytest.raises(InputError, match="no generator"):
         evaluate(tasks, ["context"], tmp_path / "out", RunConfig(generator="dall-e"))
     assert not (tmp_path / "out").exists()
-    with pytest.raises(InputError, match="seed 0, and 1"):
+    with pytest.raises(InputError, match="seed 0, and this run has 1"):
         evaluate(tasks, ["context"], finished, RunConfig(seed=1, baseline_iterations=6))
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(InputError, match="something other than a run"):
@@ -460,8 +461,8 @@ def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
     out = tmp_path / "out"
     arguments = ["evaluate", chunk.parent, "--protocol", "n-1", "n-2", "--out", out]
     assert run(monkeypatch, *arguments, "--methods", "context", "--device", "cpu") == 0
-    told = " ".join(capsys.readouterr().err.split())
-    assert "Left out wide: frame 0: its opening angle" in told
+    errors = " ".join(capsys.readouterr().err.split())
+    assert "Skipped wide: frame 0: its opening angle" in errors
     rows = [read_json(path) for path in (out / "tasks").glob("*/*.json")]
     reasons = {row["task"]["name"]: row["error"] for row in rows}
     assert len(reasons) == 8

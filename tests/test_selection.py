@@ -1,4 +1,4 @@
-"""Which photographs are chosen to start from, on cameras whose scene is known."""
+"""Selection of context views, on cameras whose scene is known."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from scenes import camera_at
 
 TARGET = camera_at(0.0)
 WALL = points_before(TARGET, 2.0, 4.0)
-"""What the target sees lies two to four units before it."""
+"""Points two to four units in front of the target."""
 
 
 def chosen(candidates: list[Camera], count: int = 2, targets: tuple[Camera, ...] = (TARGET,)):
@@ -26,7 +26,7 @@ def test_the_photographs_on_both_sides_of_the_target_are_chosen():
 
 
 def test_two_that_stand_in_one_place_are_no_pair():
-    """The closest photograph was taken twice; depth comes of it and one that stands elsewhere."""
+    """The closest photograph exists twice; depth needs one from another place."""
     cameras = [camera_at(0.1), camera_at(0.1), camera_at(0.6)]
     first, second = (cameras[i] for i in chosen(cameras))
     assert baseline_between(first, second) > 0.1

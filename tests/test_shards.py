@@ -1,4 +1,4 @@
-"""Shards: processes that share one folder of results, and what the folder is refused for."""
+"""Shards: processes that share one folder of results, and folders that are refused."""
 
 import json
 import os
@@ -57,11 +57,11 @@ os.close(start)
 codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
 print(json.dumps(codes))
 """
-"""Processes that wait for each other and then claim a folder at the same moment."""
+"""Program of processes that claim a folder at the same moment."""
 
 
 def claimed(out: Path, count: int, kinds: int = 1) -> tuple[list[int], str]:
-    """The exit codes of `count` simultaneous claims with `kinds` different settings, and stderr."""
+    """Return exit codes and stderr of `count` claims with `kinds` different settings."""
     words = [sys.executable, "-c", CLAIM, out, count, kinds]
     done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=True)
     return json.loads(done.stdout), done.stderr
@@ -80,8 +80,8 @@ def test_of_simultaneous_claims_with_other_settings_one_kind_wins(tmp_path):
     codes, refused = claimed(tmp_path / "out", 40, kinds=2)
     seed = read_json(tmp_path / "out" / "run.json")["seed"]
     assert codes == [0 if i % 2 == seed else 2 for i in range(40)]
-    told = f"holds a run with seed {seed}, and {1 - seed} is asked for; name another folder."
-    assert refused.count(told) == 20
+    sentence = f"holds a run with seed {seed}, and this run has {1 - seed}; name another folder."
+    assert refused.count(sentence) == 20
 
 
 def test_what_a_killed_process_left_unfinished_is_nobody_elses_content(tmp_path):
@@ -120,9 +120,9 @@ def test_a_folder_remembers_what_its_generator_was_told(tmp_path):
 
     claim(tmp_path, deciding(config(steps=4)))
     claim(tmp_path, deciding(config(steps=4, offload=True)))  # which changes no number
-    with pytest.raises(InputError, match="holds a run with generator_steps 4, and 8 is asked for"):
+    with pytest.raises(InputError, match="holds a run with generator_steps 4, and this run has 8"):
         claim(tmp_path, deciding(config(steps=8)))
-    with pytest.raises(InputError, match=r"run with generator_\w+ \d, and None is asked"):
+    with pytest.raises(InputError, match=r"run with generator_\w+ \d, and this run has None"):
         claim(tmp_path, deciding(RunConfig(generator="pe-field")))
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(InputError, match=r"run.json is not JSON .* name another folder"):
@@ -131,7 +131,7 @@ def test_a_folder_remembers_what_its_generator_was_told(tmp_path):
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory) -> Path:
-    """Three rooms photographed from three places."""
+    """Write three rooms with three views each."""
     root = tmp_path_factory.mktemp("rooms")
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
     names = ("one", "two", "three")
@@ -149,7 +149,7 @@ def tasks(scenes) -> list[Task]:
 
 @pytest.fixture(scope="module")
 def finished(scenes, tmp_path_factory) -> Path:
-    """What one process alone leaves."""
+    """Return the results of a single process."""
     out = tmp_path_factory.mktemp("alone") / "out"
     assert [process.wait() for process in [started(scenes, out, "0/1")]] == [0]
     return out
@@ -203,21 +203,21 @@ def test_three_shards_at_once_end_so_ten_times_out_of_ten(scenes, finished, tmp_
 
 
 def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_path, monkeypatch):
-    """Another shard ends between our reading of the rows and our writing of the tables."""
+    """Another shard ends after the rows are read and before tables are written."""
     out, late = tmp_path / "out", tmp_path / "late.json"
     shutil.copytree(finished, out)
     row = row_paths(out)[0]
     row.rename(late)
-    drawn = []
+    written = []
 
     def draw(summary, out, quiet):
-        drawn.append(len(summary.common))
-        if len(drawn) == 1:
+        written.append(len(summary.common))
+        if len(written) == 1:
             late.rename(row)
 
     monkeypatch.setattr(command, "draw", draw)
     command.show(out, quiet=True, num_rows=6)
-    assert drawn == [2, 3]
+    assert written == [2, 3]
     same_tables(out, finished)
 
 

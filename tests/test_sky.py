@@ -89,7 +89,7 @@ WHITE_ROOMS = {
     "cupboards": ((DEFAULT, BOX, *CUPBOARDS), False, ASIDE),
     "cupboards before a white wall": ((DEFAULT, BOX, *CUPBOARDS), True, FORWARD),
 }
-"""Boxes, whether the end is white like the ceiling, and where the photographs are taken."""
+"""Boxes, True if the end is white like the ceiling, and the positions of the photographs."""
 
 
 def has_sky(views: list[View]) -> bool:
@@ -199,7 +199,7 @@ def test_only_surfaces_are_compared_with_surfaces():
 
 
 def test_what_another_view_could_not_have_seen_is_hidden_by_nothing():
-    """Four columns leave the other image at the depth of what it shows in their direction."""
+    """Four columns leave the other image at the depth that it shows in their direction."""
     there, back = np.eye(3, 4, dtype=np.float32), np.eye(3, 4, dtype=np.float32)
     there[0, 3], back[0, 3] = -10, 10
     near = Neighbour(np.full((32, 32), 0.5, np.float32), there, back)

@@ -1,4 +1,4 @@
-"""The depth that PE-Field's positions come from: positive everywhere, in the scene's unit."""
+"""Source depth of PE-Field's positions: positive everywhere, in the unit of the scene."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -139,14 +139,14 @@ def tiny_glpn(folder: Path) -> Path:
 @pytest.mark.parametrize("tiny", [tiny_dpt, tiny_glpn])
 def test_other_networks_of_transformers_are_read_as_what_they_give(tiny, tmp_path, monkeypatch):
     pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
-    asked = []
+    calls = []
     for name in ("rescaled", "from_disparity"):
         fit = getattr(source_depth, name)
         monkeypatch.setattr(
-            source_depth, name, lambda *a, name=name, fit=fit: asked.append(name) or fit(*a)
+            source_depth, name, lambda *a, name=name, fit=fit: calls.append(name) or fit(*a)
         )
     depth = source_depth_named(str(tiny(tmp_path)))(VIEW, holed())
-    assert asked == ["from_disparity" if tiny is tiny_dpt else "rescaled"]
+    assert calls == ["from_disparity" if tiny is tiny_dpt else "rescaled"]
     assert depth.shape == (96, 96)
     assert (depth > 0).all()
 
@@ -154,7 +154,7 @@ def test_other_networks_of_transformers_are_read_as_what_they_give(tiny, tmp_pat
 def test_a_network_of_which_it_is_not_known_what_it_gives_is_refused(tmp_path, monkeypatch):
     folder = str(tiny_model(tmp_path))
     monkeypatch.setattr(source_depth, "METRIC", {"dpt": False})
-    with pytest.raises(InputError, match=r"is a depth_anything, of which .* choose one of dpt"):
+    with pytest.raises(InputError, match=r"unsupported kind depth_anything; choose one of dpt"):
         source_depth_named(folder)
 
 
@@ -170,12 +170,12 @@ def test_a_network_that_lacks_a_tensor_is_refused(tmp_path):
 
 def test_the_depth_of_the_scene_and_the_published_network_have_names(monkeypatch):
     assert source_depth_named("context") is context_depth
-    asked = []
+    calls = []
     monkeypatch.setattr(
-        source_depth, "load_monocular", lambda *names: asked.append(names) or context_depth
+        source_depth, "load_monocular", lambda *names: calls.append(names) or context_depth
     )
     source_depth_named("monocular", "cuda")
-    assert asked == [(source_depth.MONOCULAR, "cuda")]
+    assert calls == [(source_depth.MONOCULAR, "cuda")]
 
 
 def test_a_model_of_transformers_gives_a_depth_in_the_scenes_unit(tmp_path):

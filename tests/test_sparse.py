@@ -28,7 +28,7 @@ LOW, SIDE = -6, 12
 
 
 def random_grid(share: float = 0.15, seed: int = 0) -> Grid:
-    """Two scenes of voxels around the origin, and one voxel that no other one touches."""
+    """Create two scenes of voxels around the origin, with one isolated voxel."""
     generator = torch.Generator().manual_seed(seed)
     occupied = torch.rand(2, SIDE - 2, SIDE - 2, SIDE - 2, generator=generator) < share
     occupied[1, :4, :4, :4] = False
@@ -43,7 +43,7 @@ def random(*shape: int, seed: int = 1) -> torch.Tensor:
 
 
 def dense(features: torch.Tensor, grid: Grid) -> torch.Tensor:
-    """The features in an array [2, c, SIDE, SIDE, SIDE] of zeros."""
+    """Scatter the features into zeros of shape [2, c, SIDE, SIDE, SIDE]."""
     array = features.new_zeros((2, SIDE, SIDE, SIDE, features.shape[1]))
     batch, x, y, z = grid.coordinates.unbind(1)
     array[batch, x - LOW, y - LOW, z - LOW] = features
@@ -51,14 +51,14 @@ def dense(features: torch.Tensor, grid: Grid) -> torch.Tensor:
 
 
 def at(array: torch.Tensor, grid: Grid) -> torch.Tensor:
-    """The values of `array`, whose cells are those of the grid's stride, at the grid's rows."""
+    """Read `array`, which has the grid's stride, at the rows of the grid."""
     batch = grid.coordinates[:, 0]
     x, y, z = ((grid.coordinates[:, 1:] - LOW) // grid.stride).unbind(1)
     return array[batch, :, x, y, z]
 
 
 def dense_kernel(kernel: torch.Tensor) -> torch.Tensor:
-    """[27, in, out] as torch has it, [out, in, x, y, z]."""
+    """Convert a kernel [27, in, out] to torch's [out, in, x, y, z]."""
     array = kernel.new_zeros((kernel.shape[2], kernel.shape[1], 3, 3, 3))
     for (x, y, z), matrix in zip(OFFSETS, kernel, strict=True):
         array[:, :, x + 1, y + 1, z + 1] = matrix.T
@@ -235,7 +235,7 @@ def test_the_u_net_agrees_with_minkowski_engine(small):
 
 
 def test_two_convolutions_over_one_table_agree_with_minkowski_engine(small):
-    """The head takes what the U-Net gives."""
+    """The input of the head is the output of the U-Net."""
     head = with_sparse_rule(GaussianHead(8, 5))
     with torch.inference_mode():
         found = head(small["unet_out"], Grid(small["coords"].long()))

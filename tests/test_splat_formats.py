@@ -1,4 +1,4 @@
-"""Formats of splats: the same picture from each of them, and a sentence for what is no splat."""
+"""Splat formats: each reads as the same picture, and other files give a sentence."""
 
 import gzip
 import json
@@ -48,7 +48,7 @@ CPU = load_renderer("cpu")
 
 
 def psnr(a: Gaussians, b: Gaussians) -> float:
-    """How alike two scenes look, in dB, the worst of three cameras."""
+    """Compute the PSNR between two scenes in dB, the worst of three cameras."""
     cameras = [
         camera_at(size=64),
         camera_at(0.5, -0.3, yaw=20, size=64),
@@ -63,7 +63,7 @@ def psnr(a: Gaussians, b: Gaussians) -> float:
 
 
 def covariances(gaussians: Gaussians) -> torch.Tensor:
-    """[n, 3, 3], which unlike quaternions are the same however axes are called and signed."""
+    """Compute [n, 3, 3], which unlike quaternions is independent of axis order and sign."""
     w, x, y, z = torch.nn.functional.normalize(gaussians.quats.double(), dim=1).unbind(1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -135,7 +135,7 @@ def test_a_splat_keeps_position_and_size_and_rounds_the_rest(tmp_path):
 
 @pytest.mark.parametrize("name", FORMATS_BUT_PLY)
 def test_every_format_shows_the_same_picture(tmp_path, name):
-    """Frames, rotations and harmonics are right, or the picture would be another."""
+    """Axes, rotations and harmonics are right, or the picture would be another."""
     gaussians = plausible(400, 0 if name.endswith(".splat") else 3)
     loaded = load_splat(made(tmp_path, name, gaussians))
     assert psnr(loaded, gaussians) > 33
@@ -331,7 +331,7 @@ def test_what_is_no_splat_is_refused(tmp_path):
         ("g.json", b'{"frames": []}', "no .sog"),
         ("g.gltf", b'{"asset": {}}', "no .sog"),
         ("h.ksplat", b"\x00\x07" + bytes(4094), "is empty"),
-        ("i.ksplat", b"\x09" + bytes(4095), "no .ksplat that is known"),
+        ("i.ksplat", b"\x09" + bytes(4095), "which cannot be read"),
     ]:
         (tmp_path / name).write_bytes(data)
         refused(tmp_path / name, sentence)
@@ -368,7 +368,7 @@ def test_a_sog_opens_no_files_but_its_own(tmp_path):
         meta["quats"]["files"] = [name]
         folder = tmp_path / f"scene{len(os.listdir(tmp_path))}"
         write_sog(folder, files | {"meta.json": json.dumps(meta).encode()})
-        refused(folder, "none of its own")
+        refused(folder, "not beside it")
 
 
 @pytest.mark.parametrize("name", ["scene.splat", "scene.glb"])
@@ -387,7 +387,7 @@ def test_numbers_that_are_none_are_counted_or_left_out(tmp_path, name):
 
 
 def of_three(sizes: float, opacity: float) -> Gaussians:
-    """Three Gaussians, of which the second has other sizes and another opacity."""
+    """Make three Gaussians; the second has other sizes and another opacity."""
     gaussians = plausible(3, 0)
     scales, opacities = gaussians.scales.clone(), gaussians.opacities.clone()
     scales[1] *= sizes
@@ -426,12 +426,12 @@ def test_names_and_versions_of_others_are_quoted_in_part(tmp_path):
         {**table, "means": {long: 1}},
     ):
         (path / "meta.json").write_text(json.dumps(changed))
-        assert len(refused(path, "version|means nothing|names a file")) <= 287
+        assert len(refused(path, "version|is invalid|names a file")) <= 287
     gaussians, binary = glb_table(plausible(20, 0))
     primitive = gaussians["meshes"][0]["primitives"][0]
     primitive["extensions"]["KHR_gaussian_splatting"] = {"kernel": long, "colorSpace": long}
     primitive["extensions"][long] = {}
-    assert len(refused(write_glb(tmp_path / "long.glb", gaussians, binary), "not known")) <= 287
+    assert len(refused(write_glb(tmp_path / "long.glb", gaussians, binary), "unknown way")) <= 287
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):
@@ -463,7 +463,7 @@ def test_convert_writes_once_and_says_what_it_wrote(tmp_path, monkeypatch, capsy
 
 
 def test_convert_writes_the_plain_layout_of_all_gaussians(tmp_path, monkeypatch):
-    """As another reader takes it that misreads the label; beside other formats no labels lie."""
+    """For readers that misread the label; other formats get no labels file."""
     given = replace(plausible(30, 1), generated=(torch.arange(30) % 3).to(torch.uint8))
     save_splat(tmp_path / "completed.ply", given)
     for name in ("x.ply", "x.spz", "x.compressed.ply"):
@@ -502,11 +502,11 @@ def test_files_of_others_are_read_as_a_third_party_reads_them(shared):
 def test_opaque_gaussians_that_a_third_party_decoded_are_kept(
     shared, tmp_path, monkeypatch, capsys
 ):
-    """Their logits are infinite in its .ply; that is said, and written anew they are finite."""
+    """Their logits are infinite in its .ply; that is reported, and finite once saved again."""
     folder, out = shared / "formats" / "gaussians", tmp_path / "out.ply"
     assert run(monkeypatch, "convert", folder / "guitar.from-compressed.ply", out) == 0
     said = capsys.readouterr().out.replace("\n", " ")
-    assert "Of 90,854 Gaussians 667 have a logit of opacity of +infinity and 0 of" in said
+    assert "667 of 90,854 Gaussians have an opacity logit of +infinity and 0 of" in said
     camera = camera_at(0.29, -1.13, -1.5, size=96)
     truth, ours = (
         CPU.render(load_splat(path), camera).image
@@ -518,7 +518,7 @@ def test_opaque_gaussians_that_a_third_party_decoded_are_kept(
 
 
 def test_a_scene_in_two_formats_of_others_is_one_scene(shared):
-    """SPZ has other axes than a compressed .ply; the pictures tell whether they were turned."""
+    """SPZ has other axes than a compressed .ply; wrong axes would change the picture."""
     folder = shared / "formats" / "gaussians"
     spz, ply = (load_splat(folder / name) for name in ("biker.spz", "biker.compressed.ply"))
     camera = camera_at(-0.1, -1.6, -3.0, size=96)
@@ -539,7 +539,7 @@ def test_the_smallest_files_are_read(shared):
 
 @pytest.fixture
 def splat_transform():
-    """A third-party converter, as a function of two paths."""
+    """Make a third-party converter, as a function of two paths."""
     cli, node = os.environ.get("SPLAT_TRANSFORM"), shutil.which("node")
     if node is None or cli is None or not Path(cli).is_file():
         pytest.skip("needs node, and SPLAT_TRANSFORM with the cli.mjs of splat-transform")

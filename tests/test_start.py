@@ -1,4 +1,4 @@
-"""What a completion never imports."""
+"""Start and end of the command's process."""
 
 import os
 import subprocess
@@ -20,7 +20,7 @@ print(*sys.modules)
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory) -> set[str]:
-    """The modules that a quiet completion of a small room ends with."""
+    """Return the modules that a quiet completion of a small room has imported."""
     folder = tmp_path_factory.mktemp("start")
     cameras = [camera_at(x, yaw=yaw, size=32) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
     scene = photographed(folder / "room", cameras)
@@ -64,7 +64,7 @@ atexit.register(print, "done at the end")
 
 
 def ended(*words: str, **settings) -> subprocess.CompletedProcess[str]:
-    """The command as it is installed, in a process of its own."""
+    """Run the command as it is installed, in a process of its own."""
     command = [sys.executable, "-c", ENDING, *words]
     return subprocess.run(command, text=True, stderr=subprocess.PIPE, check=False, **settings)
 

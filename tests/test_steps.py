@@ -1,4 +1,4 @@
-"""Long sequences: each step begins with what the last one left, and all of it can be resumed."""
+"""Long sequences: each step starts from the last scene, and runs can be resumed."""
 
 import json
 import math
@@ -48,7 +48,7 @@ TABLES = ("tables.md", "tables.tex", "tables.json")
 
 @dataclass(frozen=True)
 class Walk(PosedPhotographs):
-    """A walk through the room, of which some frames cannot be read."""
+    """A walk through the room with unreadable frames."""
 
     names = ()
     origin = np.zeros(3)
@@ -80,7 +80,7 @@ FOLDER = "walk-0+1-to-2..3"
 
 @dataclass(frozen=True)
 class FewClusters(RegGSConfig):
-    """RegGS in little time."""
+    """Fast RegGS with few clusters."""
 
     components: int = 100
 
@@ -94,7 +94,7 @@ def few_clusters():
 
 @pytest.fixture(scope="module", autouse=True)
 def small_holes():
-    """Those of this room have some 45 to 60 pixels."""
+    """Accept the small holes of this room, of about 45 to 60 pixels."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(steps, "MIN_PIXELS", 40)
         yield
@@ -112,7 +112,7 @@ def ours(begun, tmp_path_factory) -> Progress:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
-    """An uninterrupted run and its tables."""
+    """Return an uninterrupted run and its tables."""
     out = tmp_path_factory.mktemp("runs") / "out"
     assert evaluate([SHORT], METHOD_NAMES, out, CONFIG) == RowCounts(3, 0, 0)
     tables(out)
@@ -120,13 +120,13 @@ def finished(tmp_path_factory) -> Path:
 
 
 def turned_away(view: View) -> View:
-    """The same photograph as if taken by a camera that looks the other way."""
+    """Return the same photograph with a camera that faces the other way."""
     back = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
     return replace(view, camera=replace(view.camera, c2w=view.camera.c2w @ back))
 
 
 def without_cost(path: Path) -> bytes:
-    """A row, with the stages that were timed but neither how long they took nor the memory."""
+    """Drop times and memory from a row, but keep the names of stages."""
     row = read_json(path)
     for step in row["steps"]:
         step["seconds"], step["peak_bytes"] = sorted(step["seconds"]), None
@@ -148,7 +148,7 @@ def psnr_of(step: dict, when: str = "after") -> float:
     return step["scores"][f"target_{when}"]["psnr"]
 
 
-# The protocol.
+# The protocol
 
 
 def test_a_sequence_begins_with_two_frames_and_goes_on_by_the_same_step():
@@ -179,7 +179,7 @@ def test_a_sequence_of_nothing_or_too_much_is_refused(text):
         parse_protocol(text)
 
 
-# Steps.
+# Steps
 
 
 def test_ours_improves_every_view_of_a_sequence_and_stays_metric(begun, ours):
@@ -221,7 +221,10 @@ def test_the_baseline_may_choose_them_too(begun, finished):
         predicted = METHODS[method](state, begun.targets[1].camera, begun.models)
         assert state.views[predicted.anchor].frame == 2
     steps = read_json(finished / "tasks" / FOLDER / "reggs.json")["steps"]
-    assert [step["anchor"] for step in steps] == [0, 0]  # the widest of those not turned away
+    assert [step["anchor"] for step in steps] == [
+        0,
+        0,
+    ]  # the widest baseline of those not rotated away
 
 
 def test_the_baseline_adds_all_that_it_lifts_and_the_context_adds_nothing(finished):
@@ -278,7 +281,7 @@ def test_the_gain_of_a_step_counts_by_its_distance_to_what_is_known_by_then():
     assert {gap: cells["full"].value for gap, cells in found.items()} == {2: 2, 4: 2, 12: 2}
 
 
-# Runs.
+# Runs
 
 
 def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path, monkeypatch):
@@ -368,12 +371,14 @@ def test_a_step_that_fails_is_the_last(begun, tmp_path, monkeypatch):
 
 def test_methods_that_change_the_scene_are_refused(tmp_path):
     for method in ("densify-100", "distill"):
-        with pytest.raises(InputError, match=f"'{method}' changes the scene .* choose of context"):
+        with pytest.raises(
+            InputError, match=f"'{method}' changes existing Gaussians, .* choose one of context"
+        ):
             evaluate([walk()], ["full", method], tmp_path / "out", CONFIG)
     assert not (tmp_path / "out").exists()
 
 
-# Tables.
+# Tables
 
 
 def test_the_tables_say_what_the_steps_say(finished):
@@ -403,7 +408,7 @@ def test_a_damaged_row_is_named(finished, tmp_path):
         tables(out)
 
 
-# The command.
+# The command
 
 
 def test_the_command_runs_end_to_end(tmp_path, monkeypatch, capsys):
@@ -413,18 +418,20 @@ def test_the_command_runs_end_to_end(tmp_path, monkeypatch, capsys):
     by_steps = ["--protocol", "sequence-1", "--generator", "oracle", "--device", "cpu"]
     arguments = ["evaluate", tmp_path, "--out", out, *by_steps, "--methods"]
     assert run(monkeypatch, *arguments, "context", "full") == 0
-    said = capsys.readouterr()
-    assert "Left out short: it has 2 frames, and sequence-1 needs 3." in " ".join(said.err.split())
+    captured = capsys.readouterr()
+    assert "Skipped short: it has 2 frames, and sequence-1 needs 3." in " ".join(
+        captured.err.split()
+    )
     assert len(list(out.glob("sequence_long*.png"))) == 1
-    assert "Scored 2, failed 0" in said.err
-    assert "1 of 1 cases" in said.out
-    assert "PSNR at the end" in said.out
+    assert "Scored 2, failed 0" in captured.err
+    assert "1 of 1 cases" in captured.out
+    assert "PSNR at the end" in captured.out
     scores = read_json(out / "tables.json")["methods"]
     assert scores["full"]["psnr"]["value"] > scores["context"]["psnr"]["value"] + 0.5
     assert run(monkeypatch, *arguments, "context", "full", "--quiet") == 0
     assert capsys.readouterr().out == ""
     assert run(monkeypatch, *arguments, "distill") == 2
-    assert "'distill' changes the scene" in " ".join(capsys.readouterr().err.split())
+    assert "'distill' changes existing Gaussians" in " ".join(capsys.readouterr().err.split())
     index = ["index", tmp_path, "--protocol", "sequence-1", "--out", tmp_path / "index.json"]
     assert run(monkeypatch, *index) == 2
     assert "has no index" in capsys.readouterr().err

@@ -40,7 +40,7 @@ def pair(baseline: float = 0.4) -> list[View]:
 
 
 def pitched(view: View, degrees: float) -> View:
-    """The photograph with a pose that is wrong by a turn about the camera's horizontal axis."""
+    """The photograph with a pose rotated about the camera's horizontal axis."""
     angle = np.deg2rad(degrees)
     turn = torch.eye(4)
     turn[1, 1] = turn[2, 2] = float(np.cos(angle))
@@ -209,9 +209,9 @@ def test_bands_of_rows_fit_the_surfaces_of_one(monkeypatch, threads, iterations)
 
     monkeypatch.setattr(variation, "run", counted)
     for count in (1, threads):
-        heights, slopes = np.zeros(shape, np.float32), np.zeros((2, *shape), np.float32)
-        variation.fit(heights, slopes, *given, threads=count)
-        found.append(np.concatenate([heights[None], slopes]))
+        heights, gradients = np.zeros(shape, np.float32), np.zeros((2, *shape), np.float32)
+        variation.fit(heights, gradients, *given, threads=count)
+        found.append(np.concatenate([heights[None], gradients]))
     assert np.array_equal(*found)
     assert np.abs(found[0]).max() > 0
     assert parts == [threads, threads - 1] * -(-iterations // variation.AT_ONCE)
@@ -267,18 +267,20 @@ def test_what_photographs_object_to_fades_and_the_rest_stays():
 
 
 def test_a_step_on_the_opacities_draws_one_photograph(monkeypatch):
-    views, drawn = pair(), []
+    views, centers = pair(), []
     plan = CpuView.plan
 
     def counted(view, new):
         render = plan(view, new)
-        return lambda opacities: drawn.append(view.viewpoint.pinhole.center[0]) or render(opacities)
+        return lambda opacities: (
+            centers.append(view.viewpoint.pinhole.center[0]) or render(opacities)
+        )
 
     monkeypatch.setattr(CpuView, "plan", counted)
     fit_opacities(merge([gaussians_of(view) for view in views]), views, load_renderer("cpu"))
-    assert len(drawn) == OPACITY_STEPS
-    assert drawn[::2] == [views[0].camera.center[0]] * (OPACITY_STEPS // 2)
-    assert drawn[1::2] == [views[1].camera.center[0]] * (OPACITY_STEPS // 2)
+    assert len(centers) == OPACITY_STEPS
+    assert centers[::2] == [views[0].camera.center[0]] * (OPACITY_STEPS // 2)
+    assert centers[1::2] == [views[1].camera.center[0]] * (OPACITY_STEPS // 2)
 
 
 def test_colours_get_back_what_drawing_blurs():
@@ -311,7 +313,7 @@ def test_an_unseen_view_profits_too(x):
 
 
 def test_no_pinholes_when_the_camera_moves_on_by_a_baseline():
-    """What is thin there is part of a hole that is at least three pixels wide."""
+    """Thin pixels are part of a hole at least three pixels wide."""
     moved = camera_at(0.6, size=SIZE)
     render = load_renderer("cpu").render(PlaneSweep()(pair()).gaussians, moved)
     thin = (render.alpha < 0.5).numpy().astype(np.uint8)

@@ -1,4 +1,4 @@
-"""A completed scene gives back the file that it was made of, byte for byte."""
+"""A completed scene restores its input file, byte for byte."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from scenes import labelled, random_gaussians
 
 
 def added(count: int = 20, sh_degree: int = 0) -> Gaussians:
-    """What a completion adds, for two targets."""
+    """Make Gaussians generated for two targets."""
     new = random_gaussians(count, seed=9, sh_degree=sh_degree)
     return replace(new, generated=(torch.arange(count) % 2 + 1).to(torch.uint8))
 
@@ -28,7 +28,7 @@ def stripped(monkeypatch: pytest.MonkeyPatch, completed: Path, name: str = "cont
 
 
 def foreign(path: Path) -> Path:
-    """A .ply that is not ours: a comment, normals, two columns more, another order."""
+    """Write a .ply of another program: a comment, normals, two more columns, another order."""
     save_ply(path, random_gaussians(60, sh_degree=1))
     vertex = plyfile.PlyData.read(str(path))["vertex"].data
     names = list(vertex.dtype.names)
@@ -45,7 +45,7 @@ def foreign(path: Path) -> Path:
 
 @pytest.mark.parametrize("degrees", [(0, 0), (3, 3), (3, 0), (0, 2), (1, 3)])
 def test_a_scene_that_we_wrote_comes_back(tmp_path, monkeypatch, degrees):
-    """Padding for the harmonics of what was added goes again, too."""
+    """SH padding for the added Gaussians is removed, too."""
     given, new = degrees
     save_ply(tmp_path / "given.ply", random_gaussians(50, sh_degree=given))
     scene = merge([load_ply(tmp_path / "given.ply"), added(sh_degree=new)])
@@ -111,7 +111,7 @@ def test_ascii_and_big_endian_scenes(tmp_path, monkeypatch, options):
     plyfile.PlyData(list(data.elements), **options).write(str(given))
     save_like(tmp_path / "completed.ply", load_ply(given), added(), given)
     context = stripped(monkeypatch, tmp_path / "completed.ply")
-    # Of an ASCII file the values come back, not the digits.
+    # An ASCII file keeps its values, not its digits.
     kept = tmp_path / "ours.ply" if "text" in options else given
     assert len(load_ply(tmp_path / "stripped-context.ply")) == 30
     assert "text" in options or context == kept.read_bytes()
@@ -167,7 +167,7 @@ def test_a_removed_ply_of_another_scene_is_refused(tmp_path, monkeypatch, capsys
     refused("do not ascend")
     removed.unlink()
     save_ply(completed, added())
-    refused("all of it was generated")
+    refused("holds only generated Gaussians")
     assert run(monkeypatch, "strip", removed, "--out", tmp_path / "context.ply") == 2
     assert not (tmp_path / "context.ply").exists()
 

@@ -1,4 +1,4 @@
-"""A scene that was brought, opaque everywhere: what no photograph supports is a hole."""
+"""Input splats, opaque everywhere: regions that no photograph confirms are holes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ SURFACES = merge([gaussians_of(view) for view in (VIEWS[0], VIEWS[2])])
 
 
 def shreds():
-    """Gaussians before the target, in colours of nothing, where no photograph looks."""
+    """Make floaters in arbitrary colours in front of the target, unseen by photographs."""
     view = view_of(Room(), TARGET)
     found = gaussians_of(view, 0.8 * view.depth)
     seen = [inside(*project(found.means, camera), camera) for camera in PHOTOGRAPHS]
@@ -89,7 +89,7 @@ def test_surfaces_are_supported_and_shreds_are_not():
     sums = weight_sums(AT_TARGET)
     found, drawn = support(evidence, sums, TARGET), sums > 0.1
     assert found[drawn & ~ARE_SHREDS].median() > 0.8
-    # A few reach into the border of a photograph.
+    # A few overlap the border of a photograph.
     assert found[drawn & ARE_SHREDS].quantile(0.9) < 0.1
 
 
@@ -147,7 +147,7 @@ def test_shreds_give_way_to_what_belongs_there():
 
 
 class NearReconstructor:
-    """All that it makes stands a fifth too near."""
+    """Ψ whose Gaussians are a fifth too near."""
 
     def __call__(self, views):
         depths = [0.8 * view_of(Room(), view.camera).depth for view in views]
@@ -155,7 +155,7 @@ class NearReconstructor:
 
 
 def test_closing_a_hole_makes_up_for_nothing_that_was_good():
-    """Half of the room is missing at every photograph, too, which all gain by what is added."""
+    """Half of the room is missing in every photograph, too, so additions improve them all."""
     half = SURFACES[SURFACES.means[:, 0] < 0.3]
     paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
     unmended = AlignmentConfig(align_at="none"), RegistrationConfig(iterations=0)
@@ -179,7 +179,7 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
 
 
 def test_what_is_added_is_drawn_only_where_it_counts(monkeypatch):
-    """All over the photographs; and at the target, whose wider camera is asked last, in holes."""
+    """All over the photographs, and at the padded target, which is rendered last, in holes."""
     asked, plan = [], CpuView.plan_appearance
 
     def noted(self, new, where):
@@ -219,7 +219,7 @@ def test_what_is_added_is_fitted_to_all_photographs_at_once():
     view = view_of(Room(), TARGET)
     hidden = gaussians_of(view)
     seen = torch.stack([inside(*project(hidden.means, c), c) for c in PHOTOGRAPHS]).any(0)
-    # Before the photographs stands what is black in them.
+    # Black Gaussians occlude the photographs.
     before = gaussians_of(VIEWS[1], 0.5 * VIEWS[1].depth)
     black = replace(before, sh=sh_from_rgb(torch.zeros(SIZE * SIZE, 3)))
     allowed = [error_of(SURFACES, v) for v in VIEWS]
@@ -287,7 +287,7 @@ def complete(scene, splat, out, *more):
 
 @pytest.mark.parametrize("worth", [0, WORTH], ids=["sorted", "as-given"])
 def test_the_command_sets_aside_and_strip_puts_back(tmp_path, monkeypatch, worth):
-    """To the byte, whether or not the scene was sorted in between."""
+    """Restored to the byte, whether or not the scene was sorted in between."""
     monkeypatch.setattr("gscompleter.commands.complete.WORTH", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = tmp_path / "splat.ply", tmp_path / "out"

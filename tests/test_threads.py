@@ -1,4 +1,4 @@
-"""All libraries share the cores they are given, and the result does not depend on how many."""
+"""Threads of all libraries; the result does not depend on their number."""
 
 import hashlib
 import os
@@ -24,7 +24,7 @@ print(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS, cv2.getNumThreads
 
 
 def counted(*arguments: str, **told: str) -> list[int]:
-    """Threads of torch, numba and OpenCV in a process to which the environment says only `told`."""
+    """Count the threads of torch, numba and OpenCV in a process with only these variables."""
     environment = {k: v for k, v in os.environ.items() if k not in threads.LIBRARIES} | told
     command = [sys.executable, "-c", COUNTS, *arguments]
     life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
@@ -99,7 +99,7 @@ def test_what_fails_meanwhile_fails_for_who_asks(monkeypatch, count):
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_many_are_made_at_once_each_on_a_thread_of_its_own(monkeypatch, count):
-    """What a kernel is given there it does where it is called, and not on threads that share it."""
+    """Kernels run in the calling thread there, not on threads that share the work."""
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", count)
 
     def threads_of(_number: int) -> tuple[int, set[int]]:

@@ -1,4 +1,4 @@
-"""Scene folders: what is read is exactly what was meant, and what is wrong is said."""
+"""`transforms.json` scenes: values are read exactly, and errors name what is wrong."""
 
 import json
 import math
@@ -20,7 +20,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_scene(folder: Path, images: dict[str, np.ndarray], **extra) -> Path:
-    """A scene of identity poses, 1 m apart, with fl 50 px."""
+    """Write a scene of identity poses, 1 m apart, with a focal length of 50 px."""
     folder.mkdir(exist_ok=True)
     frames = []
     for number, (name, pixels) in enumerate(images.items()):
@@ -200,7 +200,7 @@ def test_true_depth_carries_pixels_from_one_photograph_to_the_next(shared, name,
 
 
 def turned(degrees: float) -> np.ndarray:
-    """A camera-to-world matrix turned about the vertical axis, in nerfstudio's axes."""
+    """Return a camera-to-world matrix rotated about the vertical axis, in nerfstudio's axes."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[c, 0, s, 0.3], [0, 1, 0, -0.2], [-s, 0, c, 2.0], [0, 0, 0, 1]])
 
@@ -426,7 +426,7 @@ def test_downscaled_copies_take_the_place_of_photographs_that_are_not_there(tmp_
 
 
 def image_of(tmp_path: Path, pixels: np.ndarray, mode: str | None = None) -> list[float]:
-    """The top-left colour of a picture that is saved and loaded as a scene of one frame."""
+    """Return the top-left colour of an image saved and loaded as a scene of one frame."""
     scene = write_scene(tmp_path / "s", {"a.png": noise(*pixels.shape[:2])})
     image = Image.fromarray(pixels)
     (image if mode is None else image.convert(mode)).save(scene / "a.png")
@@ -443,7 +443,7 @@ def test_pictures_of_every_kind_become_colours(tmp_path):
 
 
 def with_depth(scene: Path, depth: np.ndarray) -> Path:
-    """The scene with a depth map of its first frame, as an array file."""
+    """Add a depth map of the first frame, as an array file."""
     np.save(scene / "d.npy", depth)
     return changed(scene, lambda c: c["frames"][0].update(depth_file_path="d.npy"))
 

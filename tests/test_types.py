@@ -1,4 +1,4 @@
-"""Cameras and views that cannot be are refused where they are made."""
+"""Impossible cameras and views are refused where they are made."""
 
 import math
 from dataclasses import replace
@@ -57,7 +57,10 @@ def test_a_rotation_may_be_rounded_and_planes_may_be_unknown():
         ({"image": torch.zeros(32, 32, 3, dtype=torch.uint8)}, "no tensor of floats"),
         ({"image": np.zeros((32, 32, 3))}, "no tensor of floats"),
         ({"depth": torch.zeros(16, 32)}, "The depth of a view has the shape"),
-        ({"ignored": torch.zeros(1, 1, dtype=torch.bool)}, "The ignored of a view has the shape"),
+        (
+            {"ignored": torch.zeros(1, 1, dtype=torch.bool)},
+            "The ignore mask of a view has the shape",
+        ),
     ],
 )
 def test_an_image_that_is_not_its_cameras_is_refused_at_once(change, sentence):
@@ -79,7 +82,7 @@ def test_values_that_no_stage_can_work_with_are_refused_before_any_work():
 
 
 def unchecked(make, *arguments, **changes):
-    """Call `make` as without the types that these tests check everywhere."""
+    """Call `make` without the type checks of these tests."""
     from jaxtyping import config
 
     before = config.jaxtyping_disable

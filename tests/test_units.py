@@ -17,13 +17,13 @@ POSES = ((-0.3, 0), (0.1, 0), (0.7, 12))
 
 
 def cameras(unit: float, size: int = 64):
-    """Two views and a target, whose depth range nobody tells."""
+    """Make two views and a target without a depth range."""
     found = [camera_at(x, yaw=yaw, size=size, unit=unit) for x, yaw in POSES]
     return [replace(camera, near=None, far=None) for camera in found]
 
 
 def picture(unit: float, with_scene: bool) -> Tensor:
-    """What the target sees of the room in that unit once it is completed."""
+    """Render the target in the completed room, in that unit."""
     left, right, target = cameras(unit)
     views = [view_of(Room(unit=unit), camera) for camera in (left, right)]
     scene = gaussians_of(views[0]) if with_scene else None

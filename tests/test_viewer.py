@@ -1,4 +1,4 @@
-"""The page of the viewer without a browser: what it holds, what it may hold, who may read it."""
+"""The viewer page without a browser: its content, its limits, and its server."""
 
 import base64
 import hashlib
@@ -51,11 +51,11 @@ from scenes import camera_at
 from viewer_pages import LEFT, SIDE, TARGET, room_exhibit, room_from
 
 NONE = Libraries({}, {})
-"""A page without libraries draws nothing, which nobody sees without a browser."""
+"""A page without libraries renders nothing, which only a browser would notice."""
 
 
 def content_of(page: Page) -> dict:
-    """What the page holds for its program."""
+    """Read the content that the page has for its program."""
     found = re.findall(
         r'<script type="application/json" id="content">(.*?)</script>', page.html.decode(), re.S
     )
@@ -63,7 +63,7 @@ def content_of(page: Page) -> dict:
 
 
 def gaussians_in(page: Page, layer: str, folder: Path) -> Gaussians:
-    """A layer of a page, read back."""
+    """Read a layer of a page."""
     calls = re.findall(rb'gscPart\("(\w+)", "([^"]*)"\)', page.html + b"".join(page.parts.values()))
     source = content_of(page)["layers"][layer].encode()
     path = folder / f"{layer}.spz"
@@ -100,7 +100,7 @@ def registry(tmp_path, monkeypatch) -> Path:
 
 
 def archive_in(folder: Path, package: Package) -> Path:
-    """Where the registry of a test has an archive."""
+    """Get the path of an archive in the registry of a test."""
     return folder / "registry" / package.path
 
 
@@ -135,7 +135,7 @@ def test_an_archive_that_was_tampered_with_is_refused_and_not_kept(registry):
     three = three_of(registry)
     source = archive_in(registry.parent, three)
     source.write_bytes(source.read_bytes() + b"\0")
-    with pytest.raises(InputError, match="three 1.2.3 as it was pinned"):
+    with pytest.raises(InputError, match="is not three 1.2.3: its SHA-512 differs"):
         archive_of(three)
     assert not place_of(three).exists()
 
@@ -153,7 +153,7 @@ def test_without_a_connection_a_sentence_says_where_to_put_what(registry):
     archive_in(registry.parent, three).unlink()
     with pytest.raises(InputError, match="cannot be reached") as refused:
         archive_of(three)
-    sentence = refused.value.args[0]  # uncut, for the folders of a test may be long
+    sentence = refused.value.args[0]  # in full, because folders of a test may be long
     assert three.path in sentence
     assert str(place_of(three)) in sentence
 
@@ -311,7 +311,7 @@ def test_a_scene_of_one_kind_is_compared_with_nothing(tmp_path, generated):
 
 
 def completion_in(folder: Path, transform: np.ndarray, origin: np.ndarray) -> Path:
-    """An output folder of `complete` whose cameras are in another frame than its scenes."""
+    """Write an output folder of `complete` with cameras in another frame than its scenes."""
     exhibit = room_exhibit()
     folder.mkdir()
     (folder / "images").mkdir()
@@ -333,7 +333,7 @@ def completion_in(folder: Path, transform: np.ndarray, origin: np.ndarray) -> Pa
 
 
 def test_the_targets_of_a_completion_are_brought_into_the_frame_of_its_scenes(tmp_path):
-    """Maps have coordinates that float32 cannot tell apart: the origin is subtracted before."""
+    """Maps have coordinates beyond the precision of float32: the origin is subtracted first."""
     origin = np.array([5e6, -3e6, 1e3])
     transform = np.eye(4)
     transform[:3, 3] = -origin
@@ -358,7 +358,7 @@ def test_photographs_of_a_completion_are_jumped_to(tmp_path):
 
 
 def completion_of_photographs_in(folder: Path) -> Path:
-    """An output folder of `complete` for photographs without cameras, which lies elsewhere now."""
+    """Write an output folder of `complete` for photographs without cameras, and move it."""
     completion_in(folder, np.eye(4), np.zeros(3))
     summary = json.loads((folder / "summary.json").read_text())
     summary["scene"] = {"format": "photographs"}
@@ -391,7 +391,7 @@ def test_a_folder_that_is_no_completion_is_refused(tmp_path):
 
 @pytest.fixture
 def packed(monkeypatch) -> None:
-    """The command finds its libraries."""
+    """Let the command find its libraries."""
     monkeypatch.setattr("gscompleter.viewer.packages.load_libraries", lambda: NONE)
 
 
@@ -446,7 +446,7 @@ def test_cameras_of_a_colmap_folder_are_jumped_to(packed, tmp_path, monkeypatch)
 
 
 def header_only(path: Path) -> None:
-    """A .ply without any Gaussian."""
+    """Write a .ply without any Gaussian."""
     save_ply(path, room_from(LEFT, 0)[:1])
     head = path.read_bytes().split(b"end_header\n")[0].replace(b"vertex 1\n", b"vertex 0\n")
     path.write_bytes(head + b"end_header\n")
@@ -501,7 +501,7 @@ def test_without_a_file_to_save_to_the_page_is_served_and_opened(
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """Where a page with one part is served."""
+    """The port of a server of a page with one part."""
     with serving(Page(b"<!doctype html>", {"my page.1.js": b"gscPart()"}, 0)) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()

@@ -1,4 +1,4 @@
-"""The page of the viewer in a real browser: without any request, and beside our own renderer."""
+"""The viewer page in a real browser: without any request, and compared with our renderer."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ header, aside, figcaption, #divider { display: none !important; }
 [data-shown="side"] #before { right: 50% !important; }
 [data-shown="side"] #after { left: 50% !important; }
 """
-"""Lets the pictures fill the window, to the pixel."""
+"""Style that lets the pictures fill the window, to the pixel."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ class Window(Tab):
         self.page.evaluate("gsc.ready")
 
     def do(self, call: str) -> Any:
-        """What a call of the page's interface returns, once everything is drawn."""
+        """Call the page's interface, and return its result once everything is rendered."""
         value = self.page.evaluate(call)
         self.page.evaluate("gsc.settled()")
         return value
@@ -80,7 +80,7 @@ def saved(exhibit, libraries, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def bare(browser, saved) -> Window:
-    """A window with nothing but two pictures of a camera's size, or one of twice its width."""
+    """Open a window with only two pictures of a camera's size, or one of twice its width."""
     tab = Window(browser, saved, 2 * SIDE, SIDE)
     tab.page.add_style_tag(content=BARE)
     tab.page.evaluate("gsc.settled()")
@@ -238,7 +238,7 @@ def test_parts_beside_the_page_are_read_from_its_folder(
 
 
 def test_antialiased_gaussians_are_those_of_our_renderer(browser, libraries, tmp_path):
-    """Both pictures, beside which those of the classic mode are something else."""
+    """Both pictures differ from those of the classic mode."""
     room = room_exhibit()
     small = [replace(g, scales=0.7 * g.scales) for g in (room.before, room.after)]
     before, after = (replace(gaussians, is_antialiased=True) for gaussians in small)

@@ -26,7 +26,7 @@ SMALL = VolSplatConfig(DepthConfig("vits", 1, 4, 4), voxel_resolution=0.02)
 
 @cache
 def published() -> VolSplat:
-    """The published architecture with the weights of the fixtures."""
+    """Create the published architecture with the fixtures' weights."""
     return with_sparse_rule(VolSplat())
 
 
@@ -48,10 +48,10 @@ def test_names_and_shapes_of_the_weights_are_those_of_the_published_file():
 
 
 def check(case: Case) -> None:
-    """Every stored array, for the voxels that lie in the same place.
+    """Compare all stored arrays at common voxels.
 
-    A point that lies on the border of two voxels falls to one side or the other by the last bit
-    of its depth, so that a few voxels are ours or the authors' alone.
+    Points on the border of two voxels are assigned by the last bit of their depth, so a few voxels
+    exist only here or only in the authors' output.
     """
     network = published()
     network.config = VolSplatConfig(voxel_resolution=float(case.values["voxel_resolution"]))
@@ -181,14 +181,14 @@ def test_all_that_the_target_sees_is_lifted():
 
 
 class Truth:
-    """Φ that knows the room."""
+    """Generator that renders the true scene."""
 
     def __call__(self, nearest, target, context):
         return view_of(Room(), target).image
 
 
 def test_smoke_a_completion_runs_with_random_weights():
-    """That the stages take Gaussians of voxels; with random weights the picture means nothing."""
+    """Random weights: this only checks that the stages accept Gaussians of voxels."""
     views, target = photographs(), camera_at(0.7, yaw=12, size=64)
     completion = GSCompleter(FeedForward(random_network()), Truth())(views, target)
     (result,) = completion.targets

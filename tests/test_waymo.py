@@ -1,4 +1,4 @@
-"""Segments of the Waymo Open Dataset 2: a place whose cameras, depth and boxes are known."""
+"""Segments of the Waymo Open Dataset 2 with known cameras, depth and boxes."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from waymo_segment import (
 WIDTH, HEIGHT = 96, 64
 LENS = (80.0, 80.0, 50.0, 30.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 PLACE = np.array([7213.0, -4100.0, 30.0])
-"""Where the drive begins, far from the origin of its map."""
+"""Start of the drive, far from the origin of its map."""
 ALONG = np.array([0.9, 0.4, 0.0])
-"""From one place to the next."""
+"""Step from one place to the next."""
 WALL = np.array([0.9, 0.3, -0.1, 12.0])
-"""A plane n·x = d before the vehicle as it begins, in its axes and in metres."""
+"""Plane n·x = d in front of the vehicle at the start, in its axes and metres."""
 
 
 def turned(yaw: float, pitch: float = 0.0, place: tuple[float, ...] = (0.0, 0.0, 0.0)):
-    """A pose that is pitched, then yawed, both in radians."""
+    """Return a pose that is pitched, then yawed, in radians."""
     return poses_of(np.array([0.0, pitch, yaw, *place]))
 
 
@@ -65,14 +65,14 @@ def jpeg(shade: int) -> bytes:
 
 
 def wall_in_world() -> np.ndarray:
-    """The plane in the world: it stands still while the vehicle drives."""
+    """Return the plane in the world; it is fixed while the vehicle drives."""
     first = VEHICLES[0]
     normal = first[:3, :3] @ WALL[:3]
     return np.array([*normal, WALL[3] + normal @ first[:3, 3]])
 
 
 def ranges_to_wall(laser: Laser, vehicle: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """How far the wall is along the beams, by the published formula of range images."""
+    """Compute the distance of the wall along the beams, by the published range image formula."""
     h, w = shape
     even = laser.low + (np.arange(h) + 0.5) / h * (laser.high - laser.low)
     rising = even if laser.values is None else np.array(laser.values)
@@ -88,7 +88,7 @@ def ranges_to_wall(laser: Laser, vehicle: np.ndarray, shape: tuple[int, int]) ->
 
 
 def moments(while_turning: bool) -> list[Moment]:
-    """Three times of the drive, with two lasers that see the wall."""
+    """Return three times of the drive, with two lasers that see the wall."""
     found = []
     for number, vehicle in enumerate(VEHICLES):
         shape = (20, 400)
@@ -118,7 +118,7 @@ def segment(root: Path, while_turning: bool = False) -> Path:
 
 
 def depth_of_wall(photographs: Photographs, frame: int) -> torch.Tensor:
-    """z-depth of the wall behind the centre of each pixel."""
+    """Return z-depth of the wall at the centre of each pixel."""
     camera = photographs.camera(frame)
     plane = torch.from_numpy(wall_in_world())
     rays, center = camera.z_rays().double(), camera.center.double()

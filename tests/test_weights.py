@@ -52,12 +52,12 @@ def network(width: int = 4) -> nn.Module:
 
 
 def published_tensors(width: int = 4) -> dict[str, Tensor]:
-    """The tensors of a network as the authors' training names them."""
+    """Create a network's tensors with the names of the authors' training."""
     return {f"encoder.{name}": t for name, t in network(width).state_dict().items()}
 
 
 def save(path: Path, content: object, like: PublishedWeights) -> PublishedWeights:
-    """Save a file of torch, and give its description with the hash of what was saved."""
+    """Save a torch file, and return its description with the new hash."""
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save(content, path)
     digits = 64 if like.sha256 is None else len(like.sha256)
@@ -82,7 +82,7 @@ def sentence_of(caught: pytest.ExceptionInfo[InputError]) -> str:
 
 @pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine on which nothing was fetched before."""
+    """Create a machine with empty caches."""
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path / "home"))
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
     return tmp_path / "home"
@@ -94,7 +94,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_names_are_model_size_and_data_and_files_carry_them():
     for name, weights in PUBLISHED.items():
         assert name == weights.name
-        if name.startswith("da3-"):  # images of any shape; files are told apart by their folders
+        if name.startswith("da3-"):  # images of any shape; files are distinguished by their folders
             assert weights.repository == f"depth-anything/{weights.model}"
             continue
         height, width = weights.image_size
@@ -208,7 +208,7 @@ def test_the_cache_is_in_the_home_folder_unless_the_environment_says_otherwise(
 
 
 def test_what_lies_on_google_drive_has_to_be_fetched_by_hand():
-    with pytest.raises(WeightsNotAvailable, match="no program can fetch") as caught:
+    with pytest.raises(WeightsNotAvailable, match="no automatic download") as caught:
         fetch(MVSPLAT)
     sentence = sentence_of(caught)
     for part in ("mvsplat-re10k", "re10k.ckpt", MVSPLAT.source, str(place_of(MVSPLAT).parent)):
@@ -229,9 +229,9 @@ def test_without_the_hubs_package_the_sentence_says_what_to_install(
 def hub_cache(
     folder: Path, weights: PublishedWeights, content: bytes, original: bytes | None = None
 ) -> Path:
-    """The hub's cache as its library leaves it: a file by its hash, and a link by its name.
+    """Create a hub cache like its library: a file by its hash, and a link by its name.
 
-    Where the content was damaged later, the hash is that of the original.
+    If the content was damaged later, the hash is that of the original.
     """
     assert weights.repository is not None
     repository = folder / f"models--{weights.repository.replace('/', '--')}"
@@ -270,21 +270,21 @@ def test_offline_and_absent_says_how_to_bring_the_file(
 
 
 def test_the_hub_is_asked_for_the_pinned_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    asked = []
+    requests = []
 
     def download(repository: str, file: str, **others: object) -> str:
-        asked.append((repository, file, others))
+        requests.append((repository, file, others))
         return str(tmp_path / file)
 
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
     pinned = replace(DEPTHSPLAT, revision=COMMIT)
     assert fetch(pinned) == tmp_path / pinned.file
     expected = {"revision": COMMIT, "local_files_only": False}
-    assert asked == [("haofeixu/depthsplat", pinned.file, expected)]
+    assert requests == [("haofeixu/depthsplat", pinned.file, expected)]
 
 
 class Hub(BaseHTTPRequestHandler):
-    """As much of the hub as a download needs: one file of one commit, and 404 for the rest."""
+    """A minimal hub: one file of one commit, and 404 for the rest."""
 
     def __init__(self, weights: PublishedWeights, content: bytes, *rest: object) -> None:
         self.path_of_file = f"/{weights.repository}/resolve/{weights.revision}/{weights.file}"
@@ -314,7 +314,7 @@ class Hub(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def serve(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[PublishedWeights, bytes], None]]:
-    """Start a hub on this machine and make it the one that is asked."""
+    """Start a local hub and direct all requests to it."""
     servers = []
 
     def start(weights: PublishedWeights, content: bytes) -> None:
@@ -346,16 +346,16 @@ def test_a_download_lands_in_the_hubs_cache_and_is_read(tmp_path: Path, serve: C
 def test_a_damaged_download_is_fetched_anew_once_it_is_deleted_as_told(
     tmp_path: Path, tmp_path_factory, monkeypatch: pytest.MonkeyPatch, serve: Callable
 ):
-    hub = tmp_path_factory.mktemp("h")  # a name that leaves room in the sentence
+    hub = tmp_path_factory.mktemp("h")  # a short name, so that the sentence is not cut
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(hub))
     weights = save(tmp_path / "original.pth", published_tensors(), DEPTHSPLAT)
     original = (tmp_path / "original.pth").read_bytes()
     hub_cache(hub, weights, b"damaged", original)
     with pytest.raises(InputError, match="delete") as caught:
         read_state_dict(fetch(weights), weights)
-    told = re.search(r"delete (\S+) and", sentence_of(caught))
-    assert told is not None
-    Path(told[1]).unlink()
+    found = re.search(r"delete (\S+) and", sentence_of(caught))
+    assert found is not None
+    Path(found[1]).unlink()
     serve(weights, original)
     assert read_state_dict(fetch(weights), weights).keys() == network().state_dict().keys()
 
@@ -425,7 +425,7 @@ def test_older_files_of_torch_are_read_too(tmp_path: Path):
 
 
 def refused(path: Path, weights: PublishedWeights, sentence: str) -> None:
-    """Reading says this in one sentence, which names the file that was expected."""
+    """Check that reading fails with one sentence that names the expected file."""
     with pytest.raises(InputError, match=sentence) as caught:
         read_state_dict(path, weights)
     assert weights.file in sentence_of(caught)
@@ -537,7 +537,7 @@ def test_what_is_not_the_networks_is_refused(tmp_path: Path, content: object, se
 
 
 def write_safetensors(path: Path, tensors: dict[str, Tensor]) -> None:
-    """The format by hand: the length of a JSON header, the header, and the bytes it describes."""
+    """Write the format manually: length of the JSON header, header, and data bytes."""
     names = {torch.float32: "F32", torch.int64: "I64"}
     header, data = {}, b""
     for name, tensor in tensors.items():
@@ -591,7 +591,7 @@ def test_tensors_that_fit_replace_those_of_the_network():
     ("change", "sentence"),
     [
         (lambda d: d.pop("0.bias"), r"lacks 1 of 7 tensors \(such as 0.bias\)"),
-        (lambda d: d.update(more=torch.zeros(1)), r"1 that the network does not know \(such as m"),
+        (lambda d: d.update(more=torch.zeros(1)), r"1 unknown to the network \(such as m"),
         (
             lambda d: d.update({"0.weight": torch.zeros(4, 5)}),
             r"1 of another shape \(such as 0.weight, \[4, 5\] instead of \[4, 3\]\)",

@@ -1,6 +1,6 @@
 """Tiny diffusion models of the real classes with random weights, saved as diffusers saves them.
 
-What they paint is noise: they are for smoke tests of frames, sizes and stages.
+Their images are noise, for smoke tests of frames, sizes and stages.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def t5(width: int) -> tuple[Any, Any]:
 
 
 def vae(levels: int, **settings: Any) -> Any:
-    """An autoencoder that halves the image on all levels but the last."""
+    """Create an autoencoder that halves the image on all levels but the last."""
     from diffusers import AutoencoderKL
 
     return AutoencoderKL(
@@ -66,7 +66,7 @@ def vae(levels: int, **settings: Any) -> Any:
 
 
 def kontext_pipeline(heads: int = 24) -> Any:
-    """FLUX Kontext whose tokens are 64 pixels wide, so that a million pixels are 256 tokens."""
+    """Create FLUX Kontext with tokens of 64 pixels, so that a million pixels are 256 tokens."""
     from diffusers import (
         FlowMatchEulerDiscreteScheduler,
         FluxKontextPipeline,
@@ -104,7 +104,7 @@ def kontext_pipeline(heads: int = 24) -> Any:
 
 
 def unet(**settings: Any) -> Any:
-    """A UNet of two levels at 64 pixels; SDXL's has no cross attention on its first."""
+    """Create a UNet of two levels at 64 pixels; SDXL's has no cross attention on its first."""
     from diffusers import UNet2DConditionModel
 
     return UNet2DConditionModel(
@@ -121,7 +121,7 @@ def unet(**settings: Any) -> Any:
 
 
 def stable_diffusion(inpainting: bool = True) -> Any:
-    """Stable Diffusion at 64 pixels: that for inpainting, or the one that knows text alone."""
+    """Create Stable Diffusion at 64 pixels, for inpainting or for text only."""
     import diffusers
 
     torch.manual_seed(0)
@@ -139,7 +139,7 @@ def stable_diffusion(inpainting: bool = True) -> Any:
 
 
 def checked_stable_diffusion() -> Any:
-    """Stable Diffusion's inpainting with its checker of images."""
+    """Create Stable Diffusion inpainting with its safety checker."""
     from diffusers.pipelines.stable_diffusion import StableDiffusionSafetyChecker
     from transformers import CLIPConfig, CLIPImageProcessorPil
 
@@ -158,7 +158,7 @@ def checked_stable_diffusion() -> Any:
 
 
 def sdxl() -> Any:
-    """SDXL's inpainting at 64 pixels."""
+    """Create SDXL inpainting at 64 pixels."""
     from diffusers import EulerDiscreteScheduler, StableDiffusionXLInpaintPipeline
     from transformers import CLIPTextModelWithProjection
 
@@ -182,7 +182,7 @@ def sdxl() -> Any:
 
 
 def flux_fill() -> Any:
-    """Flux Fill, whose tokens are 64 pixels wide as those of `kontext_pipeline`."""
+    """Create Flux Fill with tokens of 64 pixels, like `kontext_pipeline`."""
     from diffusers import FluxFillPipeline, FluxTransformer2DModel
 
     parts = kontext_pipeline().components

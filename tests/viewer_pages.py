@@ -1,4 +1,4 @@
-"""What the tests of the viewer look at: a room before and after, and its cameras."""
+"""Scenes for the tests of the viewer: a room before and after, and its cameras."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from gscompleter.viewer.exhibit import Exhibit, Shot
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIDE = 64
-"""Pixels of a side of the cameras' images, few enough for a browser that draws in software."""
+"""Image size of the cameras in pixels, small enough for software rendering."""
 LEFT = camera_at(x=-0.3, yaw=-7, size=SIDE)
-"""Where the room is observed from."""
+"""Camera that observes the room."""
 
 
 def off_centre(camera: Camera) -> Camera:
-    """The same camera with a principal point that is not in the middle of the image."""
+    """Shift the principal point of a camera away from the centre of the image."""
     K = camera.K.clone()
     K[0, 2] += 6
     K[1, 2] -= 3
@@ -25,17 +25,17 @@ def off_centre(camera: Camera) -> Camera:
 
 
 TARGET = off_centre(camera_at(x=0.8, z=0.5, yaw=20, size=SIDE))
-"""Where it has a hole: to the right of what is observed."""
+"""Camera that sees a hole, to the right of the observed part."""
 
 
 def room_from(camera: Camera, generated: int, unit: float = 1.0) -> Gaussians:
-    """What a camera sees of the room, marked as generated for a target (0: as observed)."""
+    """Make the part of the room that a camera sees, with the label `generated`."""
     gaussians = gaussians_of(view_of(Room(unit=unit), camera))
     return replace(gaussians, generated=torch.full_like(gaussians.generated, generated))
 
 
 def room_exhibit(title: str = "room") -> Exhibit:
-    """The room as the left camera sees it, and with what the target camera sees besides."""
+    """Make the room as the left camera sees it, and completed for the target camera."""
     before = room_from(LEFT, 0)
     after = merge([before, room_from(TARGET, 1)])
     shots = (Shot("target-1", "Target 1", TARGET), Shot("camera-1", "Left", LEFT))

@@ -1,4 +1,4 @@
-"""What the authors' VolSplat gave on MinkowskiEngine, and how to compare."""
+"""Outputs of the authors' VolSplat on MinkowskiEngine, and comparison with them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FIXTURES = STORED / "volsplat"
 
 
 def sparse_rule(key: str, shape: Sequence[int], multiplier: float = 1.0) -> Tensor:
-    """Rule v1, but for kernels of sparse convolutions and for variances."""
+    """Apply rule v1, except for kernels of sparse convolutions and variances."""
     weight = rule_v1(key, torch.Size(shape), multiplier)
     last = key.rsplit(".", 1)[-1]
     if last == "running_var":
@@ -31,7 +31,7 @@ def sparse_rule(key: str, shape: Sequence[int], multiplier: float = 1.0) -> Tens
 
 
 def with_sparse_rule(network: nn.Module) -> nn.Module:
-    """`network` with the weights of the fixtures, for inference."""
+    """Load the fixtures' weights for inference."""
     multipliers = json.loads((FIXTURES / "multipliers.json").read_text())["multipliers"]
     weights = {
         key: sparse_rule(key, value.shape, multipliers.get(key, 1.0))
@@ -45,7 +45,7 @@ def with_sparse_rule(network: nn.Module) -> nn.Module:
 
 @dataclass
 class VoxelPass:
-    """A pass through the network, and what its sparse parts took and gave."""
+    """A pass through the network, with inputs and outputs of its sparse parts."""
 
     predicted: VoxelGaussians
     between: dict[str, Tensor]
@@ -71,14 +71,14 @@ class VoxelPass:
         return VoxelPass(predicted, between)
 
     def rows_of(self, case: Case) -> Tensor:
-        """Our row of each voxel of the authors', -1 where we have none at its coordinates."""
+        """Find our row of each of the authors' voxels; -1 if there is none."""
         ours = {tuple(row): i for i, row in enumerate(self.predicted.grid.coordinates.tolist())}
         return torch.tensor([ours.get(tuple(row), -1) for row in case.values["voxel_coords"]])
 
     def errors(self, case: Case) -> dict[str, float]:
-        """Largest error over the authors' largest value, of all that is stored of shared voxels.
+        """Compute the largest relative error of all stored values at common voxels.
 
-        Harmonics are compared degree by degree: the higher ones are small beside the constant.
+        SH are compared degree by degree, because higher ones are small.
         """
         rows = self.rows_of(case)
         errors = {"depth": relative_error(self.predicted.depth[None], case.tensor("out_depth"))}
@@ -108,7 +108,7 @@ class VoxelPass:
 
 
 def expected_of(name: str, case: Case) -> Tensor:
-    """The stored output called `name`, of each `stride`-th voxel."""
+    """Load the stored output `name` of each `stride`-th voxel."""
     if not name.startswith("harmonics"):
         return case.tensor(f"out_{name}")[0]
     degree = int(name[-1])

@@ -1,6 +1,6 @@
-"""A small segment of the Waymo Open Dataset 2, written by the published schema of its tables.
+"""A small segment of the Waymo Open Dataset 2, in the published schema of its tables.
 
-One table a component, named by the fields of the component and of its key. Types are those of the
+One table per component, named by the fields of the component and its key. Types are those of the
 schema: transforms are fixed lists of 16 float64, images binary, range images lists of float32.
 """
 
@@ -67,7 +67,7 @@ SCHEMAS: dict[str, dict[str, pa.DataType]] = {
         **{f"[LiDARBoxComponent].speed.{axis}": pa.float64() for axis in "xyz"},
     },
 }
-"""The columns of each component that tell cameras, depth and boxes."""
+"""Columns of each component with cameras, depth and boxes."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ class RigCamera:
 
     number: int
     lens: tuple[float, ...]
-    """As `LENS` names them."""
+    """Values named by `LENS`."""
     size: tuple[int, int]
     vehicle_from_camera: np.ndarray
-    """In Waymo's axes: x forward, y left, z up."""
+    """Pose in Waymo's axes: x forward, y left, z up."""
 
 
 @dataclass(frozen=True)
@@ -91,12 +91,12 @@ class Laser:
     low: float
     high: float
     values: tuple[float, ...] | None = None
-    """Inclinations in rising order; None where they are even."""
+    """Ascending inclinations; None if uniform."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """A box around a thing, in the frame of the vehicle."""
+    """A box around an object, in the vehicle frame."""
 
     center: tuple[float, float, float]
     size: tuple[float, float, float]
@@ -107,14 +107,14 @@ class Seen:
 
 @dataclass(frozen=True)
 class Moment:
-    """What the vehicle recorded at one time."""
+    """Record of the vehicle at one time."""
 
     time: int
     world_from_vehicle: np.ndarray
     images: dict[int, bytes]
-    """By the numbers of cameras."""
+    """Photographs by camera number."""
     ranges: dict[int, np.ndarray]
-    """[h, w] by the numbers of lasers, -1 where nothing came back."""
+    """[h, w] by laser number, -1 without a return."""
     pixel_poses: np.ndarray | None = None
     """[h, w, 6] of laser 1: roll, pitch, yaw, x, y, z of the vehicle in the world."""
     boxes: tuple[Seen, ...] = ()
@@ -127,7 +127,7 @@ def write_segment(
     lasers: Sequence[Laser] = (),
     name: str = SEGMENT,
 ) -> Path:
-    """Write a segment; components without a row are left out."""
+    """Write a segment; components without rows are left out."""
     rows: dict[str, list[dict[str, object]]] = {component: [] for component in SCHEMAS}
     for camera in cameras:
         rows["camera_calibration"].append(_camera_row(camera, name))

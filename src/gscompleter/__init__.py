@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gscompleter.splats import load_splat, save_splat
     from gscompleter.types import Camera, Completion, Gaussians, Render, View, merge
 
-# Where each public name lives. They are imported on first use, so that `import gscompleter` and
+# Module of each public name, imported on first use, so that `import gscompleter` and
 # `gscompleter --help` do not wait for torch.
 _HOMES = {
     "GSCompleter": "completer",

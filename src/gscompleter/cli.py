@@ -44,8 +44,8 @@ from gscompleter.garbage import staying
 from gscompleter.interrupts import treat_stops_alike
 from gscompleter.threads import bound_threads
 
-# Where each command lives. Its module is imported once the arguments are known to be right, so
-# that `--help` does not wait for torch.
+# Options, module and function of each command. The module is imported after the options are
+# validated, so that `--help` does not wait for torch.
 COMMANDS: dict[str, tuple[type, str, str]] = {
     "complete": (CompleteOptions, "gscompleter.commands.complete", "run_completion"),
     "batch": (BatchOptions, "gscompleter.commands.batch", "run_batch"),
@@ -77,7 +77,7 @@ def run() -> None:
     Python would otherwise take a fifth of a second to free torch's operators.
     """
     done: list[bool] = []
-    # Whatever else is to be done at the end is registered later, and is done before.
+    # Functions that are registered later run before it.
     atexit.register(end_at_once, done)
     try:
         main()
@@ -120,16 +120,16 @@ def drop(stream: TextIO) -> None:
 
 def main() -> None:
     """Run a command. Exit codes: 0 done, 2 wrong input, 1 anything else."""
-    # Threads of torch that spin while they wait cost a busy machine ten times the work they do.
+    # Waiting threads of torch must not spin, which slows a busy machine down ten times.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     words = sys.argv[1:]
     if words == ["--version"]:
         print(__version__)
         return
     treat_stops_alike()
-    # Python ends a second earlier where it need not search torch for garbage once more.
+    # Without a last garbage collection of torch Python ends a second earlier.
     atexit.register(gc.freeze)
-    # Pillow warns of damage in a photograph that is read all the same, or refused in a sentence.
+    # Damaged photographs are read or refused with a sentence; Pillow's warnings add nothing.
     warnings.filterwarnings("ignore", module="PIL")
     try:
         with staying():
@@ -146,7 +146,7 @@ def main() -> None:
         sys.exit(2)
     except KeyboardInterrupt as stop:
         goes_on = words[:1] in (["batch"], ["evaluate"])
-        state = "the same command goes on from here" if goes_on else "nothing was written"
+        state = "run the same command again to continue" if goes_on else "nothing was written"
         print(f"gscompleter: interrupted; {str(stop) or state}.", file=sys.stderr)
         sys.exit(130)
 

@@ -1,4 +1,4 @@
-"""GSCompleter: a scene is taken up once, then advanced by the four stages, target after target."""
+"""GSCompleter: generate, then register, for one target after the other."""
 
 from __future__ import annotations
 
@@ -83,61 +83,57 @@ from gscompleter.types import (
 )
 
 MAX_TARGETS = 255
-"""Provenance is a byte per Gaussian: 0 for observed, 1 to 255 for the targets."""
+"""Largest target id: `generated` is one byte per Gaussian, and 0 means observed."""
 
 UNSEEN = 0.1
-"""Share of what the target sees of a Gaussian, below which no photograph shows it."""
+"""Fraction of a Gaussian's visible area below which a photograph does not observe it."""
 COLOUR_SLACK = 0.01
-"""By how much a colour may lie outside of [0, 1], as resampling leaves it."""
+"""Largest tolerated excess of a colour beyond [0, 1], as resampling causes it."""
 MIN_COVER = 0.5
-"""Pixels of a hole that a Gaussian has to cover to stand in the way."""
+"""Hole pixels that a Gaussian has to cover to count as an occluder."""
 
-MADE_WORSE = "Most of what was synthesized here made photographs worse."
+MADE_WORSE = "Most of the Gaussians that were generated here make photographs worse."
 NOTHING_ADDED = "Nothing of it was added."
 
 STAGES = ("context", "generate", "lift", "register", "integrate")
-"""What a completion spends its time on."""
+"""Stages whose wall time is recorded."""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What a target camera meets in the scene as it stands."""
+    """The scene as the padded target camera sees it, before anything is added."""
 
     completion: Completion
-    """As far as it went before this target."""
     window: Window
-    """The target, and the wider camera that it is completed with."""
     frozen: FrozenView
-    """The scene frozen at the wider camera."""
+    """The scene frozen at the padded camera."""
     anchor: AnchorChoice
     believed: Float[Tensor, "h w"] | None = None
-    """Alpha at the wider camera as far as photographs support it; None where nothing is
-    doubted."""
+    """Alpha at the padded camera weighted by trust, or None under full trust."""
     stereo: Stereo | None = None
-    """What stereo among the photographs shows there; None where nothing is doubted or that was not
-    asked."""
+    """MVS render of the photographs at the padded camera, or None if not computed."""
 
     @property
     def alpha(self) -> Float[Tensor, "h w"]:
-        """What counts against holes, at the wider camera."""
+        """Alpha that the hole mask thresholds, at the padded camera."""
         return self.frozen.context.alpha if self.believed is None else self.believed
 
     @property
     def before(self) -> Render:
-        """The scene as the target itself sees it."""
+        """Render of the scene at the target, without padding."""
         return self.frozen.context.cropped(self.window)
 
     @property
     def anchor_view(self) -> View:
-        """The photograph that forms the stereo pair with the target."""
+        """Context view that forms the stereo pair with the target."""
         return self.completion.views[self.anchor.index]
 
 
 @dataclass(frozen=True)
 class GSCompleter:
-    """Completes a scene as seen from one or several target cameras.
+    """Completes 3DGS scenes for target cameras: generate, then register.
 
-    The defaults are the embedded models, which need no weights and no GPU.
+    The default models need neither weights nor a GPU.
     """
 
     reconstructor: Reconstructor = field(default_factory=lambda: load_reconstructor("plane-sweep"))
@@ -147,26 +143,26 @@ class GSCompleter:
     )
     """Φ: nearest view and target camera -> image."""
     renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
-    """Draws Gaussians, differentiably."""
+    """Differentiable renderer of Gaussians."""
     config: CompleterConfig = CompleterConfig()
     """Settings of the stages."""
     seed: int = 0
-    """Of the random samples that RANSAC draws."""
+    """Seed of the RANSAC samples."""
     keep_registered: bool = False
-    """Keep in each result all that was registered, about a Gaussian per pixel, for evaluation."""
+    """True to keep all registered Gaussians in each result, for evaluation."""
 
     def __post_init__(self) -> None:
-        """Raises InputError where a setting is out of its range."""
+        """Raise InputError if a setting is out of range."""
         checked(self.config, "config.")
 
     @cached_property
     def frozen(self) -> KeptViews:
-        """The scene that was worked on last, frozen at the cameras of its photographs."""
+        """The current scene, frozen at the cameras of its photographs."""
         return KeptViews(self.renderer)
 
     @cached_property
     def small(self) -> KeptViews:
-        """The same at cameras of small images, about."""
+        """A simplified version of the current scene, frozen at the cameras of small images."""
         return KeptViews(self.renderer, partial(thinned, most=MAX_GAUSSIANS))
 
     def __call__(
@@ -176,22 +172,20 @@ class GSCompleter:
         scene: Gaussians | None = None,
         witnesses: Sequence[View] | None = None,
     ) -> Completion:
-        """Complete what `views` never saw, as seen from `target`.
+        """Complete what `views` never saw, as seen from one or several targets.
 
         Args:
-            views: Photographs with their cameras: at least two, or one with `scene`. Those with
-                frame numbers are sorted by them.
-            target: The camera (or cameras, completed one after the other into one scene; a
-                generator that takes several at once is asked for their images before that).
-            scene: Gaussians that are the context already, in the frame and unit of the cameras;
-                they are kept as they are. Without it Ψ reconstructs the context from `views`.
-            witnesses: The other photographs of `scene`, which may be small. Given them, it is
-                doubted where no photograph supports it, what nothing supports and nothing needs is
-                set aside, and none of them may get worse. Without them it is taken as it is.
+            views: Posed context views: at least two, or one if `scene` is given. Views with frame
+                numbers are sorted by them.
+            target: Target cameras, completed one after the other into one scene.
+            scene: Gaussians to complete, in the frame and unit of the cameras. They are kept bit
+                for bit. If None, Ψ reconstructs the context from `views`.
+            check_views: Further photographs of `scene` that must not get worse. With them the scene
+                is trusted only as far as the photographs confirm it, and occluders are pruned.
 
         Raises:
-            InputError: too few views, no baseline, too many targets, a scene nobody sees, or no
-                target that sees enough of it.
+            InputError: Too few views, no baseline, too many targets, no view sees the scene, or no
+                target sees enough of it.
         """
         targets = [target] if isinstance(target, Camera) else list(target)
         if not targets:
@@ -212,22 +206,22 @@ class GSCompleter:
         witnesses: Sequence[View] | None = None,
         targets: Sequence[Camera] = (),
     ) -> Completion:
-        """Stage 1: the scene and its photographs before any target.
+        """Initialize the context (stage 1).
 
         Args:
-            views: As in a call.
-            scene: As in a call.
-            witnesses: As in a call.
-            targets: Those that are known in advance. A large scene is drawn as finely as they and
-                the photographs can tell.
+            views: As in `__call__`.
+            scene: As in `__call__`.
+            check_views: As in `__call__`.
+            targets: Targets that are known already. The LOD proxy of a large scene is made fine
+                enough for them and the photographs.
 
         Raises:
-            InputError: too few views, no baseline, a scene nobody sees.
+            InputError: Too few views, no baseline, or no view sees the scene.
         """
         if len(views) < (2 if scene is None else 1):
             raise InputError(
                 f"{len(views)} context view was given, and stereo needs at least 2; name more "
-                "frames, or bring a scene."
+                "frames, or give a scene."
             )
         views = sort_by_frame(views)
         check_values([*views, *(witnesses or ())], scene)
@@ -237,22 +231,18 @@ class GSCompleter:
         with clock("context"):
             cameras = [*targets, *(view.camera for view in (*views, *(witnesses or ())))]
             proxy = proxy_of(scene, cameras)
-            drawn = scene if proxy is None else proxy.scene
-            near, far = working_range(views, drawn, self.renderer)
+            rendered = scene if proxy is None else proxy.scene
+            near, far = working_range(views, rendered, self.renderer)
             views = tuple(ranged(view, near, far) for view in views)
             others = tuple(ranged(view, near, far) for view in witnesses or ())
-            completion = Completion(drawn, scene, views, (), (), {}, others, proxy=proxy)
+            completion = Completion(rendered, scene, views, (), (), {}, others, proxy=proxy)
             if witnesses is not None and self.config.trust == "photometric":
                 completion = self.doubted(completion)
             completion = self.judged(completion)
         return replace(completion, seconds=clock.seconds)
 
     def reconstruct(self, views: Sequence[View]) -> InitialContext:
-        """Reconstruct the context from posed photographs (paper, Eq. 5).
-
-        Raises:
-            InputError: too few views, no baseline.
-        """
+        """Reconstruct the context from posed photographs (paper, Eq. 5)."""
         clock = Clock()
         with clock("context"):
             check_texture(views)
@@ -262,50 +252,50 @@ class GSCompleter:
         return InitialContext(gaussians, exposed_alike(views, gains), gains, clock.seconds)
 
     def begin_with(self, context: InitialContext) -> Completion:
-        """Begin the completion of a reconstructed context: find what moved, set error budgets."""
+        """Begin from a reconstructed context: compute dynamic masks and error budgets."""
         clock = Clock()
         with clock("context"):
-            made = context.gaussians
-            completion = Completion(made, made, context.views, (), (), {}, gains=context.gains)
+            scene = context.gaussians
+            completion = Completion(scene, scene, context.views, (), (), {}, gains=context.gains)
             completion = self.judged(self.wary_of_what_moved(completion))
         return replace(completion, seconds=total(clock.seconds, context.seconds))
 
     def advance(
         self, completion: Completion, target: Camera, reference: Synthesized | None = None
     ) -> Completion:
-        """Stages 2 to 4 for one target: the scene with what they add to it.
+        """Complete the scene for one more target (stages 2 to 4).
 
         Args:
-            completion: Where it goes on from; it stays as it is.
-            target: The camera to complete the scene for.
-            reference: The image at the target (at its wider camera, where the generator takes a
-                margin). The generator is asked for it if it is left out.
+            completion: The scene so far; it is not changed.
+            target: Camera to complete the scene for.
+            reference: Image at the target, padded if Φ supports it, if it was synthesized in
+                advance.
 
         Raises:
-            InputError: where the targets before are as many as a .ply can tell apart.
+            InputError: The scene holds as many targets as a .ply can tell apart.
         """
         check_numbers(completion.context, len(completion.targets) + 1)
         clock = Clock()
         with clock("context"):
-            wide = None if reference is None else reference.camera
-            sight = self.sight(completion, target, wide)
-        result = self.begun_at(sight)
+            padded = None if reference is None else reference.camera
+            target_view = self.sight(completion, target, padded)
+        result = self.begun_at(target_view)
         reason = nothing_to_do(result, completion.views)
         if reason is not None:
             return followed_by(completion, replace(result, notes=(reason,)), clock.seconds)
         with clock("context"):
-            sight = self.without_unsupported(sight)
-        result = self.completed(sight, result, reference, clock)
-        reached = sight.completion if len(result.added) else completion
-        advanced = followed_by(reached, result, clock.seconds)
-        for kept in (self.frozen, self.small):
-            kept.grown(reached.drawn, advanced.drawn)
+            target_view = self.without_unsupported(target_view)
+        result = self.completed(target_view, result, reference, clock)
+        base = target_view.completion if len(result.added) else completion
+        advanced = followed_by(base, result, clock.seconds)
+        for cache in (self.frozen, self.small):
+            cache.grown(base.drawn, advanced.drawn)
         return advanced
 
     def completed(
         self, sight: Sight, result: TargetCompletion, reference: Synthesized | None, clock: Clock
     ) -> TargetCompletion:
-        """`result` once the four stages have done their work."""
+        """Run stages 2 to 4 for an observed target and fill in its result."""
         completion, target = sight.completion, sight.window.target
         with clock("generate"):
             frozen_views = self.at(completion, completion.views)
@@ -343,7 +333,7 @@ class GSCompleter:
         )
 
     def advance_together(self, completion: Completion, targets: Sequence[Camera]) -> Completion:
-        """`advance` by each of `targets`, whose images are synthesized in one go beforehand."""
+        """Complete several targets, whose images Φ synthesizes in one call."""
         if len(targets) < 2:
             return reduce(self.advance, targets, completion)
         references, seconds = self.references(completion, targets)
@@ -353,17 +343,14 @@ class GSCompleter:
         return completion
 
     def reference(self, completion: Completion, target: Camera) -> View:
-        """The image of Φ as far as `target` sees it, whether or not there is a hole.
-
-        It is the one that `advance` would take: drawn with the margin, which is then cut off.
-        """
-        sight = self.sight(completion, target)
+        """Synthesize the image at a target, without padding, even if there is no hole."""
+        target_view = self.sight(completion, target)
         at_views = contexts_of(self.at(completion, completion.views))
-        (image,) = self.synthesize([sight], at_views)
-        return View(sight.window.crop(image.image), sight.window.target)
+        (image,) = self.synthesize([target_view], at_views)
+        return View(target_view.window.crop(image.image), target_view.window.target)
 
     def begun_at(self, sight: Sight) -> TargetCompletion:
-        """Begin the result of a target; refuse one that sees too little of the scene."""
+        """Begin the result of a target; refuse the target if it sees too little of the scene."""
         result = nothing_added(sight, sight.window.crop(self.holes(sight)))
         covered = surfaces_in(result.before, result.target).valid.float().mean().item()
         least = self.config.holes.min_covered
@@ -379,25 +366,31 @@ class GSCompleter:
     def references(
         self, completion: Completion, targets: Sequence[Camera]
     ) -> tuple[list[Synthesized | None], Mapping[str, float]]:
-        """The image at each target where there is something to complete, and the seconds taken."""
+        """Synthesize the images of all targets that have holes; also return the seconds."""
         clock = Clock()
         with clock("context"):
-            sights = [self.sight(completion, target) for target in targets]
-            results = [self.begun_at(sight) for sight in sights]
-            asked = [nothing_to_do(result, completion.views) is None for result in results]
+            target_views = [self.sight(completion, target) for target in targets]
+            results = [self.begun_at(target_view) for target_view in target_views]
+            has_hole = [nothing_to_do(result, completion.views) is None for result in results]
             at_views = contexts_of(self.at(completion, completion.views))
         with clock("generate"):
-            wanted = [sight for sight, needed in zip(sights, asked, strict=True) if needed]
-            found = iter(self.synthesize(wanted, at_views))
-        return [next(found) if needed else None for needed in asked], clock.seconds
+            open_views = [
+                target_view
+                for target_view, needed in zip(target_views, has_hole, strict=True)
+                if needed
+            ]
+            images = iter(self.synthesize(open_views, at_views))
+        return [next(images) if needed else None for needed in has_hole], clock.seconds
 
     def synthesize(self, sights: Sequence[Sight], at_views: Sequence[Render]) -> list[Synthesized]:
-        """Stage 2: Φ's image at each of the wider cameras."""
-        asked = [(sight.window.wide, self.known(sight, at_views)) for sight in sights]
-        return synthesize_all(self.generator, asked) if asked else []
+        """Synthesize the image of each padded target (stage 2)."""
+        inputs = [
+            (target_view.window.wide, self.known(target_view, at_views)) for target_view in sights
+        ]
+        return synthesize_all(self.generator, inputs) if inputs else []
 
     def known(self, sight: Sight, at_views: Sequence[Render]) -> SceneContext:
-        """What Φ is told of the scene."""
+        """Collect the input of Φ at a target."""
         synthesis = self.config.synthesis
         context = SceneContext(
             sight.completion.views,
@@ -411,12 +404,12 @@ class GSCompleter:
         return context if sight.stereo is None else corrected(context, sight.stereo)
 
     def lift(self, sight: Sight, reference: Synthesized) -> Lift:
-        """Stage 2: the image as Gaussians, those that lie near a hole, in the mode of the scene."""
+        """Lift the pixels near holes to Gaussians in the antialiasing mode of the scene."""
         radius = self.config.holes.candidate_radius
-        wanted = None if radius is None else dilate(self.holes(sight), radius)
-        lifted = lift(self.reconstructor, reference, sight.anchor_view, wanted)
-        scene, made = sight.completion.drawn, lifted.gaussians
-        return replace(lifted, gaussians=in_mode_of(scene, made, reference.camera))
+        pixel_mask = None if radius is None else dilate(self.holes(sight), radius)
+        lifted = lift(self.reconstructor, reference, sight.anchor_view, pixel_mask)
+        scene, gaussians = sight.completion.drawn, lifted.gaussians
+        return replace(lifted, gaussians=in_mode_of(scene, gaussians, reference.camera))
 
     def register(
         self,
@@ -425,7 +418,7 @@ class GSCompleter:
         reference: Synthesized,
         frozen_views: Sequence[FrozenView],
     ) -> Registration:
-        """Stage 3: the candidates at the depth of the scene."""
+        """Register the lifted Gaussians to the scene (stage 3)."""
         return register(
             lifted,
             sight.frozen,
@@ -454,42 +447,43 @@ class GSCompleter:
         registration: Registration,
         frozen_views: Sequence[FrozenView],
     ) -> Gaussians:
-        """Stage 4: what lies in the holes, where no photograph and no earlier target sees through
-        it."""
+        """Keep registered Gaussians in holes, outside of observed free space (stage 4)."""
         mask = dilate(self.holes(sight), self.config.holes.dilation)
-        wide, views = sight.window.wide, sight.completion.views
+        padded, views = sight.window.wide, sight.completion.views
         side, earlier = self.config.next_best_view.image_size, sight.completion.targets
-        completed = [result.target for result in earlier if len(result.added)]
-        aside = [shrunk(camera, side) for camera in (*sight.completion.bystanders, *completed)]
-        kept, placed = respect_free_space(
+        completed_cameras = [result.target for result in earlier if len(result.added)]
+        small_cameras = [
+            shrunk(camera, side) for camera in (*sight.completion.bystanders, *completed_cameras)
+        ]
+        kept, is_placed = respect_free_space(
             self.before_doubted(
-                keep_in_holes(registration.gaussians, lifted.pixel_index, mask, wide), sight
+                keep_in_holes(registration.gaussians, lifted.pixel_index, mask, padded), sight
             ),
-            wide,
-            [*(view.camera for view in views), *aside],
+            padded,
+            [*(view.camera for view in views), *small_cameras],
             [
                 *(self.as_believed(sight, f, v) for f, v in zip(frozen_views, views, strict=True)),
-                *self.small_renders(sight.completion, aside),
+                *self.small_renders(sight.completion, small_cameras),
             ],
             self.config.registration.footprint,
             self.config.free_space,
         )
-        kept = kept[placed]
+        kept = kept[is_placed]
         number = torch.full_like(kept.generated, sight.completion.next_number)
         return replace(kept, generated=number)
 
     def as_believed(self, sight: Sight, frozen: FrozenView, view: View) -> Render:
-        """The scene at a photograph, with alpha as far as photographs support it."""
-        drawn = frozen.context
-        believed = self.believed(sight.completion, frozen, view.camera)
-        return drawn if believed is None else replace(drawn, alpha=believed)
+        """Weight the alpha of a photograph's render by trust."""
+        render = frozen.context
+        alpha = self.believed(sight.completion, frozen, view.camera)
+        return render if alpha is None else replace(render, alpha=alpha)
 
     def before_doubted(self, kept: Gaussians, sight: Sight) -> Gaussians:
-        """`kept` before what is doubted at the target and stays, since photographs need it."""
+        """Move Gaussians in front of untrusted Gaussians that were not pruned."""
         if sight.believed is None or len(kept) == 0:
             return kept
-        camera, drawn = sight.window.wide, sight.completion.drawn
-        nearest = front(drawn, sight.frozen, camera)
+        camera, scene = sight.window.wide, sight.completion.drawn
+        nearest = front(scene, sight.frozen, camera)
         pixels, z = project(kept.means, camera)
         limit = sample(nearest[..., None], pixels, "nearest")[:, 0]
         covered = sample(sight.frozen.context.alpha[..., None], pixels, "nearest")[:, 0] > 0.1
@@ -499,7 +493,7 @@ class GSCompleter:
     def refine(
         self, sight: Sight, kept: Gaussians, reference: Synthesized
     ) -> tuple[Gaussians, tuple[float, ...]]:
-        """Stage 4: what joins the scene with the opacities it has there, and the losses."""
+        """Refine new Gaussians and fade those that harm photographs (stage 4)."""
         completion, config = sight.completion, self.config
         budgets = completion.budgets
         frozen = self.at(completion, completion.photographs)
@@ -512,36 +506,37 @@ class GSCompleter:
             refined, losses = refine_opacities(
                 kept, at_target, reference, near, near_views, config.refine
             )
-            drawings = [image_of(plan) for plan in planned]
+            images = [image_of(plan) for plan in planned]
         else:
             holes, degree = self.holes(sight), completion.context.sh_degree
             settings = config.reconcile.at_most(degree)
-            counted = [view.counted for view in completion.photographs]
-            plans = list(each_view(kept)(lambda v, c: v.plan_appearance(kept, c), frozen, counted))
-            observed = [first for first, *_ in budgets]
-            refined, losses = reconcile(
-                kept, sight.frozen, reference, holes, plans, observed, settings
+            valid_masks = [view.counted for view in completion.photographs]
+            plans = list(
+                each_view(kept)(lambda v, c: v.plan_appearance(kept, c), frozen, valid_masks)
             )
-            drawings = [in_colours(plan, refined.sh) for plan in plans]
-        return do_no_harm(refined, frozen, budgets, config.psnr_guard, drawings), losses
+            first_budgets = [first for first, *_ in budgets]
+            refined, losses = reconcile(
+                kept, sight.frozen, reference, holes, plans, first_budgets, settings
+            )
+            images = [in_colours(plan, refined.sh) for plan in plans]
+        return do_no_harm(refined, frozen, budgets, config.psnr_guard, images), losses
 
     def sight(self, completion: Completion, target: Camera, wide: Camera | None = None) -> Sight:
-        """The scene as it stands, frozen at the target's wider camera, and the target's anchor.
+        """Render the scene at a target, padded if a hole reaches the border.
 
-        Without `wide` the target is widened where a hole reaches its edge; what its frame holds
-        whole needs no more.
+        A reference that was synthesized in advance determines the padding by its camera, `padded`.
         """
-        window = self.window(completion, target)
+        camera = self.window(completion, target)
         if wide is not None:
-            window = between(window.target, wide)
-        sight = self.without_stereo(completion, window)
-        if wide is None and is_enclosed(window.crop(self.holes(sight))):
-            sight = self.without_stereo(completion, bordered(window.target, 0, 0))
-        found = self.stereo(completion, sight.frozen.context, sight.window)
-        return replace(sight, stereo=found)
+            camera = between(camera.target, wide)
+        target_view = self.without_stereo(completion, camera)
+        if wide is None and is_enclosed(camera.crop(self.holes(target_view))):
+            target_view = self.without_stereo(completion, bordered(camera.target, 0, 0))
+        found = self.stereo(completion, target_view.frozen.context, target_view.window)
+        return replace(target_view, stereo=found)
 
     def without_stereo(self, completion: Completion, window: Window) -> Sight:
-        """The same through a window, without what stereo among the photographs shows there."""
+        """Render the scene at a padded target, without stereo among the photographs."""
         frozen = self.renderer.freeze(completion.drawn, window.wide)
         anchor = self.anchor(completion, window.target)
         return Sight(
@@ -549,7 +544,7 @@ class GSCompleter:
         )
 
     def anchor(self, completion: Completion, target: Camera) -> AnchorChoice:
-        """Which photograph forms the stereo pair with the target, as the scene stands."""
+        """Select the stereo anchor of a target."""
         config, views = self.config.anchor, completion.views
         if config.min_overlap == 0:
             return select_anchor(target, views, config)
@@ -565,8 +560,7 @@ class GSCompleter:
         return select_anchor(target, views, config, overlaps)
 
     def stereo(self, completion: Completion, drawn: Render, window: Window) -> Stereo | None:
-        """What stereo among the photographs shows to the wider camera; None where nothing is
-        doubted, or there is nothing to complete."""
+        """Render stereo among the photographs at the padded target; None under full trust."""
         cameras = [view.camera for view in completion.views]
         if completion.evidence is None or any(same_camera(window.target, c) for c in cameras):
             return None
@@ -582,8 +576,7 @@ class GSCompleter:
     def believed(
         self, completion: Completion, frozen: FrozenView, camera: Camera
     ) -> Float[Tensor, "h w"] | None:
-        """The alpha of the scene as it stands, frozen at `camera`, as far as photographs support
-        what this sees; None where nothing is doubted."""
+        """Compute alpha weighted by trust at a camera; None under full trust."""
         if completion.evidence is None:
             return None
         values = self.support(completion, completion.evidence, frozen, camera)
@@ -592,78 +585,75 @@ class GSCompleter:
     def support(
         self, completion: Completion, evidence: Evidence, frozen: FrozenView, camera: Camera
     ) -> Float[Tensor, "n"]:
-        """Support of the scene as it stands, as `camera` sees it. What was added has it all, and so
-        has what it does not see."""
+        """Compute the trust of every rendered Gaussian; generated and invisible ones have 1."""
         sums, kept = weight_sums(frozen), completion.num_kept
         seen = in_context(completion, sums[:kept])
-        found = support(evidence, seen, camera, self.config.trust_settings)
+        trust = support(evidence, seen, camera, self.config.trust_settings)
         values = torch.ones_like(sums)
-        values[:kept] = of_kept(completion, found)
+        values[:kept] = of_kept(completion, trust)
         return values
 
     def doubted(self, completion: Completion) -> Completion:
-        """`completion` of a scene that was brought, before any target, and what the photographs
-        show of it."""
-        views, drawn = completion.photographs, completion.drawn
+        """Add the photographs' observations of an input splat, before any target."""
+        views, scene = completion.photographs, completion.drawn
         frozen_views = self.at(completion, views)
-        evidence = gather_evidence(drawn, views, frozen_views, self.config.trust_settings)
-        return replace(completion, evidence=evidence)
+        observations = gather_evidence(scene, views, frozen_views, self.config.trust_settings)
+        return replace(completion, evidence=observations)
 
     def without_unsupported(self, sight: Sight) -> Sight:
-        """`sight` once what covers its holes, and no photograph shows or needs, is set aside.
+        """Prune occluders: unobserved Gaussians that cover holes and that no photograph needs.
 
-        What is set aside leaves the scene, and is none of what the target is completed with.
-        Without witnesses nothing is: what the context does not show, others may have shown.
+        Without check views nothing is pruned, as other photographs may show those Gaussians.
         """
         completion, config = sight.completion, self.config.trust_settings
         if completion.evidence is None or not completion.witnesses or not config.prune:
             return sight
-        doubtful = self.unseen_in_holes(sight, completion.evidence)
-        if not doubtful.any():
+        occluders = self.unseen_in_holes(sight, completion.evidence)
+        if not occluders.any():
             return sight
-        taken = self.not_needed(completion, doubtful)
-        if not taken.any():
+        removable = self.not_needed(completion, occluders)
+        if not removable.any():
             return sight
-        again = self.without_stereo(without(completion, taken), sight.window)
-        # Photographs, and what stereo makes of them, stay as they are.
-        return replace(again, stereo=sight.stereo)
+        pruned_view = self.without_stereo(without(completion, removable), sight.window)
+        # Stereo depends on the photographs only, which do not change.
+        return replace(pruned_view, stereo=sight.stereo)
 
     def not_needed(self, completion: Completion, doubtful: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
-        """The `doubtful` Gaussians of the scene as it stands that no photograph needs."""
+        """Find those of the given Gaussians that can be removed without harm to any photograph."""
         views, rest = completion.photographs, completion.drawn[~doubtful]
         cameras = [view.camera for view in views]
         around = each_view(rest)(partial(self.renderer.freeze, rest), cameras)
-        self.frozen.forget()  # A scene without `doubtful` is to come.
-        gone = not_needed(completion.drawn[doubtful], around, views)
-        return doubtful.masked_scatter(doubtful, gone)
+        self.frozen.forget()  # Free memory: the next scene lacks `doubtful`.
+        removable = not_needed(completion.drawn[doubtful], around, views)
+        return doubtful.masked_scatter(doubtful, removable)
 
     def unseen_in_holes(self, sight: Sight, evidence: Evidence) -> Bool[Tensor, "n"]:
-        """Which Gaussians of the scene as it stands cover holes and are shown by no photograph."""
+        """Find context Gaussians that cover holes and that no photograph shows."""
         completion, camera = sight.completion, sight.window.wide
-        drawn, holes = completion.drawn, self.holes(sight)
+        scene, holes = completion.drawn, self.holes(sight)
         everywhere = torch.ones_like(sight.alpha)
         layers = torch.stack([everywhere, holes.to(everywhere), 0 * everywhere], dim=-1)
         sums, covering, _ = sight.frozen.sums(layers).unbind(-1)
-        of_context = (covering > MIN_COVER) & (drawn.generated == 0)
+        is_occluder = (covering > MIN_COVER) & (scene.generated == 0)
         kept = completion.num_kept
         seen = shown(evidence, in_context(completion, sums[:kept]), camera)
-        of_context[:kept] &= of_kept(completion, seen) < UNSEEN
-        of_context[kept:] = False
-        return of_context
+        is_occluder[:kept] &= of_kept(completion, seen) < UNSEEN
+        is_occluder[kept:] = False
+        return is_occluder
 
     def window(self, completion: Completion, target: Camera) -> Window:
-        """The target and its wider camera, as wide as the generator can draw."""
+        """Pad a target camera by as much as the settings and Φ allow."""
         takes_margin = as_generator(self.generator).takes_margin
         return widened(completion.ranged(target), self.config.margin if takes_margin else 0.0)
 
     def holes(self, sight: Sight) -> Bool[Tensor, "h w"]:
-        """Where the scene has a hole at the wider camera, by the settings of this completer."""
+        """Compute the hole mask at the padded camera."""
         return hole_mask(sight.alpha, self.config.holes)
 
     def wary_of_what_moved(self, completion: Completion) -> Completion:
-        """`completion`, whose photographs say where others contradict them."""
-        views, drawn = completion.views, contexts_of(self.at(completion, completion.views))
-        masks = contradicted(views, drawn, self.config.dynamic_masks)
+        """Add dynamic masks to the context views."""
+        views, renders = completion.views, contexts_of(self.at(completion, completion.views))
+        masks = contradicted(views, renders, self.config.dynamic_masks)
         return replace(
             completion,
             views=tuple(
@@ -673,10 +663,10 @@ class GSCompleter:
         )
 
     def judged(self, completion: Completion) -> Completion:
-        """`completion` before any target, with what its photographs ask of whatever is added."""
+        """Add the error budgets of all photographs, before any target."""
         config = self.config.psnr_guard
         tolerance = 0.0 if completion.evidence is not None else config.max_drop or 0.0
-        drawn = contexts_of(self.at(completion, completion.photographs))
+        renders = contexts_of(self.at(completion, completion.photographs))
         budgets = tuple(
             error_budgets(
                 view,
@@ -685,51 +675,47 @@ class GSCompleter:
                 tolerance,
                 config.max_ssim_drop,
             )
-            for view, render in zip(completion.photographs, drawn, strict=True)
+            for view, render in zip(completion.photographs, renders, strict=True)
         )
-        return replace(completion, budgets=budgets, begun=drawn[: len(completion.views)])
+        return replace(completion, budgets=budgets, begun=renders[: len(completion.views)])
 
     def at(self, completion: Completion, views: Sequence[View]) -> tuple[FrozenView, ...]:
-        """The scene as it stands, frozen at the cameras of photographs."""
+        """Freeze the scene at the cameras of photographs."""
         return self.frozen.of(completion, [view.camera for view in views])
 
     def small_renders(self, completion: Completion, cameras: Sequence[Camera]) -> Sequence[Render]:
-        """What cameras of small images see of the scene as it stands, about."""
+        """Render a simplified scene at cameras of small images."""
         return contexts_of(self.small.of(completion, cameras))
 
 
 def ranged(view: View, near: float, far: float) -> View:
-    """`view` with a depth range."""
+    """Return the view with a depth range in scene units."""
     return replace(view, camera=replace(view.camera, near=near, far=far))
 
 
 def without(completion: Completion, taken: Bool[Tensor, "n"]) -> Completion:
-    """`completion` with more of its context set aside: `taken` of what is drawn of it."""
-    before, gone = completion.set_aside, in_context(completion, taken[: completion.num_kept])
-    aside = gone if before is None else before | gone
-    return replace(completion, drawn=completion.drawn[~taken], set_aside=aside)
+    """Prune rendered Gaussians of the context."""
+    before, new = completion.set_aside, in_context(completion, taken[: completion.num_kept])
+    pruned = new if before is None else before | new
+    return replace(completion, drawn=completion.drawn[~taken], set_aside=pruned)
 
 
 def in_context(completion: Completion, values: Shaped[Tensor, "kept"]) -> Shaped[Tensor, "m"]:
-    """Values of what the scene keeps of its context, as values of all of this; 0 of the others."""
-    aside = completion.set_aside
-    if aside is None:
+    """Map values of kept context Gaussians to all rendered ones; pruned ones get 0."""
+    pruned = completion.set_aside
+    if pruned is None:
         return values
-    return values.new_zeros(len(aside)).masked_scatter(~aside, values)
+    return values.new_zeros(len(pruned)).masked_scatter(~pruned, values)
 
 
 def of_kept(completion: Completion, values: Shaped[Tensor, "m"]) -> Shaped[Tensor, "kept"]:
-    """Values of all of the context, as values of what the scene keeps of it."""
-    aside = completion.set_aside
-    return values if aside is None else values[~aside]
+    """Select the values of context Gaussians that are not pruned."""
+    pruned = completion.set_aside
+    return values if pruned is None else values[~pruned]
 
 
 def check_numbers(scene: Gaussians | None, num_targets: int) -> None:
-    """Refuse more targets than provenance can tell apart.
-
-    Raises:
-        InputError: where `scene` holds so many already that `num_targets` more do not fit.
-    """
+    """Raise InputError if `generated` cannot hold the ids of `num_targets` more targets."""
     given = 0 if scene is None or len(scene) == 0 else int(scene.generated.max())
     if given + num_targets > MAX_TARGETS:
         raise InputError(
@@ -739,7 +725,7 @@ def check_numbers(scene: Gaussians | None, num_targets: int) -> None:
 
 
 def nothing_added(sight: Sight, holes: Bool[Tensor, "h w"]) -> TargetCompletion:
-    """The target before anything happened there."""
+    """Return the result of a target to which nothing was added."""
     return TargetCompletion(
         target=sight.window.target,
         before=sight.before,
@@ -755,7 +741,7 @@ def nothing_added(sight: Sight, holes: Bool[Tensor, "h w"]) -> TargetCompletion:
 
 
 def nothing_to_do(result: TargetCompletion, views: Sequence[View]) -> str | None:
-    """Why a target needs no completion, in a sentence; None where it does."""
+    """Return a sentence why a target needs no completion, or None if it does."""
     if result.refused is not None:
         return result.refused
     if any(same_camera(result.target, view.camera) for view in views):
@@ -768,7 +754,7 @@ def nothing_to_do(result: TargetCompletion, views: Sequence[View]) -> str | None
 def followed_by(
     completion: Completion, result: TargetCompletion, seconds: Mapping[str, float]
 ) -> Completion:
-    """`completion` after what happened at one more target."""
+    """Append the result of one more target."""
     added = result.added
     return replace(
         completion,
@@ -787,45 +773,45 @@ def check_any_completed(completion: Completion) -> None:
 
 
 def contexts_of(frozen_views: Sequence[FrozenView]) -> tuple[Render, ...]:
-    """The scene as each of the frozen views shows it."""
+    """Return the renders of frozen scenes."""
     return tuple(frozen.context for frozen in frozen_views)
 
 
 def nearest_views(camera: Camera, views: Sequence[View]) -> list[int]:
-    """Indices of `views`, the ones taken closest to `camera` first."""
+    """Sort indices of `views` by their distance to `camera`."""
     return sorted(
         range(len(views)), key=lambda i: (views[i].camera.center - camera.center).norm().item()
     )
 
 
 def notes_of(anchor_fallback: bool, affine: DepthAffine) -> tuple[str, ...]:
-    """A sentence for each fallback that was taken."""
+    """Return one sentence for each fallback that was taken."""
     notes = []
     if anchor_fallback:
         notes.append("Every view is turned too far; the least-turned one is the anchor.")
     if affine.contradicted:
         notes.append(
-            "At the target the scene contradicted the depths that fit the anchor; they were fitted "
-            "there instead."
+            "The depths that fit the anchor contradict the scene at the target; they are fitted at "
+            "the target instead."
         )
     if affine.refuted:
         notes.append(
-            "At the target the scene contradicts the depths of what was synthesized: with "
-            f"{affine.agreement:.0%} of what is seen of it they agree, and no other fit is better."
+            f"Only {affine.agreement:.0%} of the scene that the target sees agrees with the depths "
+            "of the synthesized image, and no other fit is better."
         )
     if affine.method == "median":
-        notes.append("RANSAC found no trustworthy affine; the median depth ratio took its place.")
+        notes.append(
+            "RANSAC finds no reliable depth correction; the median depth ratio replaces it."
+        )
     if affine.method == "identity":
-        notes.append("There was nothing to fit an affine to; depths were left as predicted.")
+        notes.append(
+            "There is nothing to fit a depth correction to; the predicted depths are used."
+        )
     return tuple(notes)
 
 
 def check_values(views: Sequence[View], scene: Gaussians | None) -> None:
-    """Refuse images and Gaussians of values that no stage can work with.
-
-    Raises:
-        InputError: where colours are outside of [0, 1], or the scene holds NaN or infinity.
-    """
+    """Raise InputError for colours outside of [0, 1], or NaN or infinity in the scene."""
     for number, view in enumerate(views):
         low, high = (float(bound) for bound in view.image.aminmax())
         if not (low >= -COLOUR_SLACK and high <= 1 + COLOUR_SLACK):  # nor NaN
@@ -835,11 +821,11 @@ def check_values(views: Sequence[View], scene: Gaussians | None) -> None:
             )
     parts = () if scene is None else (scene.means, scene.quats, scene.scales, scene.opacities)
     if not all(bool(part.isfinite().all()) for part in parts):
-        raise InputError("The scene holds NaN or infinity; leave such Gaussians out.")
+        raise InputError("The scene holds NaN or infinity; remove such Gaussians.")
 
 
 class Clock:
-    """Wall time by stage, and `total`. That a stage goes on is shown where anything is."""
+    """A stopwatch of wall time per stage and in total, which also shows the running stage."""
 
     def __init__(self, stages: Sequence[str] = STAGES) -> None:
         self._start = time.perf_counter()
@@ -847,6 +833,7 @@ class Clock:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
+        """Measure a stage and show it as running."""
         start = time.perf_counter()
         try:
             with stage(name):
@@ -859,10 +846,10 @@ class Clock:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Seconds of each stage so far, and of all of it."""
+        """Wall time of each stage so far, and of all together as `total`."""
         return {**self._seconds, "total": time.perf_counter() - self._start}
 
 
 def total(before: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:
-    """Seconds of both, stage by stage."""
+    """Add wall times stage by stage."""
     return {stage: before[stage] + more.get(stage, 0.0) for stage in before}

@@ -1,5 +1,4 @@
-"""When a scene covers a pixel."""
+"""Threshold of alpha at which a pixel counts as covered."""
 
 COVERED = 0.5
-"""Alpha from which a pixel is covered, by half: its rendered depth means something, and it is no
-hole unless `holes.max_alpha` asks for more (τ of Eq. 12)."""
+"""Alpha from which a pixel is covered, unless `holes.max_alpha` (τ of Eq. 12) demands more."""

@@ -60,7 +60,7 @@ def quoted(value: object, length: int | None = None) -> str:
     if length is None:
         length = LONGEST_PATH if isinstance(value, os.PathLike) else LONGEST_QUOTE
     text = str(value) if isinstance(value, (str, os.PathLike)) else _written(value)
-    # Twice as many characters as are wanted at either end are enough, whatever is left out.
+    # Only the ends of very long texts are processed.
     ends = text if len(text) <= 4 * length else text[: 2 * length] + text[-2 * length :]
     line = "".join(c if c.isprintable() else " " for c in ends)
     if len(text) <= length:

@@ -1,4 +1,4 @@
-"""Explorer: a scene is completed where it lacks most, and looked at again after each completion."""
+"""Next-best-view planner: choose target cameras greedily and complete the scene for them."""
 
 from __future__ import annotations
 
@@ -36,42 +36,41 @@ from gscompleter.stages.integration import hole_mask
 from gscompleter.types import Camera, Completion, Render, merge
 
 MAX_BYSTANDERS = 40
-"""Photographs, besides the context, before which nothing is added."""
+"""Most cameras of photographs, besides the context views, whose free space is kept empty."""
 
 Complete = Callable[[Completion, Camera], Completion]
-"""What is done at a camera once it is chosen."""
+"""Step that is taken at a chosen camera."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a camera sees of a scene in a small image."""
+    """A small render of a scene and its hole mask."""
 
     camera: Camera
-    """The camera of the small image."""
     render: Render
     holes: Bool[Tensor, "h w"]
 
 
 @dataclass(frozen=True)
 class Explorer:
-    """Finds the cameras that a scene is worth completing for, and completes it for them."""
+    """Plans next-best target views greedily, re-scoring candidates after each completion."""
 
     completer: GSCompleter
 
     @property
     def config(self) -> NextBestViewConfig:
-        """Where targets are looked for."""
+        """Settings of the planner."""
         return self.completer.config.next_best_view
 
     def explore(
         self, completion: Completion, cameras: Sequence[Camera], count: int
     ) -> tuple[Completion, tuple[Choice, ...]]:
-        """Complete a scene for up to `count` cameras that are found, one after the other.
+        """Choose up to `count` target cameras and complete the scene for each.
 
         Args:
-            completion: Where it goes on from, such as `GSCompleter.begin` gives it.
-            cameras: Those of all photographs of the scene, whether or not it was made of them.
-            count: How many cameras it is completed for at most. It is fewer where little is left.
+            completion: The scene so far, such as `GSCompleter.begin` returns.
+            cameras: Cameras of all photographs of the scene, used for the context or not.
+            count: Largest number of targets; there are fewer if little is left to gain.
         """
         clock, begun = Clock(()), completion.seconds["total"]
         completion = with_bystanders(completion, cameras)
@@ -84,14 +83,14 @@ class Explorer:
     def plan(
         self, completion: Completion, cameras: Sequence[Camera], count: int
     ) -> tuple[Choice, ...]:
-        """About the cameras that `explore` would take, found without completing anything.
+        """Estimate the choices of `explore` without completing anything.
 
-        Each hole is closed by grey stand-ins before the next camera is chosen.
+        Grey placeholders close the holes of each chosen camera.
         """
         return self.take(miniature(completion), cameras, count, self.with_stand_ins)[1]
 
     def holes(self, completion: Completion, cameras: Sequence[Camera]) -> list[float]:
-        """Share of the image of each camera that is a hole, once those before are completed."""
+        """Compute the hole fraction at each camera after those before it are completed."""
         small, shares = miniature(completion), []
         for camera in cameras:
             shares.append(self.look(small, camera).holes.float().mean().item())
@@ -101,25 +100,25 @@ class Explorer:
     def take(
         self, completion: Completion, cameras: Sequence[Camera], count: int, complete: Complete
     ) -> tuple[Completion, tuple[Choice, ...]]:
-        """Choose a camera, complete the scene there, and choose again."""
+        """Repeatedly choose the best camera and complete the scene there."""
         with stage("finding targets"):
-            offers, step = self.offers(completion, cameras)
+            remaining, step = self.offers(completion, cameras)
         chosen: list[Choice] = []
         for _ in track(range(count), "target"):
-            choices = self.judged(completion, offers)
+            choices = self.judged(completion, remaining)
             choice = best(choices, [v.camera for v in completion.views], step, self.config)
             if choice is None:
                 break
             completion = complete(completion, choice.camera)
             chosen.append(choice)
             left = [c.candidate for c in choices if c.gain >= self.config.min_gain]
-            offers = [candidate for candidate in left if candidate is not choice.candidate]
+            remaining = [candidate for candidate in left if candidate is not choice.candidate]
         return completion, tuple(chosen)
 
     def offers(
         self, completion: Completion, cameras: Sequence[Camera]
     ) -> tuple[list[Candidate], float]:
-        """Cameras a move away from those given that see anything new, and the length of a step."""
+        """Propose candidate cameras; also return the step length in scene units."""
         bases = spread_cameras(cameras, self.config.bases)
         near = [completion.ranged(cameras[index]) for index in bases]
         step = spacing(near)
@@ -129,7 +128,7 @@ class Explorer:
         return [replace(candidate, base=bases[candidate.base]) for candidate in found], step
 
     def judged(self, completion: Completion, offers: Sequence[Candidate]) -> list[Choice]:
-        """What there is to gain at each of `offers`, in the scene as it stands."""
+        """Score all candidates in the current scene."""
         small = miniature(completion)
         anchors = [self.look(small, view.camera) for view in small.views]
         choose = partial(self.choice, small, anchors)
@@ -140,38 +139,39 @@ class Explorer:
     def choice(
         self, completion: Completion, anchors: Sequence[Look], candidate: Candidate
     ) -> Choice:
-        """What there is to gain at one camera; nothing where it stands close to a surface."""
-        look = self.look(completion, candidate.camera)
-        hole = look.holes.float().mean().item()
-        if is_close(look.render, candidate.nearest, self.config):
+        """Score one candidate; its gain is 0 if it is too close to a surface."""
+        small_view = self.look(completion, candidate.camera)
+        hole = small_view.holes.float().mean().item()
+        if is_close(small_view.render, candidate.nearest, self.config):
             return Choice(candidate, hole, 0.0)
         overlaps = [
-            overlap_of(look.camera, look.render, anchor.camera, anchor.render) for anchor in anchors
+            overlap_of(small_view.camera, small_view.render, anchor.camera, anchor.render)
+            for anchor in anchors
         ]
         config, views = self.completer.config.anchor, completion.views
         anchor = select_anchor(candidate.camera, views, config, overlaps).index
-        return Choice(candidate, hole, gain(look.holes, overlaps[anchor], self.config))
+        return Choice(candidate, hole, gain(small_view.holes, overlaps[anchor], self.config))
 
     def look(self, completion: Completion, camera: Camera) -> Look:
-        """What a camera sees of a scene, in a small image."""
+        """Render the scene at a camera in a small image."""
         camera = shrunk(completion.ranged(camera), self.config.image_size)
         frozen = self.completer.renderer.freeze(completion.drawn, camera)
-        render, believed = frozen.context, self.completer.believed(completion, frozen, camera)
-        alpha = render.alpha if believed is None else believed
+        render, trusted = frozen.context, self.completer.believed(completion, frozen, camera)
+        alpha = render.alpha if trusted is None else trusted
         return Look(camera, render, hole_mask(alpha, self.completer.config.holes))
 
     def with_stand_ins(self, completion: Completion, camera: Camera) -> Completion:
-        """`completion` with stand-ins in the holes that it has at a camera."""
-        look = self.look(completion, self.completer.window(completion, camera).wide)
-        drawn, made = completion.drawn, stand_ins(look.render, look.holes, look.camera)
-        added = in_mode_of(drawn, made, look.camera)
-        return replace(completion, drawn=merge([drawn, added]))
+        """Close the holes at a camera by grey placeholders."""
+        view = self.look(completion, self.completer.window(completion, camera).wide)
+        scene, placeholders = completion.drawn, stand_ins(view.render, view.holes, view.camera)
+        added = in_mode_of(scene, placeholders, view.camera)
+        return replace(completion, drawn=merge([scene, added]))
 
 
 def with_bystanders(completion: Completion, cameras: Sequence[Camera]) -> Completion:
-    """`completion` with those of `cameras` that it has no photographs of, or many of them, spread.
+    """Keep the free space of a spread subset of cameras empty.
 
-    Not where the scene is doubted: what it shows them may be wrong, and its witnesses know better.
+    An input splat gets none: its renders may be wrong there, and check views protect it better.
     """
     taken = [view.camera for view in completion.views]
     others = [completion.ranged(c) for c in cameras if not any(same_camera(c, t) for t in taken)]

@@ -1,4 +1,4 @@
-"""Rays, projection, and how cameras lie to each other."""
+"""Rays, projections, rotations, and relations between cameras."""
 
 from __future__ import annotations
 
@@ -14,22 +14,18 @@ from torch.nn.functional import pad
 from gscompleter.types import Camera, Gaussians, Window
 
 FOOTPRINT = 3.4
-"""Standard deviations from its centre within which a Gaussian is drawn: beyond sqrt(2 log 255) the
-alpha of the most opaque is below 1/255."""
+"""Rendered radius of a Gaussian in standard deviations: beyond sqrt(2 log 255), alpha < 1/255."""
 
 
 def unproject(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w 3"]:
-    """World points at z-depth `depth` behind each pixel centre of `camera`."""
+    """Lift z-depths at the pixel centres of `camera` to world points."""
     return camera.center + depth[..., None] * camera.z_rays()
 
 
 def project(
     points: Float[Tensor, "*shape 3"], camera: Camera
 ) -> tuple[Float[Tensor, "*shape 2"], Float[Tensor, "*shape"]]:
-    """Pixel coordinates (x, y) and z-depth of world `points` in `camera`.
-
-    Coordinates of points that do not lie in front of the camera (z <= 0) mean nothing.
-    """
+    """Project world points to pixels (x, y), meaningful for positive z-depth only, and z-depths."""
     camera_points = (points - camera.center) @ camera.c2w[:3, :3]
     z = camera_points[..., 2]
     homogeneous = camera_points @ camera.K.T
@@ -39,7 +35,7 @@ def project(
 def inside(
     pixels: Float[Tensor, "*shape 2"], z: Float[Tensor, "*shape"], camera: Camera
 ) -> Bool[Tensor, "*shape"]:
-    """Where projected points lie in front of the camera and within its image."""
+    """Return True for projected points in front of the camera and within its image."""
     x, y = pixels.unbind(-1)
     return (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
 
@@ -47,7 +43,7 @@ def inside(
 def sample(
     values: Float[Tensor, "h w c"], pixels: Float[Tensor, "*shape 2"], mode: str = "bilinear"
 ) -> Float[Tensor, "*shape c"]:
-    """`values` at pixel coordinates, `bilinear` or `nearest`; the border is extended."""
+    """Sample `values` at pixel coordinates, `bilinear` or `nearest`, extending the border."""
     h, w = values.shape[:2]
     size = torch.tensor([w, h], dtype=pixels.dtype, device=pixels.device)
     grid = (pixels / size * 2 - 1).reshape(1, 1, -1, 2)
@@ -58,7 +54,7 @@ def sample(
 
 
 def distance_from_depth(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w"]:
-    """Euclidean distance along each pixel's ray, from z-depth (paper, Eq. 9)."""
+    """Convert z-depth to the Euclidean distance along each pixel's ray (paper, Eq. 9)."""
     return depth * camera.z_rays().norm(dim=-1)
 
 
@@ -68,10 +64,10 @@ def slide(
     ratio: Float[Tensor, "n"],
     footprint: Literal["constant", "fixed"],
 ) -> Gaussians:
-    """`gaussians` at `ratio` times their distance from the centre of `camera`.
+    """Move Gaussians to `ratio` times their distance from the centre of `camera`.
 
-    With a constant footprint sizes follow: a similarity about the camera centre, under which the
-    image in that camera is exactly what it was.
+    With a constant footprint they are scaled about the camera centre, which keeps the image in that
+    camera exactly as it was.
     """
     means = camera.center + ratio[:, None] * (gaussians.means - camera.center)
     scales = gaussians.scales * ratio[:, None] if footprint == "constant" else gaussians.scales
@@ -79,10 +75,9 @@ def slide(
 
 
 def reaching(gaussians: Gaussians, camera: Camera, where: Bool[Tensor, "h w"]) -> Bool[Tensor, "n"]:
-    """Which Gaussians `camera` may see at pixels `where` it is asked for; at least those it does.
+    """Return True for all Gaussians that `camera` sees in the mask `where`, and maybe others.
 
-    Each is taken for the square about its widest footprint that is drawn (`FOOTPRINT`), in which
-    pixels are counted by sums over the rectangles from the corner of the image.
+    A square of `FOOTPRINT` about each Gaussian is compared with a summed-area table of the mask.
     """
     pixels, z = project(gaussians.means, camera)
     size = torch.tensor([camera.width, camera.height], device=pixels.device)
@@ -99,20 +94,19 @@ def reaching(gaussians: Gaussians, camera: Camera, where: Bool[Tensor, "h w"]) -
 
 
 def at_depths(gaussians: Gaussians, camera: Camera, depths: Float[Tensor, "n"]) -> Gaussians:
-    """`gaussians` on the same rays of `camera` at other z-depths, with a constant footprint."""
+    """Move Gaussians along the rays of `camera` to other z-depths, with a constant footprint."""
     return slide(gaussians, camera, depths / z_depths(gaussians.means, camera), "constant")
 
 
 def z_depths(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n"]:
-    """How far points stand from `camera` along its axis, in scene units."""
+    """Compute the z-depths of world points in `camera`, in scene units."""
     return (points - camera.center) @ camera.forward
 
 
 def rotation_between(a: Camera, b: Camera) -> float:
-    """Full angle of the rotation that turns one camera into the other, in degrees.
+    """Compute the angle of the rotation between two cameras, in degrees.
 
-    The arctangent of sine and cosine keeps small angles exact, where the arccosine of the
-    trace alone loses half of the digits.
+    The arctangent of sine and cosine is exact for small angles; the arccosine of the trace is not.
     """
     relative = (a.c2w[:3, :3].T @ b.c2w[:3, :3]).double()
     cos = (relative.trace() - 1) / 2
@@ -122,18 +116,17 @@ def rotation_between(a: Camera, b: Camera) -> float:
 
 
 def baseline_between(a: Camera, b: Camera) -> float:
-    """Distance between the camera centres, in scene units."""
+    """Compute the distance between the camera centres, in scene units."""
     return (a.center - b.center).norm().item()
 
 
 def widened(camera: Camera, margin: float) -> Window:
-    """`camera` and the one whose image extends it on every side by `margin` of its size."""
+    """Pad the image of `camera` on every side by `margin` of its size."""
     return bordered(camera, round(margin * camera.width), round(margin * camera.height))
 
 
 def bordered(camera: Camera, left: int, top: int) -> Window:
-    """`camera` and the one whose image has `left` pixels more on both sides, `top` above and
-    below."""
+    """Pad the image of `camera` by `left` pixels on the left and right, `top` above and below."""
     K = camera.K.clone()
     K[0, 2] += left
     K[1, 2] += top
@@ -142,12 +135,12 @@ def bordered(camera: Camera, left: int, top: int) -> Window:
 
 
 def between(camera: Camera, wide: Camera) -> Window:
-    """`camera` and the one that sees as much more on both sides, above and below as `wide` does."""
+    """Pad the image of `camera` to the size of `padded`, centred."""
     return bordered(camera, (wide.width - camera.width) // 2, (wide.height - camera.height) // 2)
 
 
 def same_camera(a: Camera, b: Camera) -> bool:
-    """Whether two cameras see the same image, up to float rounding."""
+    """Return True if two cameras see the same image, up to float rounding."""
     extent = max(a.center.abs().max().item(), b.center.abs().max().item())
     return (
         (a.width, a.height) == (b.width, b.height)
@@ -158,7 +151,7 @@ def same_camera(a: Camera, b: Camera) -> bool:
 
 
 def rotations_from(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
-    """Rotation matrices of wxyz quaternions of any length but zero."""
+    """Convert wxyz quaternions of any length but zero to rotation matrices."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     return matrices(
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -168,7 +161,7 @@ def rotations_from(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
 
 
 def quats_from(rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
-    """Unit wxyz quaternions of rotation matrices, by the largest of the four components."""
+    """Convert rotation matrices to unit wxyz quaternions, by the largest component."""
     r = rotations.flatten(-2).unbind(-1)
     w, x = 1 + r[0] + r[4] + r[8], 1 + r[0] - r[4] - r[8]
     y, z = 1 - r[0] + r[4] - r[8], 1 - r[0] - r[4] + r[8]
@@ -183,20 +176,20 @@ def quats_from(rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
 def quats_product(
     after: Float[Tensor, "*#n 4"], before: Float[Tensor, "*#n 4"]
 ) -> Float[Tensor, "*n 4"]:
-    """wxyz quaternions of the rotations `before` followed by the rotations `after`."""
+    """Compose rotations given as wxyz quaternions: first `before`, then `after`."""
     w, x, y, z = after.unbind(-1)
     left = matrices([w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w])
     return (left @ before[..., None])[..., 0]
 
 
 def rotation_about(axis: Float[Tensor, "3"], angle: float) -> Float[Tensor, "3 3"]:
-    """The turn by `angle` radians about a direction of length 1."""
+    """Compute the rotation by `angle` radians about a unit `axis`."""
     real = torch.tensor([math.cos(angle / 2)], dtype=torch.float64, device=axis.device)
     return rotations_from(torch.cat([real, math.sin(angle / 2) * axis.double()])).to(axis)
 
 
 def share_of_turn(turn: Float[Tensor, "3 3"], share: float) -> Float[Tensor, "3 3"]:
-    """`share` of a turn, about the same axis; of its two ways the shorter one."""
+    """Scale the angle of a rotation by `share`, taking the shorter way round."""
     quat = quats_from(turn.double())
     real, imaginary = (quat if quat[0] >= 0 else -quat).split([1, 3])
     length = imaginary.norm()
@@ -205,5 +198,5 @@ def share_of_turn(turn: Float[Tensor, "3 3"], share: float) -> Float[Tensor, "3 
 
 
 def matrices(*rows: list[Float[Tensor, "*n"]]) -> Float[Tensor, "*n r c"]:
-    """The matrices of which these are the entries, row by row."""
+    """Stack entries, given row by row, to matrices."""
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

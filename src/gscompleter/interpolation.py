@@ -1,4 +1,4 @@
-"""Smooth continuation of values known in a part of an image."""
+"""Smooth interpolation of values that are known in a part of an image."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 def fill_smoothly(
     values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"], num_relaxations: int = 64
 ) -> Float[Tensor, "h w"]:
-    """`values` where `known`, continued smoothly elsewhere; zero everywhere if nothing is known.
+    """Interpolate smoothly outside the mask `known`: `push_pull`, relaxed towards a membrane.
 
-    The pyramid of `push_pull` gives a first guess, which relaxation then draws towards the
-    membrane that is clamped to what is known.
+    If nothing is known, the result is zero.
     """
     weight = known.to(values.dtype)
     filled = push_pull(values[..., None], weight)[..., 0]
@@ -25,7 +24,7 @@ def fill_smoothly(
 
 
 def mean_of_neighbours(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """The mean of the four pixels around each; the border is extended."""
+    """Compute the mean of the four neighbours of each pixel, extending the border."""
     padded = pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     total = padded[:-2, 1:-1] + padded[2:, 1:-1]
     total += padded[1:-1, :-2]
@@ -36,10 +35,9 @@ def mean_of_neighbours(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 def push_pull(
     values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w c"]:
-    """`values` where `weight` is 1; where it is 0, a smooth continuation of what surrounds it.
+    """Interpolate `values` into the pixels of zero `weight` through a pyramid of averages.
 
-    Averages are pushed up a pyramid, and whatever a level lacks is pulled down from the coarser
-    one (Gortler et al., The Lumigraph, 1996). Where no weight is positive at all the result is 0.
+    See Gortler et al., The Lumigraph, 1996. If all weights are zero, the result is 0.
     """
     weighted = (values * weight[..., None]).permute(2, 0, 1)[None]
     filled = _fill(weighted, weight[None, None])
@@ -64,7 +62,7 @@ def _fill(
 def smoothed(
     values: Float[Tensor, "h w c"], mask: Bool[Tensor, "h w"], radius: int
 ) -> Float[Tensor, "h w c"]:
-    """Means of `values` over the pixels of `mask` within a square of 2 radius + 1."""
+    """Average `values` over the pixels of `mask` in a square of 2 radius + 1 pixels."""
     weight = mask.to(values.dtype)[..., None]
     layers = torch.cat([values * weight, weight], dim=-1)
     side = 2 * radius + 1

@@ -1,4 +1,4 @@
-"""Masks over the pixels of an image."""
+"""Operations on image masks."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from torch.nn.functional import max_pool2d
 
 
 def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
-    """`mask` grown by `radius` pixels on every side (max-pool of 2 radius + 1, by rows and then by
-    columns)."""
+    """Dilate `mask` by a square of 2 radius + 1 pixels."""
     side, grown = 2 * radius + 1, mask[None, None].float()
     for size, padding in (((1, side), (0, radius)), ((side, 1), (radius, 0))):
         grown = max_pool2d(grown, size, stride=1, padding=padding)
@@ -17,5 +16,5 @@ def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
 
 
 def is_enclosed(mask: Bool[Tensor, "h w"]) -> bool:
-    """Whether the image holds `mask` whole: there is some of it, and none at the edge."""
+    """Return True if `mask` is not empty and does not touch the border of the image."""
     return bool(mask.any()) and int(mask.sum()) == int(mask[1:-1, 1:-1].sum())

@@ -153,12 +153,12 @@ class Work:
     def sentence(self) -> str:
         """Format everything as one line."""
         left, share, spent = self.left(), self.share(), self.spent()
-        told = [
+        parts = [
             *([] if share is None else [f"{share:.0%}"]),
             *([f"{in_words(spent)} so far"] if spent >= 1 else []),
             *([] if left is None else [f"about {in_words(left)} left"]),
         ]
-        return ": ".join([self.description(), *([", ".join(told)] if told else [])])
+        return ": ".join([self.description(), *([", ".join(parts)] if parts else [])])
 
 
 def outermost_counted(activities: Sequence[Activity]) -> Activity | None:
@@ -190,7 +190,7 @@ class Line:
     """A live line on a terminal, which disappears at the end."""
 
     def __init__(self, console: Console, work: Work) -> None:
-        # Here, so that what shows nothing does not wait for it.
+        # Imported here because a log does not need it.
         from rich.live import Live
         from rich.spinner import Spinner
 
@@ -224,7 +224,7 @@ class Line:
         if not work.going:
             return row
         left, share = work.left(), work.share()
-        # Alone what goes on may be cut, where the terminal is narrow.
+        # On a narrow terminal only the name is shortened.
         name = Text(work.description(), no_wrap=True, overflow="ellipsis")
         cells: list[RenderableType] = [self._spinner, name]
         if share is not None:

@@ -1,4 +1,4 @@
-"""Read files that somebody else wrote: regular files only, and no more of them than fits."""
+"""Safe reading of files from elsewhere: regular files only, of limited size."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from gscompleter.errors import InputError, quoted
 MAX_BYTES = 1 << 33
 """Largest file that is read at once, in bytes."""
 MAX_TEXT = 1 << 23
-"""Longest text file, in bytes."""
+"""Largest text file, in bytes."""
 MAX_LINE = 4096
 """Longest line, in characters."""
 MAX_DEPTH = 64
-"""Deepest nesting of lists and dictionaries; numpy knows no more dimensions."""
+"""Deepest nesting of lists and dictionaries, the most dimensions that numpy supports."""
 
 _KINDS = {
     stat.S_IFDIR: "folder",
@@ -32,11 +32,7 @@ _HOLDERS = (list, tuple, dict, set, frozenset)
 
 
 def check_file(path: Path) -> None:
-    """Refuse whatever is no regular file, before it is opened.
-
-    Raises:
-        InputError: if there is nothing, or a folder, a pipe, a socket or a device.
-    """
+    """Raise InputError if `path` is not a regular file, without opening it."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
@@ -47,11 +43,7 @@ def check_file(path: Path) -> None:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file for reading.
-
-    Raises:
-        InputError: as `check_file`, or if it may not be read.
-    """
+    """Open a regular file for reading; raise InputError if that fails."""
     check_file(path)
     try:
         return path.open("rb")
@@ -60,18 +52,14 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def read_head(path: Path, count: int) -> bytes:
-    """Read the first `count` bytes of a file; empty where there is no file that can be read."""
+    """Read the first `count` bytes of a file, or none if it cannot be read."""
     with suppress(InputError, OSError), open_file(path) as file:
         return file.read(count)
     return b""
 
 
 def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
-    """Read a file of at most `most` bytes.
-
-    Raises:
-        InputError: as `open_file`, or if it is larger.
-    """
+    """Read a file of at most `max_bytes` bytes; raise InputError if that fails."""
     try:
         with open_file(path) as file:
             _check_size(path, file, most)
@@ -83,17 +71,10 @@ def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
 def read_lines(
     path: Path, longest: int = MAX_LINE, most: int = MAX_TEXT, errors: str = "replace"
 ) -> Iterator[str]:
-    """Read the lines of a text file in UTF-8, one after the other, with their ends.
+    """Read the lines of a UTF-8 text file one by one; raise InputError if it is too long.
 
-    Args:
-        path: The file.
-        longest: Characters of a line.
-        most: Bytes of the file.
-        errors: What becomes of bytes that are no text, as in `bytes.decode`.
-
-    Raises:
-        InputError: as `open_file`, or if the file or one of its lines is longer.
-        UnicodeDecodeError: if it is no text, and `errors` is "strict".
+    Lines have at most `max_length` characters, the file `max_bytes` bytes. `errors` as in
+    `bytes.decode`.
     """
     try:
         with open_file(path) as file:
@@ -102,8 +83,8 @@ def read_lines(
             while line := text.readline(longest + 1):
                 if len(line) > longest:
                     raise InputError(
-                        f"{quoted(path)} has a line of more than {longest:,} characters, which is "
-                        "none of its format; copy it again."
+                        f"{quoted(path)} has a line of more than {longest:,} characters, which "
+                        "its format does not allow; copy the file again."
                     )
                 yield line
     except OSError as error:
@@ -111,17 +92,9 @@ def read_lines(
 
 
 def check_plain(value: Any, path: Path, most: int) -> None:
-    """Refuse lists and dictionaries that are too deep or, with repetitions, too many.
+    """Raise InputError if values read from `path` are nested too deeply or too many.
 
-    A value that contains itself is endless, and is refused as too deep or too large.
-
-    Args:
-        value: What was read from `path`.
-        path: The file.
-        most: How many values there may be.
-
-    Raises:
-        InputError: if there are more, or `MAX_DEPTH` of them are within one another.
+    Repeated values count again, so that a value that contains itself is refused as endless.
     """
     waiting, count = [(value, 0)], 0
     while waiting:

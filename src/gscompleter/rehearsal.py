@@ -63,13 +63,15 @@ def render_with(renderer: str) -> None:
 def doubt_brought(_: str) -> None:
     """Compute photometric trust, and fit the appearance of Gaussians."""
     gaussians, view, config = some_gaussians(), photographs()[0], TrustConfig()
-    looks = gaussians.opacities.clone().requires_grad_(), gaussians.sh.clone().requires_grad_()
+    parameters = gaussians.opacities.clone().requires_grad_(), gaussians.sh.clone().requires_grad_()
     frozen = load_renderer("cpu").freeze(gaussians, view.camera)
     run_by_run(gaussians, [view.camera])
     evidence = gather_evidence(gaussians, [view], [frozen], config)
     support(evidence, weight_sums(frozen), view.camera, config)
     plan = frozen.plan_appearance(gaussians, view.counted)
-    (plan(*looks).sum() + plan.compared(view.image, view.image[..., 0])(*looks)).backward()
+    (
+        plan(*parameters).sum() + plan.compared(view.image, view.image[..., 0])(*parameters)
+    ).backward()
 
 
 def some_gaussians() -> Gaussians:

@@ -1,8 +1,4 @@
-"""What is so far away that it moves with the camera.
-
-The sky is a layer of its own: Gaussians at one z-depth far behind the far plane, so that between
-photographs and target it shifts by less than can be seen, and no surface is ever behind it.
-"""
+"""The sky: Gaussians so far behind the far plane that their parallax is invisible."""
 
 from __future__ import annotations
 
@@ -19,34 +15,34 @@ from gscompleter.types import Camera, DepthMap, Gaussians, Render, View, observe
 SKY_DEPTH = 8.0
 """z-depth of the sky, in multiples of the far plane."""
 SKY_FROM = 3.0
-"""z-depth from which what is drawn counts as sky, in multiples of the far plane. What an edge and
-the sky behind it make together lies in between."""
+"""Rendered z-depth from which a pixel is sky, in multiples of the far plane.
+Pixels on an edge mix surface and sky and lie in between."""
 REACH = 0.125
-"""How far the sky goes on behind what stands before it, as a share of the image's shorter side: it
-moves with the camera while roofs and trees do not, and gaps would open along all of them."""
+"""Extension of the sky behind surfaces, as a fraction of the shorter image side.
+Without it, parallax would open gaps along roofs and trees."""
 OPACITY = 0.98
-"""Of the Gaussians there."""
+"""Opacity of the extended sky."""
 
 
 def is_sky(depth: Float[Tensor, "*n"], camera: Camera) -> Bool[Tensor, "*n"]:
-    """Which z-depths, in scene units, are the sky's; none where the far plane is not known."""
+    """Return which z-depths, in scene units, are sky; none if the far plane is unknown."""
     return depth > (float("inf") if camera.far is None else SKY_FROM * camera.far)
 
 
 def sky_depth(camera: Camera) -> float:
-    """z-depth of the sky, in scene units; `camera` knows its far plane."""
+    """Compute the z-depth of the sky in scene units; `camera` must have a far plane."""
     assert camera.far is not None, "a camera with a sky has a far plane"
     return SKY_DEPTH * camera.far
 
 
 def shows_sky(render: Render, camera: Camera) -> bool:
-    """Whether `camera` sees the sky in `render`."""
+    """Return True if a render shows sky."""
     depth = render.depth_map()
     return bool((depth.valid & is_sky(depth.depth, camera)).any())
 
 
 def surfaces_in(render: Render, camera: Camera) -> DepthMap:
-    """The depth that `camera` sees in `render`, valid where it is a surface's and not the sky's."""
+    """Return the rendered depth, valid only on surfaces and not in the sky."""
     depth = render.depth_map()
     return DepthMap(depth.depth, depth.valid & ~is_sky(depth.depth, camera))
 
@@ -54,12 +50,10 @@ def surfaces_in(render: Render, camera: Camera) -> DepthMap:
 def sky_behind(
     view: View, sky: Bool[Tensor, "h w"], sigma: float
 ) -> tuple[Gaussians, Int[Tensor, "n"]]:
-    """The sky behind what stands before it, near where it is seen, and the pixels it lies at [n].
+    """Extend the sky behind bordering surfaces, by Gaussians of `sigma` pixels.
 
-    Args:
-        view: The image and its camera.
-        sky: Where it shows the sky.
-        sigma: Standard deviation of the Gaussians, in pixels.
+    Returns:
+        Gaussians and their row-major pixels.
     """
     camera, image = view.camera, view.image
     reach = round(REACH * min(camera.width, camera.height))
@@ -78,15 +72,10 @@ def sky_behind(
 
 
 def with_sky_of(made: Gaussians, fitted: Gaussians, camera: Camera) -> Gaussians:
-    """`fitted`, its sky in the colours that `made` has there.
+    """Restore the colours that Gaussians of the sky had before colours were fitted.
 
-    Fitted colours make up for what drawing blurs. At the edge of a roof that is a bright line of
-    sky, which stays behind when the roof moves on.
-
-    Args:
-        made: The n Gaussians before they were fitted, and where they stood.
-        fitted: The same afterwards.
-        camera: One of those that saw them.
+    Fitting compensates for blur, which makes a bright line of sky along roofs; parallax would
+    reveal it. `camera` is any of those that see the Gaussians.
     """
     in_sky = is_sky((made.means - camera.center).norm(dim=-1), camera)
     if not in_sky.any():

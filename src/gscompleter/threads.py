@@ -28,8 +28,8 @@ def bound_threads(count: int | None) -> None:
 
 def threads() -> int:
     """Return the number of threads."""
-    told = os.environ.get(LIBRARIES[0], "")
-    return int(told) if told.isdecimal() and int(told) > 0 else usable_cores()
+    value = os.environ.get(LIBRARIES[0], "")
+    return int(value) if value.isdecimal() and int(value) > 0 else usable_cores()
 
 
 @contextmanager

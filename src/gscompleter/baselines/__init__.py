@@ -1,1 +1,1 @@
-"""Other ways to complete a scene, for comparison only: nothing of the method depends on them."""
+"""Other completion methods, for comparison only."""

@@ -1,9 +1,4 @@
-"""Entropic Mixture-2-Wasserstein distance between two mixtures of Gaussians.
-
-Delon and Desolneux, A Wasserstein-type Distance in the Space of Gaussian Mixture Models, 2020, as
-RegGS (Cheng et al., 2025) uses it: reduced mixtures, closed-form distances between components,
-Sinkhorn in the log domain, and a plan that is scaled to a largest entry of 1.
-"""
+"""Entropic Mixture-2-Wasserstein distance (Delon and Desolneux, 2020), in the form of RegGS."""
 
 from __future__ import annotations
 
@@ -16,25 +11,24 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 EPSILON = 0.1
-"""Entropic regularisation, in squared units of length."""
+"""Entropic regularization, in squared units of length."""
 MAX_ITERATIONS = 100
-"""Most updates of the two potentials."""
+"""Largest number of updates of both potentials."""
 TOLERANCE = 1e-5
-"""Largest change of a potential at which it has converged."""
+"""Largest change of a converged potential."""
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Components of a mixture of Gaussians."""
+    """A mixture of Gaussians; the weights sum to 1."""
 
     means: Float[Tensor, "n 3"]
     covariances: Float[Tensor, "n 3 3"]
     weights: Float[Tensor, "n"]
-    """They sum to 1."""
 
 
 def reduced(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
-    """One component per cluster with the same mean and covariance as the cluster (moments)."""
+    """Merge each cluster into one component with its mean and covariance."""
     count = int(clusters.max()) + 1
     weight = mixture.weights.new_zeros(count).index_add(0, clusters, mixture.weights)
     filled = weight > 0
@@ -50,7 +44,7 @@ def reduced(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
 
 
 def pairwise_costs(a: Mixture, b: Mixture) -> Float[Tensor, "n m"]:
-    """Squared 2-Wasserstein distances between the components of two mixtures.
+    """Compute squared 2-Wasserstein distances between components.
 
     |μ_i - μ_j|² + tr Σ_i + tr Σ_j - 2 tr (Σ_i^½ Σ_j Σ_i^½)^½
     """
@@ -64,13 +58,13 @@ def pairwise_costs(a: Mixture, b: Mixture) -> Float[Tensor, "n m"]:
 
 
 def matrix_root(matrices: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3 3"]:
-    """Square roots of positive matrices; differentiable where eigenvalues coincide too."""
+    """Compute square roots of positive matrices, differentiable at equal eigenvalues."""
     identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
     return _Root.apply(matrices + 1e-6 * identity)
 
 
 class _Root(torch.autograd.Function):
-    """R with R R = M, through eigenvalues; dM = R dR + dR R is solved for the slope."""
+    """R with R R = M by eigenvalues; the gradient solves dM = R dR + dR R."""
 
     @staticmethod
     def forward(ctx: Any, matrices: Tensor) -> Tensor:
@@ -81,19 +75,15 @@ class _Root(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> Tensor:
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
         roots, vectors = ctx.saved_tensors
         sums = (roots[..., :, None] + roots[..., None, :]).clamp_min(1e-6)
-        inner = (vectors.transpose(-1, -2) @ slope @ vectors) / sums
+        inner = (vectors.transpose(-1, -2) @ gradient @ vectors) / sums
         return vectors @ inner @ vectors.transpose(-1, -2)
 
 
 def mixture_wasserstein(a: Mixture, b: Mixture) -> Float[Tensor, ""]:
-    """Σ plan * cost, differentiable in both mixtures.
-
-    The plan's largest entry is scaled to 1, as RegGS has it, so that the value is larger than the
-    distance by the factor that the scaling takes.
-    """
+    """Compute Σ plan * cost by Sinkhorn iterations; the largest plan entry is 1 as in RegGS."""
     cost = pairwise_costs(a, b)
     log_a, log_b = (a.weights + 1e-10).log(), (b.weights + 1e-10).log()
     log_kernel = -cost / EPSILON

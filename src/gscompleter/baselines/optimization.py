@@ -1,9 +1,7 @@
-"""Completion by optimisation: vanilla 3DGS (Kerbl et al., 2023) on photographs and a repaired view.
+"""Completion by 3DGS optimization (Kerbl et al., 2023) with the synthesized view added.
 
-All attributes of all Gaussians are fitted, as `distill` does, and with adaptive density control on
-top, as `densify` does. The rates are those of 3DGS; its schedule of 30,000 iterations is cut to the
-few hundred that a comparison in seconds allows, with ten rounds of density control in the first
-four fifths of them.
+All attributes are fitted (`distill`), optionally with adaptive density control (`densify`).
+Learning rates are those of 3DGS; its 30,000 iterations are cut to a few hundred.
 """
 
 from __future__ import annotations
@@ -25,25 +23,25 @@ from gscompleter.types import Camera, Gaussians, View, merge
 
 @dataclass(frozen=True)
 class OptimizationConfig:
+    """Settings of the 3DGS optimization."""
+
     iterations: int = 800
-    """Steps of Adam, each on one view."""
     density_rounds: int = 10
-    """Rounds of cloning, splitting and pruning; 0 keeps the number of Gaussians (distillation)."""
+    """Rounds of cloning, splitting and pruning; 0 for `distill`."""
     position_rate: float = 1.6e-4
-    """Step of positions, in extents of the cameras."""
+    """Step size of positions, in camera extents."""
     colour_rate: float = 2.5e-3
     opacity_rate: float = 0.05
     scale_rate: float = 5e-3
     rotation_rate: float = 1e-3
     dssim_weight: float = 0.2
-    """Share of 1 - SSIM in the loss; the rest is L1."""
+    """Weight of 1 - SSIM in the loss; the rest is L1."""
     gradient_threshold: float = 2e-4
-    """Mean slope of the loss in a Gaussian's place in the image (in half widths of the image) from
-    which there are too few Gaussians."""
+    """Mean image gradient, per half image width, from which Gaussians are added."""
     dense_share: float = 0.01
-    """Size, in extents of the cameras, up to which a Gaussian is cloned and not split."""
+    """Largest size of a cloned Gaussian, in camera extents; larger ones are split."""
     min_opacity: float = 0.005
-    """Fainter Gaussians are removed."""
+    """Opacity below which Gaussians are pruned."""
 
 
 @dataclass(frozen=True)
@@ -61,19 +59,11 @@ def optimize(
     seed: int = 0,
     config: OptimizationConfig = OptimizationConfig(),
 ) -> Optimized:
-    """Fit everything of `scene` to `views`, the repaired one among them.
-
-    Args:
-        scene: Where to begin.
-        views: Photographs, and the synthesized view that repairs the hole.
-        renderer: Draws the scene, differentiably.
-        seed: Of the order of views and of the samples that splitting draws.
-        config: Rates and thresholds.
-    """
+    """Fit all attributes of `scene` to `views`; `seed` sets their order and the splitting."""
     random = torch.Generator().manual_seed(seed)
     extent = extent_of([view.camera for view in views])
     state = Parameters.of(scene, config, extent)
-    slopes = counts = torch.zeros_like(scene.opacities)
+    gradients = counts = torch.zeros_like(scene.opacities)
     rounds = round_numbers(config)
     losses: list[float] = []
     order: list[int] = []
@@ -87,27 +77,27 @@ def optimize(
         state.optimizer.zero_grad()
         loss.backward()
         losses.append(loss.item())
-        slope, seen = image_slopes(gaussians.means, state.means.grad, view.camera)
-        slopes, counts = slopes + slope, counts + seen
+        gradient, seen = image_slopes(gaussians.means, state.means.grad, view.camera)
+        gradients, counts = gradients + gradient, counts + seen
         state.optimizer.step()
         if number in rounds:
-            crowded = slopes / counts.clamp_min(1) >= config.gradient_threshold
+            crowded = gradients / counts.clamp_min(1) >= config.gradient_threshold
             dense = densified(state.gaussians(), crowded, extent, random, config)
             state = Parameters.of(dense, config, extent)
-            slopes = counts = torch.zeros_like(dense.opacities)
-    with torch.no_grad():  # in which a slice of the leaves is none
+            gradients = counts = torch.zeros_like(dense.opacities)
+    with torch.no_grad():  # so that the result is detached from the parameters
         return Optimized(state.gaussians()[:], tuple(losses))
 
 
 def round_numbers(config: OptimizationConfig) -> set[int]:
-    """Iterations after which density is controlled: evenly over the first four fifths."""
+    """List the iterations with density control, evenly over the first 80 %."""
     last = 0.8 * config.iterations
     return {math.ceil(last * (i + 1) / config.density_rounds) for i in range(config.density_rounds)}
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """A scene as 3DGS optimises it: logarithms of sizes, logits of opacities."""
+    """Optimized parameters of 3DGS: log-scales and opacity logits."""
 
     means: Tensor
     quats: Tensor
@@ -120,7 +110,7 @@ class Parameters:
 
     @staticmethod
     def of(scene: Gaussians, config: OptimizationConfig, extent: float) -> Parameters:
-        """Leaves to optimise. Adam begins anew after each round of density control."""
+        """Create the parameters; Adam restarts after each round of density control."""
         rates = (
             (scene.means, config.position_rate * extent),
             (scene.quats, config.rotation_rate),
@@ -138,14 +128,14 @@ class Parameters:
         return Parameters(means, quats, log_scales, logits, sh, *kept, optimizer)
 
     def gaussians(self) -> Gaussians:
-        """The scene, differentiable in the leaves."""
+        """Assemble the scene, differentiable in the parameters."""
         scales, opacities = self.log_scales.exp(), self.logits.sigmoid()
         leaves = self.means, self.quats, scales, opacities, self.sh, self.generated
         return Gaussians(*leaves, is_antialiased=self.is_antialiased)
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:
-    """1.1 times the farthest camera's distance from their middle, in scene units."""
+    """Compute 1.1 times the largest camera distance from the mean centre, in scene units."""
     centers = torch.stack([camera.center for camera in cameras])
     return 1.1 * (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
 
@@ -153,10 +143,7 @@ def extent_of(cameras: Sequence[Camera]) -> float:
 def image_slopes(
     means: Float[Tensor, "n 3"], slope: Float[Tensor, "n 3"] | None, camera: Camera
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Length of the loss's slope in each place in the image, and 1 for what the camera drew.
-
-    It is taken from the slope in space across the line of sight: a pixel is z / f scene units.
-    """
+    """Compute the norm of each image position gradient, and 1 for rendered Gaussians."""
     if slope is None:
         return torch.zeros_like(means[:, 0]), torch.zeros_like(means[:, 0])
     with torch.no_grad():
@@ -176,7 +163,7 @@ def densified(
     random: torch.Generator,
     config: OptimizationConfig,
 ) -> Gaussians:
-    """Small `crowded` Gaussians twice, large ones split in two, faint ones gone."""
+    """Clone small `crowded` Gaussians, split large ones and prune faint ones."""
     with torch.no_grad():
         large = scene.scales.amax(dim=-1) > config.dense_share * extent
         clones, parents = scene[crowded & ~large], scene[crowded & large]

@@ -1,9 +1,7 @@
-"""Registration by a similarity, after RegGS (Cheng et al., RegGS: Unposed Sparse Views Gaussian
-Splatting with 3DGS Registration, 2025).
+"""Registration by one similarity, after RegGS (Cheng et al., 2025).
 
-What was lifted is brought to the scene as a whole: one scale, one rotation, one translation, fitted
-to colour, depth and an entropic Mixture-2-Wasserstein distance; then everything is added. RegGS
-estimates poses along the way; here they are known, and only its registration is compared.
+Scale, rotation and translation of all lifted Gaussians are fitted to colour, depth and a mixture
+distance. RegGS also estimates the poses, which are known here.
 """
 
 from __future__ import annotations
@@ -25,42 +23,41 @@ from gscompleter.types import Camera, Gaussians, View
 
 @dataclass(frozen=True)
 class RegGSConfig:
+    """Settings of the registration; the defaults are those of RegGS."""
+
     iterations: int = 400
-    """Steps of Adam (amsgrad)."""
     scale_rate: float = 1e-3
-    """Step of the scale."""
     rotation_rate: float = 2e-4
-    """Step of the rotation's quaternion."""
     translation_rate: float = 2e-3
-    """Step of the translation, in scene units."""
+    """Step size of the translation, in scene units."""
     colour_weight: float = 1.0
     depth_weight: float = 0.1
     mixture_weight: float = 0.1
     components: int = 1000
-    """Clusters that each set of Gaussians is reduced to."""
+    """Clusters per set of Gaussians."""
     patience: int = 10
-    """The mixture distance is left out for good once it is no smaller than the largest of its
-    last values, so many of them."""
+    """The mixture distance is dropped if it does not fall in this many steps."""
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """x -> R^T (scale-about-the-camera(x) - t): where the lifted Gaussians go."""
+    """Similarity of the lifted Gaussians: x -> R^T (scale-about-camera(x) - t)."""
 
     scale: Float[Tensor, ""]
     quaternion: Float[Tensor, "4"]
-    """wxyz, of the rotation R that carries the scene towards the lifted Gaussians."""
+    """Rotation R (wxyz) from the scene to the lifted Gaussians."""
     translation: Float[Tensor, "3"]
-    """t, in scene units."""
+    """Translation t, in scene units."""
 
     @property
     def rotation(self) -> Float[Tensor, "3 3"]:
+        """Rotation matrix R."""
         return rotations_from(self.quaternion)
 
 
 @dataclass(frozen=True)
 class Registered:
-    """The lifted Gaussians in the scene's frame, and how they came there."""
+    """The registered Gaussians, and their similarity."""
 
     gaussians: Gaussians
     similarity: Similarity
@@ -75,16 +72,7 @@ def register_by_similarity(
     seed: int = 42,
     config: RegGSConfig = RegGSConfig(),
 ) -> Registered:
-    """Fit one similarity between `lifted` and `scene` at the camera of `reference`.
-
-    Args:
-        lifted: Gaussians lifted from `reference`.
-        scene: What they are to agree with.
-        reference: The synthesized image and its camera.
-        renderer: Draws both, differentiably.
-        seed: Of the clustering.
-        config: Weights and steps; the defaults are those of RegGS.
-    """
+    """Fit one similarity between `lifted` and `scene` at the camera of `reference`."""
     camera = reference.camera
     own = renderer.render(lifted, camera)
     theirs = renderer.render(scene, camera)
@@ -139,14 +127,14 @@ def register_by_similarity(
 
 
 def carried(scene: Gaussians, fit: Similarity) -> Gaussians:
-    """The scene, turned and moved towards the lifted Gaussians; differentiable in `fit`."""
+    """Move the scene to the lifted Gaussians, differentiable in `fit`."""
     unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
     means = scene.means @ fit.rotation.T + fit.translation
     return replace(scene, means=means, quats=quats_product(unit, scene.quats), encoded=None)
 
 
 def into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
-    """The lifted Gaussians, scaled about their camera, then turned and moved back."""
+    """Scale the lifted Gaussians about their camera and move them to the scene."""
     means = camera.center + fit.scale * (lifted.means - camera.center)
     unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
     back = unit * unit.new_tensor([1.0, -1.0, -1.0, -1.0])
@@ -160,7 +148,7 @@ def into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
 
 
 def clustered(gaussians: Gaussians, camera: Camera, components: int, seed: int) -> Mixture:
-    """The Gaussians in camera axes, merged into clusters of their means (k-means)."""
+    """Merge the Gaussians into k-means clusters, in camera axes."""
     rotation = camera.c2w[:3, :3]
     axes = rotation.T @ rotations_from(gaussians.quats)
     spread = axes * gaussians.scales[:, None, :]
@@ -177,11 +165,12 @@ def clustered(gaussians: Gaussians, camera: Camera, components: int, seed: int) 
 
 
 def scaled(mixture: Mixture, scale: Float[Tensor, ""]) -> Mixture:
+    """Scale a mixture."""
     return Mixture(scale * mixture.means, scale**2 * mixture.covariances, mixture.weights)
 
 
 def turned(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
-    """A mixture of the scene in camera axes, moved as `carried` moves the scene."""
+    """Move a mixture in camera axes by the similarity of the scene."""
     c2w = camera.c2w[:3, :3]
     rotation = c2w.T @ fit.rotation @ c2w
     offset = (fit.rotation @ camera.center + fit.translation - camera.center) @ c2w

@@ -1,1 +1,1 @@
-"""Independent jobs: claimed, done once, resumed, shared among processes and machines."""
+"""Independent jobs, resumable and shared by processes and machines."""

@@ -1,4 +1,4 @@
-"""What a job costs: seconds and bytes, stage by stage."""
+"""Costs of a job by stage: seconds and bytes."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from pathlib import Path
 from gscompleter.progress import stages_heard_by
 
 COUNTERS = Path("/proc/self/io")
-"""Where Linux counts what this process read and wrote, whether or not it reached a disk."""
+"""File in which Linux counts the bytes that this process reads and writes, cached or not."""
 
 
 @dataclass
 class Cost:
-    """What a stage took."""
+    """Cost of a stage."""
 
     seconds: float = 0.0
     cpu_seconds: float = 0.0
-    """Of all threads: what it takes of a machine, however busy that is."""
+    """Sum over all threads, which does not depend on how busy the machine is."""
     read_bytes: int = 0
     written_bytes: int = 0
 
 
 @dataclass
 class Meter:
-    """Gives what is spent to the stage that began last."""
+    """Assigns costs to the stage that started last."""
 
     stages: dict[str, Cost] = field(default_factory=dict)
     name: str = "open"
     begun: Cost = field(default_factory=Cost)
-    """The clock and the counters when it began."""
+    """Clock and counters at its start."""
 
     def begin(self, name: str) -> None:
-        """From now on, what is spent is the cost of `name`."""
+        """End the current stage and start the stage `name`."""
         now, cost = spent(), self.stages.setdefault(self.name, Cost())
         cost.seconds += now.seconds - self.begun.seconds
         cost.cpu_seconds += now.cpu_seconds - self.begun.cpu_seconds
@@ -47,7 +47,7 @@ class Meter:
 
 @contextmanager
 def metered() -> Iterator[Meter]:
-    """Measure what is done inside, by the stages that it tells of."""
+    """Measure the body by stage."""
     meter = Meter(begun=spent())
     with stages_heard_by(meter.begin):
         yield meter
@@ -55,7 +55,7 @@ def metered() -> Iterator[Meter]:
 
 
 def spent() -> Cost:
-    """The clocks, and the bytes that this process has read and written; 0 where nobody counts."""
+    """Read the clocks and the byte counters of this process; 0 if the system has no counters."""
     counters = COUNTERS.read_text() if COUNTERS.is_file() else ""
     found = dict(re.findall(r"^(\w+): ([0-9]+)$", counters, re.M))
     read, written = int(found.get("rchar", 0)), int(found.get("wchar", 0))

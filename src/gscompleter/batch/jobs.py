@@ -1,12 +1,10 @@
-"""A job, what became of it, and the rule by which it is done: once, by whoever claims it first.
+"""Jobs, their outcomes, and how each is run once, by the first process that claims it.
 
-    batch.json          what kind of folder this is
-    jobs/NAME/          what `complete` wrote
-    rows/NAME.json      what became of the job: done or failed, the reason, scores, cost
-    thumbnails/NAME.jpg the first target before and after
-    claims/NAME         there while somebody does the job, and after somebody was killed over it
-
-A row appears once everything else of its job is there.
+batch.json          kind and version of the folder
+jobs/NAME/          output of `complete`
+rows/NAME.json      outcome of the job: state, reason, scores, cost; written last
+thumbnails/NAME.jpg first target before and after completion
+claims/NAME         exists while a process runs the job, or after one was killed by it
 """
 
 from __future__ import annotations
@@ -22,71 +20,60 @@ from gscompleter.batch.places import Place
 from gscompleter.errors import InputError, OutputError, quoted
 
 BATCH = "batch.json"
-"""The file that says a folder holds a batch."""
+"""Name of the file that marks the folder of a batch."""
 JOBS, ROWS, CLAIMS, THUMBNAILS = "jobs", "rows", "claims", "thumbnails"
-"""The folders in it."""
+"""Folders of a batch."""
 VERSION = 1
-"""Of the files in such a folder."""
+"""Version of the files of a batch."""
 RETRY_SECONDS = 1.0
-"""How long a job waits that failed for no fault of its input, before it is tried again; the second
-time twice as long."""
+"""Delay before the first retry after an error not caused by the input; doubled for the next."""
 LONGEST_NAME = 120
-"""Characters of the name of a job."""
+"""Maximum number of characters of a job name."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Something to do that depends on nothing else."""
+    """A piece of work that does not depend on others."""
 
     name: str
-    """Of its folder and its row; no two jobs of a batch share it."""
+    """Unique name, of its folder and its row."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """What it is told."""
 
 
 State = Literal["done", "failed", "elsewhere", "lost"]
-"""What became of a job: a row that is good or says why not; it is being done by somebody else; its
-worker was killed over it."""
+"""Outcome of a job: row written (done, failed), run by another process, or worker killed."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job in one attempt to have it done."""
+    """Outcome of one attempt to run a job."""
 
     job: Job
     state: State
     reason: str | None = None
-    """A sentence where it failed."""
+    """One sentence if the job failed."""
 
 
 Perform = Callable[[Job], Outcome]
-"""Does a job in whatever process it is sent to."""
+"""Runs a job, in any process."""
 
 
 @dataclass(frozen=True)
 class Attempts:
-    """What came of trying to do a job."""
+    """Result of the attempts at a job."""
 
     result: Mapping[str, Any] | None
-    """What the work returned; None where it failed."""
+    """Return value of the work, or None if it failed."""
     number: int
-    """How often it was begun, in all runs together."""
+    """Number of attempts in all runs together."""
     reason: str | None = None
-    """Why it failed, in one line."""
 
 
 def settle(job: Job, place: Place, work: Callable[[], Mapping[str, Any]], retries: int) -> Outcome:
-    """Claim `job`, do it, and write its row, unless it has one or somebody else does it.
+    """Claim a job, run it and write its row, unless it has a row or another process runs it.
 
-    Args:
-        job: What the row is of.
-        place: The folder of the batch.
-        work: Does it, and returns what the row says besides. It may be called again.
-        retries: How often it is tried again after an error that is no InputError, or after the
-            process that did it was killed.
-
-    Raises:
-        OutputError: where nothing can be written; the job is left for a later run.
+    `work` returns further entries of the row. It is repeated after a killed process or any error
+    other than InputError, at most `retries` times.
     """
     with place.claimed(f"{CLAIMS}/{job.name}") as lost:
         if lost is None:
@@ -99,12 +86,8 @@ def settle(job: Job, place: Place, work: Callable[[], Mapping[str, Any]], retrie
 
 
 def attempts(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> Attempts:
-    """Do `work` until it comes to an end, `retries` times more at most; `lost` of them are gone.
-
-    Raises:
-        OutputError: as `settle`.
-    """
-    reason = f"its process was killed {lost} times, perhaps for want of memory"
+    """Run `work` with retries; `lost` attempts have already been killed."""
+    reason = f"its process was killed {lost} times, perhaps because memory ran out"
     for number in range(lost + 1, retries + 2):
         try:
             return Attempts(work(), number)
@@ -112,7 +95,7 @@ def attempts(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> 
             raise
         except InputError as error:
             return Attempts(None, number, str(error))
-        except Exception as error:  # a defect of one job must not cost the others
+        except Exception as error:  # one broken job must not stop the others
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         if number <= retries:
             time.sleep(RETRY_SECONDS * number)
@@ -120,7 +103,7 @@ def attempts(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> 
 
 
 def row_of(job: Job, attempts: Attempts) -> dict[str, Any]:
-    """What became of a job, as its row says it."""
+    """Build the row of a job."""
     return {
         "version": VERSION,
         "job": job.name,
@@ -133,17 +116,17 @@ def row_of(job: Job, attempts: Attempts) -> dict[str, Any]:
 
 
 def row_path(name: str) -> str:
-    """Where the row of the job of that name lies."""
+    """Return the path of the row of a job."""
     return f"{ROWS}/{name}.json"
 
 
 def write_row(place: Place, name: str, row: Mapping[str, Any]) -> None:
-    """Write the row of a job; an OutputError where that cannot be."""
+    """Write the row of a job; raise OutputError if that fails."""
     place.write(row_path(name), (json.dumps(row, indent=1) + "\n").encode())
 
 
 def read_row(place: Place, name: str) -> dict[str, Any] | None:
-    """The row of a job; None where there is none that is whole."""
+    """Read the row of a job, or return None if there is no complete one."""
     content = place.read(row_path(name))
     try:
         row = None if content is None else json.loads(content)
@@ -153,7 +136,7 @@ def read_row(place: Place, name: str) -> dict[str, Any] | None:
 
 
 def finished_row(place: Place, job: Job) -> dict[str, Any] | None:
-    """The row of a job that is done, or failed as it stands in the manifest now."""
+    """Read the row of a job that is done, or failed with the same options as now."""
     row = read_row(place, job.name)
     if row is None or (row["state"] == "failed" and row["options"] != dict(job.options)):
         return None
@@ -161,19 +144,14 @@ def finished_row(place: Place, job: Job) -> dict[str, Any] | None:
 
 
 def missing(jobs: Sequence[Job], place: Place, again: bool) -> list[Job]:
-    """Those of `jobs` that have no row, or failed and are told something else now.
-
-    Args:
-        jobs: Of the manifest.
-        place: The folder of the batch.
-        again: Whether all that failed are done once more.
+    """Return jobs without a row or with a failed one to repeat (new options, or `again`).
 
     Raises:
-        InputError: where one is done with other options.
+        InputError: A job was done with other options.
     """
-    there, left = place.names(ROWS), []
+    existing, left = place.names(ROWS), []
     for job in jobs:
-        row = read_row(place, job.name) if f"{job.name}.json" in there else None
+        row = read_row(place, job.name) if f"{job.name}.json" in existing else None
         if row is not None and row["state"] == "failed" and again:
             place.remove(row_path(job.name))
             row = None
@@ -188,19 +166,14 @@ def missing(jobs: Sequence[Job], place: Place, again: bool) -> list[Job]:
 
 
 def slug(name: str) -> str:
-    """`name` as the name of a file."""
+    """Turn a name into a valid file name."""
     return re.sub(r"[^\w.+-]+", "-", name).strip(".")[:LONGEST_NAME] or "job"
 
 
 def claim_folder(place: Place) -> None:
-    """Make `place` the folder of a batch, or see that it is.
-
-    Raises:
-        InputError: where it holds something else.
-        OutputError: where nothing can be written there.
-    """
+    """Make `place` the folder of a batch, or raise InputError if it holds something else."""
     content = json.dumps({"version": VERSION, "kind": "batch"}).encode() + b"\n"
-    # In this order: another run that has written anything there has written that file before.
+    # Order matters: every run writes this file before all others.
     others = place.names("")
     if others and place.read(BATCH) is None:
         raise InputError(f"{quoted(place.name)} holds something other than a batch; name another.")
@@ -213,7 +186,7 @@ def claim_folder(place: Place) -> None:
 
 
 def check_jobs(jobs: Sequence[Job]) -> None:
-    """Raise an InputError for no job at all, and for two of one name."""
+    """Raise InputError if there is no job, or if two have the same name."""
     if not jobs:
         raise InputError("The manifest names no job; give it a row for each scene.")
     seen: set[str] = set()

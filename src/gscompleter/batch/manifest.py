@@ -1,8 +1,7 @@
-"""What is to be done: a CSV file, JSON lines, or a folder of scenes.
+"""Manifests of a batch: a CSV file, JSON lines, or a folder of scenes.
 
-A row has the options of `complete` by their names, and may have a `name`. Without one it is called
-as the folder of its scene. A cell of a CSV that is empty says nothing. Paths are relative to the
-manifest.
+A row has the options of `complete` and, optionally, a `name`; the default is the name of the scene
+folder. Empty CSV cells are ignored. Paths are relative to the manifest.
 """
 
 from __future__ import annotations
@@ -24,23 +23,18 @@ from gscompleter.io.unfinished import MARK
 from gscompleter.reading import read_bytes
 
 FOLDER, NAME = "folder", "name"
-"""What every row has: where the scene lies, and what the job is called."""
+"""Columns of the scene folder and of the job name."""
 PATHS = (FOLDER, "scene", "weights")
 """Options that are paths."""
 LONGEST_FILE = 2 * 10**9
-"""Bytes of a manifest."""
+"""Maximum number of bytes of a manifest."""
 
 
 def read_manifest(manifest: str, common: Mapping[str, Any]) -> list[Job]:
-    """The jobs that a manifest names, in its order.
-
-    Args:
-        manifest: A file `.csv` or `.jsonl`, or a folder whose folders are scenes; a path or an
-            address.
-        common: Options of every row that has not its own.
+    """Read the jobs of a `.csv` or `.jsonl` file or a folder of scenes, by path or address.
 
     Raises:
-        InputError: where it cannot be read, names no job, or gives two the same name.
+        InputError: The manifest cannot be read, names no job, or repeats a name.
     """
     base = os.path.dirname(os.path.abspath(manifest))
     here = placed(common, os.getcwd())
@@ -54,7 +48,7 @@ def read_manifest(manifest: str, common: Mapping[str, Any]) -> list[Job]:
 
 
 def placed(row: Mapping[str, Any], base: str) -> dict[str, Any]:
-    """`row` with its paths from the root; addresses, numbers and what is wrong stay as they are."""
+    """Make the paths of a row absolute; addresses and invalid values stay."""
 
     def joined(value: Any) -> Any:
         path = isinstance(value, str) and value and not is_address(value)
@@ -70,7 +64,7 @@ def placed(row: Mapping[str, Any], base: str) -> dict[str, Any]:
 
 
 def rows_of(manifest: str) -> list[dict[str, Any]]:
-    """The rows of a manifest, as they stand there."""
+    """Read the rows of a manifest as they are."""
     if not is_address(manifest) and os.path.isdir(manifest):
         return [{FOLDER: os.path.abspath(folder)} for folder in scenes_in(Path(manifest))]
     if manifest.endswith(".csv"):
@@ -88,16 +82,12 @@ def rows_of(manifest: str) -> list[dict[str, Any]]:
 
 
 def scenes_in(folder: Path) -> list[Path]:
-    """The folders in a folder, by their names; hidden ones are none."""
+    """List the visible folders in a folder by name."""
     return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith((MARK, ".")))
 
 
 def text_of(manifest: str) -> str:
-    """The content of a manifest.
-
-    Raises:
-        InputError: where it cannot be read.
-    """
+    """Read the text of a manifest; raise InputError if that fails."""
     try:
         if is_address(manifest):
             return bytes(store_of(manifest).cat_file(manifest)).decode("utf-8-sig")
@@ -106,11 +96,13 @@ def text_of(manifest: str) -> str:
         reason = error.strerror or str(error)
         raise InputError(f"The manifest {quoted(manifest)} cannot be read: {reason}.") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"The manifest {quoted(manifest)} is no text in UTF-8.") from error
+        raise InputError(
+            f"The manifest {quoted(manifest)} is not text in UTF-8; save it as UTF-8."
+        ) from error
 
 
 def csv_rows(text: str, manifest: str) -> Iterator[dict[str, Any]]:
-    """The rows of a CSV file under its head."""
+    """Parse the rows of a CSV file with a header."""
     try:
         for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
             given = {k: v.strip() for k, v in row.items() if isinstance(v, str) and v.strip()}
@@ -118,11 +110,11 @@ def csv_rows(text: str, manifest: str) -> Iterator[dict[str, Any]]:
                 given["too many cells"] = " ".join(row[None])
             yield given
     except csv.Error as error:
-        raise InputError(f"The manifest {quoted(manifest)} is no CSV: {error}.") from error
+        raise InputError(f"The manifest {quoted(manifest)} is not valid CSV: {error}.") from error
 
 
 def json_rows(text: str, manifest: str) -> Iterator[dict[str, Any]]:
-    """The rows of JSON lines."""
+    """Parse JSON lines."""
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip():
             continue
@@ -135,26 +127,28 @@ def json_rows(text: str, manifest: str) -> Iterator[dict[str, Any]]:
             ) from error
         if not isinstance(row, dict):
             raise InputError(
-                f"Line {number} of the manifest {quoted(manifest)} is no object; write it as "
-                '{"folder": "scene", "target": [6]}.'
+                f"Line {number} of the manifest {quoted(manifest)} is not a JSON object; write it "
+                'as {"folder": "scene", "target": [6]}.'
             )
         yield row
 
 
 def names_of(rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """What the jobs of rows are called: as they say, or as the folder of the scene, with a number
-    where several rows that have no name of their own share one."""
+    """Name the jobs by their `name` or scene folder, numbered if several share a folder."""
     rows = list(rows)
-    said = [slug(str(row[NAME])) if NAME in row else None for row in rows]
+    given = [slug(str(row[NAME])) if NAME in row else None for row in rows]
     scenes = [slug(os.path.basename(str(row.get(FOLDER, "")).rstrip("/"))) for row in rows]
-    count, seen = Counter(s for s, n in zip(scenes, said, strict=True) if n is None), Counter[str]()
+    count, seen = (
+        Counter(s for s, n in zip(scenes, given, strict=True) if n is None),
+        Counter[str](),
+    )
     names = []
-    for name, scene in zip(said, scenes, strict=True):
+    for name, scene in zip(given, scenes, strict=True):
         seen[scene] += name is None
         names.append(name or (scene if count[scene] == 1 else f"{scene}-{seen[scene]}"))
     return names
 
 
 def plain(row: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a row, without its name."""
+    """Drop the name of a row."""
     return {key: value for key, value in row.items() if key != NAME}

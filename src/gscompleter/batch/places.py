@@ -1,9 +1,8 @@
-"""Where a batch lies: a folder of this machine, or one of a store that fsspec reaches.
+"""Places for the files of a batch: a local folder, or one of a store that fsspec reaches.
 
-Both write a file whole or not at all, and let one process at a time claim a name. A folder of this
-machine (or one that machines share by a file system with locks) has claims that the kernel takes
-back from a process that was killed. In a store a claim is a small object that its holder renews,
-and that counts for nothing once it was not renewed for a while.
+Both write files atomically, and only one process at a time holds a claim: in a folder a file lock,
+released by the kernel if the process is killed; in a store a small object that expires unless its
+holder renews it.
 """
 
 from __future__ import annotations
@@ -26,10 +25,9 @@ from gscompleter.io.files import replacing
 from gscompleter.io.unfinished import MARK, locked
 
 LEASE_SECONDS = 90.0
-"""After so many seconds without being renewed a claim in a store counts for nothing. The clocks of
-the machines have to agree better than that."""
+"""Time without renewal after which a claim in a store expires; clocks must agree within it."""
 RENEWAL_SECONDS = 20.0
-"""How often its holder renews it."""
+"""Interval between renewals."""
 
 
 @runtime_checkable
@@ -38,55 +36,50 @@ class Place(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user calls it."""
+        """Path or address as given by the user."""
         ...
 
     def read(self, path: str) -> bytes | None:
-        """The content of a file; None where there is none."""
+        """Read a file, or return None if it does not exist."""
         ...
 
     def write(self, path: str, content: bytes) -> None:
-        """Write a file, whole or not at all; an OutputError where it cannot be."""
+        """Write a file atomically; raise OutputError if that fails."""
         ...
 
     def remove(self, path: str) -> None:
-        """Remove a file where there is one."""
+        """Remove a file if it exists."""
         ...
 
     def names(self, folder: str) -> set[str]:
-        """The names in a folder, empty where there is none; what is unfinished does not count."""
+        """List the names in a folder, without unfinished files; empty if it does not exist."""
         ...
 
     def folder(self, path: str) -> AbstractContextManager[Path]:
-        """A folder of this machine whose content is at `path` once the body is over."""
+        """Yield a local folder whose content is at `path` when the body ends."""
         ...
 
     def claimed(self, path: str) -> AbstractContextManager[int | None]:
-        """Hold the claim `path`: how many holders before were killed over it, or None where
-        somebody else holds it."""
+        """Hold a claim; yield the number of holders killed before, or None if it is held."""
         ...
 
     def is_held(self, path: str) -> bool:
-        """Whether somebody holds the claim `path`."""
+        """Return True if any process holds the claim."""
         ...
 
 
 def place_of(out: str) -> Place:
-    """The place that a path or an address such as `s3://bucket/folder` names.
-
-    Raises:
-        InputError: where no package reaches it.
-    """
+    """Open a path or an address such as `s3://bucket/folder`."""
     return StorePlace(out.rstrip("/"), store_of(out)) if is_address(out) else FolderPlace(Path(out))
 
 
 def is_address(text: str) -> bool:
-    """Whether `text` is an address rather than a path."""
+    """Return True for an address such as `s3://bucket/folder`, False for a path."""
     return "://" in text
 
 
 def store_of(address: str) -> Any:
-    """The file system of fsspec behind an address; an InputError where there is none."""
+    """Open the fsspec file system of an address; raise InputError if there is none."""
     import fsspec
 
     try:
@@ -97,30 +90,35 @@ def store_of(address: str) -> Any:
 
 @dataclass(frozen=True)
 class FolderPlace:
-    """A folder of this machine, or one that it shares."""
+    """A folder of a local or network file system."""
 
     root: Path
 
     @property
     def name(self) -> str:
+        """Path of the folder."""
         return str(self.root)
 
     def read(self, path: str) -> bytes | None:
+        """Read a file, or return None if it does not exist."""
         try:
             return (self.root / path).read_bytes()
         except (FileNotFoundError, NotADirectoryError):
             return None
 
     def write(self, path: str, content: bytes) -> None:
+        """Write a file atomically."""
         target = self.root / path
         make_folder(target.parent)
         with replacing(target) as file:
             file.write(content)
 
     def remove(self, path: str) -> None:
+        """Remove a file if it exists."""
         (self.root / path).unlink(missing_ok=True)
 
     def names(self, folder: str) -> set[str]:
+        """List the names in a folder, without unfinished files."""
         try:
             return {n for n in os.listdir(self.root / folder) if not n.startswith(MARK)}
         except FileNotFoundError:
@@ -132,14 +130,13 @@ class FolderPlace:
 
     @contextlib.contextmanager
     def folder(self, path: str) -> Iterator[Path]:
-        """The folder itself: `complete` makes it appear all at once."""
+        """Yield the folder itself; `complete` writes it atomically."""
         make_folder((self.root / path).parent)
         yield self.root / path
 
     @contextlib.contextmanager
     def claimed(self, path: str) -> Iterator[int | None]:
-        """By a lock on a file. On a file system that knows no locks everybody holds it: there only
-        shards keep processes apart."""
+        """Lock a file. Without locks in the file system every process gets the claim."""
         target = self.root / path
         make_folder(target.parent)
         try:
@@ -147,7 +144,7 @@ class FolderPlace:
         except OSError as error:
             raise cannot_write(target, error) from error
         try:
-            # Whoever held it until a moment ago removed the file that we have opened.
+            # The last holder may have removed the file that has just been opened.
             if locked(descriptor, wait=False) is False or not os.fstat(descriptor).st_nlink:
                 yield None
                 return
@@ -161,6 +158,7 @@ class FolderPlace:
             os.close(descriptor)
 
     def is_held(self, path: str) -> bool:
+        """Return True if any process holds the claim."""
         try:
             descriptor = os.open(self.root / path, os.O_RDONLY)
         except FileNotFoundError:
@@ -172,12 +170,12 @@ class FolderPlace:
 
 
 def counted(content: bytes) -> int:
-    """The number that a claim says; 0 for one that is new."""
+    """Parse the number in a claim; 0 for a new one."""
     return int(content) if content.isdigit() else 0
 
 
 def write_count(path: Path, descriptor: int, count: int) -> None:
-    """Note that one more process has begun the job, in case it never comes back."""
+    """Count one more started process, in case it is killed."""
     try:
         os.pwrite(descriptor, str(count).encode(), 0)
     except OSError as error:
@@ -187,7 +185,7 @@ def write_count(path: Path, descriptor: int, count: int) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make `folder` where it is not there; an OutputError where that cannot be."""
+    """Create a folder; raise OutputError if that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -195,36 +193,42 @@ def make_folder(folder: Path) -> None:
 
 
 def cannot_write(path: Path, error: OSError) -> OutputError:
-    """The sentence for what the system refused."""
+    """Return the OutputError for a write error."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     reason = "there is no space left" if full else error.strerror
-    return OutputError(f"Cannot write {quoted(path)}: {reason}; make room or choose another place.")
+    return OutputError(
+        f"Cannot write {quoted(path)}: {reason}; free some space or choose another place."
+    )
 
 
 @dataclass(frozen=True)
 class StorePlace:
-    """A folder of a store, by its address."""
+    """A folder of a store."""
 
     name: str
     store: Any
     """A file system of fsspec."""
 
     def read(self, path: str) -> bytes | None:
+        """Read an object, or return None if it does not exist."""
         try:
             return bytes(self.store.cat_file(self._at(path)))
         except FileNotFoundError:
             return None
 
     def write(self, path: str, content: bytes) -> None:
+        """Write an object."""
         with self._writing(path):
             self.store.pipe_file(self._at(path), content)
 
     def remove(self, path: str) -> None:
+        """Remove an object if it exists."""
         with contextlib.suppress(FileNotFoundError):
             self.store.rm_file(self._at(path))
 
     def names(self, folder: str) -> set[str]:
-        # Listings are cached, and others write meanwhile.
+        """List the names in a folder."""
+        # Listings are cached, and other processes may have written since.
         self.store.invalidate_cache()
         try:
             found = self.store.ls(self._at(folder), detail=False)
@@ -234,7 +238,7 @@ class StorePlace:
 
     @contextlib.contextmanager
     def folder(self, path: str) -> Iterator[Path]:
-        """A temporary folder; its files are sent once it is complete."""
+        """Yield a temporary folder, and upload its files when the body ends."""
         from tempfile import TemporaryDirectory
 
         with TemporaryDirectory(prefix="gscompleter-") as temporary:
@@ -248,8 +252,7 @@ class StorePlace:
 
     @contextlib.contextmanager
     def claimed(self, path: str) -> Iterator[int | None]:
-        """By an object that only one can create. Who takes over one that was not renewed may, in
-        the same moment, not be alone: then the job is done twice, with the same bytes."""
+        """Create an object exclusively; two processes may both take over an expired one."""
         holder = secrets.token_hex(8)
         lost = self._taken(path, holder)
         if lost is None:
@@ -266,11 +269,12 @@ class StorePlace:
             self.remove(path)
 
     def is_held(self, path: str) -> bool:
+        """Return True if any process holds the claim."""
         claim = self.read(path)
         return claim is not None and not expired(claim)
 
     def _taken(self, path: str, holder: str) -> int | None:
-        """Become the holder: how many were killed before, or None where somebody holds it."""
+        """Take a claim; return the number of holders killed before, or None if it is held."""
         with self._writing(path):
             try:
                 self.store.pipe_file(self._at(path), lease(holder, 0), mode="create")
@@ -292,7 +296,6 @@ class StorePlace:
 
     @contextlib.contextmanager
     def _writing(self, path: str) -> Iterator[None]:
-        """Make the folder of `path`; what then cannot be written ends the run."""
         try:
             self.store.makedirs(self._at(path).rsplit("/", 1)[0], exist_ok=True)
             yield
@@ -304,13 +307,13 @@ class StorePlace:
 
 
 def lease(holder: str, lost: int) -> bytes:
-    """A claim in a store, renewed now."""
+    """Return the content of a claim in a store, renewed now."""
     return json.dumps({"holder": holder, "lost": lost, "renewed": time.time()}).encode()
 
 
 def expired(claim: bytes) -> bool:
-    """Whether a claim in a store was not renewed for long."""
+    """Return True if a claim in a store has expired."""
     try:
         return time.time() - float(json.loads(claim)["renewed"]) > LEASE_SECONDS
     except (ValueError, KeyError, TypeError):
-        return False  # it is just being written
+        return False  # another process is writing it

@@ -1,4 +1,4 @@
-"""Jobs of a batch until each has a row, whoever does it."""
+"""Rounds of jobs, until each has a row from this or another process."""
 
 from __future__ import annotations
 
@@ -22,57 +22,59 @@ from gscompleter.batch.jobs import (
 from gscompleter.batch.places import Place
 
 POLL_SECONDS = 1.0
-"""How often it is looked whether others have done what they began."""
+"""Interval between checks for rows of other processes."""
 
 
 @runtime_checkable
 class Rows(Protocol):
-    """What becomes of jobs, as it is written down."""
+    """The rows of jobs, wherever they are stored."""
 
     def ended(self, job: Job) -> Outcome | None:
-        """What became of a job; None where it is still to be done."""
+        """Return the outcome of a job, or None if it has no row."""
         ...
 
     def give_up(self, job: Job, reason: str) -> Outcome:
-        """Write down that a job came to nothing."""
+        """Write a row for a job that cannot be completed."""
         ...
 
 
 @dataclass(frozen=True)
 class BatchRows:
-    """A row for each job of a batch."""
+    """The rows of the jobs of a batch."""
 
     place: Place
 
     def ended(self, job: Job) -> Outcome | None:
+        """Return the outcome of a job, or None if it has no row."""
         row = finished_row(self.place, job)
         return None if row is None else Outcome(job, row["state"], row["reason"])
 
     def give_up(self, job: Job, reason: str) -> Outcome:
+        """Write a row for a job that cannot be completed."""
         write_row(self.place, job.name, row_of(job, Attempts(None, 0, reason)))
         return Outcome(job, "failed", reason)
 
 
 def in_this_process(perform: Perform, jobs: Iterable[Job]) -> Iterator[Outcome]:
-    """The engine that needs no other process: one job after the other."""
+    """Run jobs one after the other in this process: the simplest engine."""
     return map(perform, jobs)
 
 
 @dataclass
 class Rounds:
-    """Hands out jobs, takes back what was lost, and waits for what others do."""
+    """Distributes jobs, repeats lost ones, and waits for those of other processes."""
 
     place: Place
     rows: Rows
     jobs: Sequence[Job]
     retries: int
-    """How often a job is sent again whose worker was lost."""
+    """Number of retries of a job whose worker was lost."""
     waiting: deque[Job] = field(default_factory=deque)
     elsewhere: list[Job] = field(default_factory=list)
     lost: Counter[str] = field(default_factory=Counter)
 
     def outcomes(self, engine: Engine, perform: Perform) -> Iterator[Outcome]:
-        """What became of each of the jobs, in the order in which they end."""
+        """Run all jobs and yield their outcomes in the order in which they end."""
         self.waiting.extend(self.jobs)
         while self.waiting or self.elsewhere:
             for outcome in engine(perform, self.offered()):
@@ -82,12 +84,12 @@ class Rounds:
                 time.sleep(POLL_SECONDS)
 
     def offered(self) -> Iterator[Job]:
-        """Jobs that wait, each as it is asked for; what is lost meanwhile is offered again."""
+        """Yield waiting jobs on demand, including those that are lost in the meantime."""
         while self.waiting:
             yield self.waiting.popleft()
 
     def heard(self, outcome: Outcome) -> Iterator[Outcome]:
-        """`outcome`, where it is the last word on its job."""
+        """Record an outcome, and yield it if it is final."""
         job = outcome.job
         if outcome.state == "elsewhere":
             self.elsewhere.append(job)
@@ -100,14 +102,14 @@ class Rounds:
             yield outcome
 
     def given_up(self, job: Job) -> Outcome:
-        """What is said of a job whose workers were lost as often as may be."""
+        """Return the outcome of a job that has been lost too often."""
         ended = self.rows.ended(job)
         lost = self.lost[job.name] + 1
-        reason = f"its worker was lost {lost} times, perhaps for want of memory"
+        reason = f"its worker was lost {lost} times, perhaps because memory ran out"
         return self.rows.give_up(job, reason) if ended is None else ended
 
     def done_by_others(self) -> Iterator[Outcome]:
-        """What others have done of what they claimed; what they let go waits for us again."""
+        """Yield outcomes of other processes; jobs that they released wait again."""
         held = []
         for job in self.elsewhere:
             is_held = self.place.is_held(f"{CLAIMS}/{job.name}")

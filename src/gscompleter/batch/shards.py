@@ -1,4 +1,4 @@
-"""Shards: every n-th of the jobs, so that processes that know nothing of each other share them."""
+"""Shards: every n-th job, so that independent processes share a batch."""
 
 from __future__ import annotations
 
@@ -8,18 +8,14 @@ from collections.abc import Mapping
 from gscompleter.errors import InputError, quoted
 
 Shard = tuple[int, int]
-"""(i, n): the jobs i, i + n, i + 2n, …; n shards with i from 0 are all of them."""
+"""(i, n) stands for the jobs i, i + n, i + 2n, …; i starts at 0."""
 
 ARRAY = ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_MIN", "SLURM_ARRAY_TASK_COUNT")
-"""Where SLURM says which task of an array this is, the number of the first, and how many."""
+"""SLURM variables: number of this task of an array, of the first task, and of tasks."""
 
 
 def parse_shard(text: str | None, environment: Mapping[str, str]) -> Shard:
-    """`i/n` as numbers; `auto` is what SLURM says of its array. Without a word it is all.
-
-    Raises:
-        InputError: where there is no such shard, or none is told of.
-    """
+    """Parse `i/n`, or `auto` for a task of a SLURM array; None means all jobs."""
     if text is None:
         return 0, 1
     if text == "auto":
@@ -35,20 +31,20 @@ def parse_shard(text: str | None, environment: Mapping[str, str]) -> Shard:
 
 
 def shard_of_array(environment: Mapping[str, str]) -> Shard:
-    """The shard that a task of an array of SLURM is, whose numbers follow one another."""
-    told = [environment.get(name, "") for name in ARRAY]
-    if not all(number.isdecimal() for number in told):
+    """Return the shard of a SLURM task; the numbers of the array have to be consecutive."""
+    numbers = [environment.get(name, "") for name in ARRAY]
+    if not all(number.isdecimal() for number in numbers):
         raise InputError(
-            f"{ARRAY[0]} and {ARRAY[2]} are not set, as they are in an array of SLURM; give the "
-            "shard as i/n.",
+            f"{ARRAY[0]} and {ARRAY[2]} are not set, so this is no SLURM array; give the shard as "
+            "i/n.",
             "shard",
         )
-    task, first, count = map(int, told)
+    task, first, count = map(int, numbers)
     return checked_shard((task - first, count))
 
 
 def checked_shard(shard: Shard) -> Shard:
-    """`shard`; an InputError where there is no such one."""
+    """Return the shard, or raise InputError if it is impossible."""
     number, count = shard
     if not 0 <= number < count:
         raise InputError(

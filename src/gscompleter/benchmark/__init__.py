@@ -1,1 +1,1 @@
-"""What a completion takes on this machine: time, memory, and how both grow."""
+"""Time and memory of a completion on this machine, and their growth."""

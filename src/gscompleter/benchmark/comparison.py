@@ -1,4 +1,4 @@
-"""Methods side by side: each makes the same target of the same scene, from the same image."""
+"""Comparison of methods on the same target of the same scene, with the same image."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from gscompleter.runs.methods import BASELINES, METHODS, Method, Models, Predict
 from gscompleter.types import Camera, Completion
 
 OWN_STAGES = ("register", "integrate", "optimize")
-"""What follows once the image is there and lifted, which is where methods differ."""
+"""Stages after generation and lifting, in which methods differ."""
 OWN = "own"
-"""What the seconds of these together are called."""
+"""Name of the sum of their seconds."""
 
 
 def with_plain_autograd(state: Completion, target: Camera, models: Models) -> Prediction:
-    """Ours with the same objectives and iterations, and nothing frozen."""
+    """Complete as `full` does, with the same objectives and iterations but no frozen context."""
     return METHODS["full"](state, target, replace(models, renderer=Unfrozen(models.renderer)))
 
 
@@ -31,35 +31,31 @@ COMPARED: dict[str, Method] = {
     "autograd": with_plain_autograd,
     **BASELINES,
 }
-"""Methods by name; the first is ours, which the others are told in multiples of."""
+"""Methods by name; the first one is ours, and times of others are multiples of its time."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where every method starts from."""
+    """The state that all methods start from."""
 
     state: Completion
-    """The scene before the target."""
     target: Camera
     models: Models
 
 
 def check_compared(names: Sequence[str]) -> None:
-    """Refuse names of no method.
-
-    Raises:
-        InputError: with those there are.
-    """
+    """Raise InputError for an unknown method."""
     for name in names:
         if name not in COMPARED:
             raise InputError(
-                f"There is no method '{quoted(name)}' to compare; choose of {', '.join(COMPARED)}.",
+                f"There is no method '{quoted(name)}' to compare; choose one of "
+                f"{', '.join(COMPARED)}.",
                 "methods",
             )
 
 
 def start_of(case: BenchCase, models: Models, device: str) -> Start:
-    """The scene of a case, reconstructed once for all methods, and its first target."""
+    """Reconstruct the scene of a case once for all methods, with its first target."""
     photographs = open_photographs(case.scene, near=case.near, far=case.far)
     views = [view.to(device) for view in photographs.views(case.context, case.resolution)]
     target = photographs.camera(case.targets[0], case.resolution).to(device)
@@ -67,7 +63,7 @@ def start_of(case: BenchCase, models: Models, device: str) -> Start:
 
 
 def compared(name: str, start: Start, yardstick: Yardstick) -> Sample:
-    """One run of a method, beside the yardstick."""
+    """Measure one run of a method, next to the yardstick."""
 
     def measure() -> Prediction:
         with peak_memory(start.state.views[0].image.device) as peak:
@@ -81,6 +77,6 @@ def compared(name: str, start: Start, yardstick: Yardstick) -> Sample:
 
 
 def with_own(seconds: Mapping[str, float]) -> dict[str, float]:
-    """`seconds` by stage, and of what a method does itself."""
+    """Add the sum of the stages in which methods differ."""
     own = sum(spent for stage, spent in seconds.items() if stage in OWN_STAGES)
     return {**seconds, OWN: own}

@@ -1,4 +1,4 @@
-"""A case completed by the command line, in a process of its own."""
+"""A case completed by the command line, in its own process."""
 
 from __future__ import annotations
 
@@ -18,16 +18,11 @@ from gscompleter.io.ply import save_ply
 from gscompleter.runs.methods import Models
 
 PROCESS, REST = "process", "rest"
-"""All of a process, and what of it is none of the completion's own seconds: start-up, imports,
-reading, scoring, writing."""
+"""Seconds of the whole process, and those outside the stages: start, imports, files, scores."""
 
 
 def completed(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
-    """One run of the command that `words` are, which writes `out`, beside the yardstick.
-
-    Raises:
-        InputError: where the command refuses its input.
-    """
+    """Measure one run of a command that writes to `out`, next to the yardstick."""
     ended, unit = yardstick.beside(lambda: run_alone(words))
     summary = json.loads((out / SUMMARY).read_text())
     stages = summary["seconds"]
@@ -36,10 +31,7 @@ def completed(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
 
 
 def brought(case: BenchCase, folder: Path, models: Models, device: str) -> Path | None:
-    """The file of the scene that a case brings; None where its context is reconstructed.
-
-    It is made of the context of the case, once, and stays in `folder`.
-    """
+    """Write the input splat of a case to `folder` once; None if the context is reconstructed."""
     if case.gaussians is None:
         return None
     alike = replace(case, name="", targets=(0,))

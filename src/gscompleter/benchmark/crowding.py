@@ -1,4 +1,4 @@
-"""Scenes of any number of Gaussians that still show what their photographs show."""
+"""Scenes of any number of Gaussians with the same appearance."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import torch
 from gscompleter.types import Gaussians
 
 JITTER = 0.1
-"""How far a copy lies from where it was, in standard deviations of the Gaussian."""
+"""Offset of a copy, in standard deviations of its Gaussian."""
 
 
 def crowded(scene: Gaussians, count: int, seed: int = 0) -> Gaussians:
-    """`count` Gaussians that look about as `scene` does: its Gaussians in turn, each moved a
-    little, and so much fainter that its copies together cover what it covered alone.
+    """Repeat Gaussians until there are `count`, with offsets and reduced opacities.
 
-    Fewer than there are, they are a random choice.
+    All copies of a Gaussian together have its opacity. If `count` is smaller than the scene, a
+    random subset is returned.
     """
     rng = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(scene), generator=rng)
     rows = order.repeat(math.ceil(count / len(scene)))[:count]
     copies = torch.bincount(rows, minlength=len(scene))[rows].to(scene.means)
-    crowd = scene[rows.to(scene.means.device)]
-    offsets = JITTER * torch.randn(count, 3, generator=rng).to(crowd.means)
-    means = crowd.means + offsets * crowd.scales.amin(dim=1, keepdim=True)
-    fainter = -torch.expm1(torch.log1p(-crowd.opacities) / copies)
-    return replace(crowd, means=means, opacities=fainter, encoded=None)
+    repeats = scene[rows.to(scene.means.device)]
+    offsets = JITTER * torch.randn(count, 3, generator=rng).to(repeats.means)
+    means = repeats.means + offsets * repeats.scales.amin(dim=1, keepdim=True)
+    fainter = -torch.expm1(torch.log1p(-repeats.opacities) / copies)
+    return replace(repeats, means=means, opacities=fainter, encoded=None)

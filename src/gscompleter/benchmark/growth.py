@@ -1,4 +1,4 @@
-"""How times and memory grow: the slope of a straight line between logarithms."""
+"""Growth of time and memory, as the exponent of a power law."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gscompleter.benchmark.samples import Measured
 
 @dataclass(frozen=True)
 class Growth:
-    """A series of measurements along an axis."""
+    """Measurements along an axis."""
 
     axis: str
     sizes: tuple[int, ...]
@@ -21,22 +21,21 @@ class Growth:
 
     @property
     def slopes(self) -> dict[str, float | None]:
-        """By stage, the exponent p of seconds ~ size^p."""
+        """Exponent p of seconds ~ size^p by stage."""
         return {stage: slope(self.sizes, self.medians(stage)) for stage in self.points[0].stages}
 
     @property
     def memory_slope(self) -> float | None:
-        """The exponent of the peak of memory."""
+        """Exponent of the peak memory."""
         return slope(self.sizes, [float(point.peak_bytes or 0) for point in self.points])
 
     def medians(self, stage: str) -> list[float]:
-        """Seconds of a stage at each size."""
+        """Return the median seconds of a stage at each size."""
         return [point.seconds[stage].median for point in self.points]
 
 
 def slope(sizes: Sequence[int], values: Sequence[float]) -> float | None:
-    """The slope of the least-squares line through the logarithms of both; None of fewer than two
-    sizes with a value above zero."""
+    """Fit the exponent of a power law by least squares; None for fewer than two sizes."""
     known = [(size, value) for size, value in zip(sizes, values, strict=True) if value > 0]
     if len({size for size, _ in known}) < 2:
         return None

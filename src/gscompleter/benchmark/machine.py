@@ -1,4 +1,4 @@
-"""The machine that measurements hold for."""
+"""Description of the machine that the measurements are valid for."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gscompleter.memory import memory_bytes
 
 
 def machine(device: str) -> dict[str, str | int]:
-    """What a reader needs to know of it."""
+    """Describe the versions and the hardware."""
     memory = memory_bytes()
     found: dict[str, str | int] = {
         "gscompleter": __version__,
@@ -30,16 +30,16 @@ def machine(device: str) -> dict[str, str | int]:
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Count the cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def processor() -> str:
-    """The model of the processor as Linux tells it, else its architecture."""
+    """Return the model of the processor, or its architecture if Linux does not report it."""
     try:
-        told = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.M)
+        model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.M)
     except OSError:
-        told = None
-    return told[1] if told else platform.processor() or platform.machine()
+        model = None
+    return model[1] if model else platform.processor() or platform.machine()

@@ -1,4 +1,4 @@
-"""What is measured: cases of a completion, and the series that grow from one of them."""
+"""Cases to measure, and series of cases that grow from one of them."""
 
 from __future__ import annotations
 
@@ -14,26 +14,25 @@ from gscompleter.io.json_file import read_json
 
 @dataclass(frozen=True)
 class BenchCase:
-    """One completion whose time is taken."""
+    """One completion to measure."""
 
     name: str
     scene: Path
     """Folder of the scene."""
     context: tuple[int, ...]
-    """Frames that are known."""
     targets: tuple[int, ...]
-    """Frames that are completed, in this order."""
+    """Target frames, completed in this order."""
     resolution: tuple[int, int]
-    """Height and width, in pixels."""
+    """Height and width in pixels."""
     near: float | None = None
-    """Smallest depth, in scene units; estimated where it is None."""
+    """Smallest depth in scene units; None to estimate it. The same holds for `far`."""
     far: float | None = None
-    """Largest depth, in scene units; estimated where it is None."""
     gaussians: int | None = None
-    """How many the scene holds that is brought; None where the context is reconstructed."""
+    """Number of Gaussians of the input splat, or None if the context is reconstructed."""
 
     @property
     def pixels(self) -> int:
+        """Number of pixels of an image."""
         return self.resolution[0] * self.resolution[1]
 
 
@@ -43,26 +42,26 @@ AXES: dict[str, str] = {
     "views": "context",
     "targets": "targets",
 }
-"""What a series can grow over, and the field of a case that it changes."""
+"""Axes of growth, with the field of a case that each one changes."""
 
 GAUSSIANS = (250_000, 500_000, 1_000_000, 2_000_000)
-"""Of the scenes that are brought, where nobody says."""
+"""Default numbers of Gaussians of the input splats."""
 SIDES = (0.5, 0.5**0.5, 1.0, 2**0.5, 2.0)
-"""Of the images, as multiples of the case's, where nobody says."""
+"""Default sides of the images, as multiples of the sides of the case."""
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """All that is measured."""
+    """All cases to measure."""
 
     cases: tuple[BenchCase, ...]
-    """The first is the one that methods are compared on."""
+    """The first one is also used to compare methods."""
     growth: Mapping[str, tuple[BenchCase, ...]] = field(default_factory=dict)
-    """By axis, cases that differ in nothing but its field."""
+    """Cases by axis, which differ only in its field."""
 
 
 def size_over(axis: str, case: BenchCase) -> int:
-    """How large a case is along an axis."""
+    """Return the size of a case along an axis."""
     if axis == "pixels":
         return case.pixels
     value = getattr(case, AXES[axis])
@@ -70,8 +69,7 @@ def size_over(axis: str, case: BenchCase) -> int:
 
 
 def grown_from(case: BenchCase) -> dict[str, tuple[BenchCase, ...]]:
-    """The series of a case where nobody names any, with the first of its targets, and over views
-    and targets with twice as many of its own each time."""
+    """Make the default series of a case, with its first target, from doubled sizes."""
     height, width = case.resolution
     sides = [(round(s * height), round(s * width)) for s in SIDES]
     values: dict[str, Sequence[Any]] = {
@@ -85,29 +83,25 @@ def grown_from(case: BenchCase) -> dict[str, tuple[BenchCase, ...]]:
 
 
 def prefixes(frames: tuple[int, ...], fewest: int) -> list[tuple[int, ...]]:
-    """The first `fewest` of `frames`, the first twice as many, and so on."""
+    """Return the first `fewest` frames, the first twice as many, and so on."""
     counts = [fewest * 2**n for n in range(len(frames).bit_length())]
     return [frames[:count] for count in counts if count <= len(frames)]
 
 
 def series(case: BenchCase, axis: str, values: Sequence[Any]) -> tuple[BenchCase, ...]:
-    """`case` with each of `values` along an axis, named by its size there."""
+    """Vary a case along an axis, and name the results by their sizes."""
     cases = [replace(case, **{AXES[axis]: value}) for value in values]
     return tuple(replace(c, name=f"{case.name}, {size_over(axis, c):,} {axis}") for c in cases)
 
 
 def read_manifest(path: Path) -> Manifest:
-    """The manifest in a JSON file, which names scenes by paths from its own folder.
-
-    Raises:
-        InputError: where the file is missing or is no manifest.
-    """
+    """Read a manifest from a JSON file; paths are relative to its folder."""
     content = read_json(path, "name a file of cases to measure")
     try:
         cases = tuple(_case(row, path.parent) for row in content["cases"])
         by_name = {case.name: case for case in cases}
         if not cases or len(by_name) < len(cases):
-            raise ValueError("cases need names, each another")
+            raise ValueError("there is no case, or two have the same name")
         return Manifest(cases, _growth(content.get("growth"), by_name))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(
@@ -119,11 +113,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def check_frames(cases: Sequence[BenchCase]) -> None:
-    """Open the scene of each case, and look for its frames, before anything is measured.
-
-    Raises:
-        InputError: where a scene cannot be opened or has no such frame.
-    """
+    """Raise InputError if a scene cannot be opened or lacks a frame."""
     for case in cases:
         photographs = open_photographs(case.scene, near=case.near, far=case.far)
         for frame in (*case.context, *case.targets):

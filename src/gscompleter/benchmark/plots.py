@@ -1,4 +1,4 @@
-"""Growth as curves, both axes logarithmic."""
+"""Growth as curves with logarithmic axes."""
 
 from __future__ import annotations
 
@@ -18,12 +18,7 @@ CURVES = (*STAGES, REST, PROCESS)
 
 
 def plot_growth(path: Path, growth: Sequence[Growth]) -> Path:
-    """A PNG with a panel for each series, one above the other.
-
-    Raises:
-        PlotsNotAvailable: where matplotlib is missing.
-        InputError: where the file cannot be written.
-    """
+    """Write a PNG with one panel per series; raise PlotsNotAvailable without matplotlib."""
     figure = new_figure(3.2 * len(growth))
     panels = figure.subplots(len(growth), squeeze=False)[:, 0]
     for axes, series in zip(panels, growth, strict=True):
@@ -33,7 +28,7 @@ def plot_growth(path: Path, growth: Sequence[Growth]) -> Path:
 
 
 def draw(axes: Axes, series: Growth) -> None:
-    """Median seconds of each stage against the size, the exponent of the process in the label."""
+    """Plot the median seconds of each stage against size."""
     for number, stage in enumerate(CURVES):
         if stage in series.points[0].stages:
             axes.plot(

@@ -1,4 +1,4 @@
-"""A command in a process of its own, with its time and memory."""
+"""A command in its own process, with its time and memory."""
 
 from __future__ import annotations
 
@@ -23,27 +23,21 @@ finally:
     from gscompleter.runs.memory import peak_of_process
     peak.write_text(str(peak_of_process() or ""))
 """
-"""What the process runs. It tells its peak itself: what the system tells of a child counts its
-parent's memory, too, which the child shares until it becomes another program."""
+"""Program of the process. It reports its own peak, because a child inherits its parent's."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A process that did its work."""
+    """Result of a process that succeeded."""
 
     seconds: float
-    """Wall time from its start to its end, start-up and imports included."""
+    """Wall time with start-up and imports."""
     peak_bytes: int | None
-    """The most resident memory it held; None where the system does not tell."""
+    """Peak resident memory, or None if the system does not report it."""
 
 
 def run_alone(words: Sequence[str]) -> Ended:
-    """Run `gscompleter` with these words.
-
-    Raises:
-        InputError: with the sentence of the command, where it refuses its input.
-        RuntimeError: where it fails otherwise.
-    """
+    """Run `gscompleter` with these arguments; raise InputError if it rejects its input."""
     with TemporaryDirectory() as folder:
         peak = Path(folder) / "peak"
         start = time.perf_counter()
@@ -58,5 +52,5 @@ def run_alone(words: Sequence[str]) -> Ended:
             raise InputError(done.stderr.strip().removeprefix("gscompleter: "))
         if done.returncode != 0:
             raise RuntimeError(f"gscompleter {' '.join(words)} failed:\n{done.stderr}")
-        told = peak.read_text()
-    return Ended(seconds, int(told) if told else None)
+        peak_bytes = peak.read_text()
+    return Ended(seconds, int(peak_bytes) if peak_bytes else None)

@@ -1,4 +1,4 @@
-"""What was measured, as tables in Markdown and as JSON."""
+"""Measurements as tables in Markdown and as JSON."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from gscompleter.completer import STAGES
 from gscompleter.reports.tables import markdown
 
 COLUMNS = (*STAGES, "total", REST, PROCESS)
-"""Of the seconds of a case. A stage that it did not have is left out."""
+"""Columns of the seconds of a case; stages that did not run are omitted."""
 METHOD_COLUMNS = ("generate", "lift", "register", "integrate", "optimize", OWN)
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that was measured in one run."""
+    """All measurements of one run."""
 
     machine: Mapping[str, str | int]
     settings: Mapping[str, Any]
-    """What was asked for: seed, repeats, and most iterations of the baselines."""
+    """Seed, repeats, and maximum number of iterations of the baselines."""
     cases: tuple[Measured, ...]
     methods: tuple[Measured, ...]
-    """On the first target of the first case; ours first, where it is among them."""
+    """Measurements on the first target of the first case; ours is the first if present."""
     growth: tuple[Growth, ...]
 
     @property
     def yardstick(self) -> Spread:
-        """Seconds of the yardstick beside all of it."""
+        """Seconds of the yardstick over all measurements."""
         points = [point for series in self.growth for point in series.points]
         everything = [*self.cases, *self.methods, *points]
         return Spread.of([s.yardstick for found in everything for s in found.samples])
 
 
 def content(report: Report) -> dict[str, Any]:
-    """The report as JSON has it. Seconds; bytes; ratios are seconds in yardsticks."""
+    """Return the report as JSON, in seconds, bytes and yardsticks (`ratios`)."""
     return {
         "machine": dict(report.machine),
         "settings": dict(report.settings),
@@ -51,7 +51,7 @@ def content(report: Report) -> dict[str, Any]:
 
 
 def measured_content(measured: Measured) -> dict[str, Any]:
-    """Every sample, and what they come to."""
+    """Return the samples of a measurement and their statistics."""
     samples = [
         {
             "seconds": dict(sample.seconds),
@@ -72,7 +72,7 @@ def measured_content(measured: Measured) -> dict[str, Any]:
 
 
 def growth_content(series: Growth) -> dict[str, Any]:
-    """A series with its slopes."""
+    """Return a series with its exponents."""
     return {
         "axis": series.axis,
         "sizes": list(series.sizes),
@@ -83,7 +83,7 @@ def growth_content(series: Growth) -> dict[str, Any]:
 
 
 def report_markdown(report: Report) -> str:
-    """Machine, cases, methods and growth."""
+    """Format machine, cases, methods and growth as Markdown."""
     parts = [machine_line(report)]
     if report.cases:
         parts += ["### Cases\n", case_table(report.cases)]
@@ -96,7 +96,7 @@ def report_markdown(report: Report) -> str:
 
 
 def machine_line(report: Report) -> str:
-    """Where and how it was measured."""
+    """Describe the machine and the measurements."""
     machine = {name.replace("_", " "): value for name, value in report.machine.items()}
     unit = report.yardstick
     return (
@@ -107,7 +107,7 @@ def machine_line(report: Report) -> str:
 
 
 def case_table(cases: Sequence[Measured]) -> str:
-    """Seconds by stage, memory and Gaussians, a row per case."""
+    """Format seconds by stage, memory and Gaussians, one row per case."""
     columns = present(cases, COLUMNS)
     head = ["case", *columns, "peak (GB)", "Gaussians", "added"]
     rows = [
@@ -124,14 +124,14 @@ def case_table(cases: Sequence[Measured]) -> str:
 
 
 def ratio_table(cases: Sequence[Measured]) -> str:
-    """Yardsticks by stage, a row per case."""
+    """Format yardsticks by stage, one row per case."""
     columns = present(cases, COLUMNS)
     rows = [[c.name, *(cell(c.ratios.get(column), 1) for column in columns)] for c in cases]
     return markdown(["case", *columns], rows)
 
 
 def method_table(methods: Sequence[Measured]) -> str:
-    """Seconds by stage, and how many times as long as ours, a row per method."""
+    """Format seconds by stage and the ratio to the first method, one row per method."""
     columns = present(methods, METHOD_COLUMNS)
     head = ["method", *columns, "yardsticks", f"times {methods[0].name}", "peak (GB)"]
     rows = [
@@ -148,12 +148,12 @@ def method_table(methods: Sequence[Measured]) -> str:
 
 
 def times(method: Measured, other: Measured) -> float:
-    """How many times as long a method takes as another, in yardsticks beside each."""
+    """Compute the ratio of the times of two methods, each in yardsticks."""
     return method.ratios[OWN].median / other.ratios[OWN].median
 
 
 def growth_table(series: Growth) -> str:
-    """Seconds by stage, a row per size, and the exponents below."""
+    """Format seconds by stage, one row per size, with the exponents in the last row."""
     columns = present(series.points, COLUMNS)
     rows = [
         [
@@ -163,19 +163,19 @@ def growth_table(series: Growth) -> str:
         ]
         for size, point in zip(series.sizes, series.points, strict=True)
     ]
-    slopes = [*(series.slopes.get(column) for column in columns), series.memory_slope]
-    exponents = ["–" if found is None else f"{found:.2f}" for found in slopes]
+    powers = [*(series.slopes.get(column) for column in columns), series.memory_slope]
+    cells = ["–" if power is None else f"{power:.2f}" for power in powers]
     head = [series.axis, *columns, "peak (GB)"]
-    return markdown(head, [*rows, ["exponent", *exponents]])
+    return markdown(head, [*rows, ["exponent", *cells]])
 
 
 def present(found: Sequence[Measured], columns: Sequence[str]) -> list[str]:
-    """Those of `columns` that took any time."""
+    """Select the columns with a positive time."""
     return [c for c in columns if any(c in m.stages and m.seconds[c].high > 0 for m in found)]
 
 
 def cell(spread: Spread | None, digits: int = 2) -> str:
-    """The median, and between which values it lies where there are several."""
+    """Format the median, with the range if there are several values."""
     if spread is None:
         return "–"
     median = f"{spread.median:.{digits}f}"
@@ -185,5 +185,5 @@ def cell(spread: Spread | None, digits: int = 2) -> str:
 
 
 def gigabytes(number: int | None) -> str:
-    """A dash where the system did not tell."""
+    """Format bytes in GB, or a dash if unknown."""
     return "–" if number is None else f"{number / 1e9:.2f}"

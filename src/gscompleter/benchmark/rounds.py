@@ -1,4 +1,4 @@
-"""Measuring in turns: what slows a shared machine for a while falls on everything alike."""
+"""Measurements in turns, so that a busy machine slows all of them alike."""
 
 from __future__ import annotations
 
@@ -11,22 +11,17 @@ from gscompleter.progress import shown_on, track
 
 @dataclass(frozen=True)
 class Task:
-    """Something that is measured several times."""
+    """A measurement that is repeated."""
 
     name: str
     measure: Callable[[], Sample]
     stage: str
-    """What of its seconds is told while it goes on."""
+    """Stage whose seconds the progress lines show."""
     repeats: int
 
 
 def in_rounds(tasks: Sequence[Task], tell: Callable[[str], None]) -> dict[str, Measured]:
-    """Each task once in every round, until it had its repeats; by name, what was measured.
-
-    Args:
-        tasks: Of different names.
-        tell: Is given a line after each measurement.
-    """
+    """Run each task once per round until it has its repeats; `tell` receives progress lines."""
     samples: dict[str, list[Sample]] = {task.name: [] for task in tasks}
     turns = [
         task
@@ -35,7 +30,7 @@ def in_rounds(tasks: Sequence[Task], tell: Callable[[str], None]) -> dict[str, M
         if number < task.repeats
     ]
     for number, task in enumerate(track(turns, "measuring"), start=1):
-        with shown_on(None):  # what is measured shows nothing
+        with shown_on(None):  # no progress lines inside a measurement
             sample = task.measure()
         samples[task.name].append(sample)
         seconds, ratio = sample.seconds[task.stage], sample.ratios[task.stage]

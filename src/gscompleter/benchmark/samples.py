@@ -1,4 +1,4 @@
-"""Measurements, and what several of the same come to."""
+"""Measurements and their statistics."""
 
 from __future__ import annotations
 
@@ -9,31 +9,30 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Spread:
-    """Several measurements of one quantity."""
+    """Statistics of several measurements of one quantity."""
 
     median: float
     low: float
-    """The smallest of them."""
     high: float
-    """The largest of them."""
 
     @staticmethod
     def of(values: Sequence[float]) -> Spread:
+        """Compute the statistics of values."""
         return Spread(statistics.median(values), min(values), max(values))
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What something took once."""
+    """One measurement."""
 
     seconds: Mapping[str, float]
     """Wall time by stage."""
     yardstick: float
-    """Seconds of the yardstick beside it, the mean of just before and just after."""
+    """Seconds of the yardstick, the mean of just before and just after."""
     peak_bytes: int | None = None
-    """The most memory that was held; None where the system does not tell."""
+    """Peak memory, or None if the system does not report it."""
     gaussians: Mapping[str, int] = field(default_factory=dict)
-    """How many the scene had, and how many were added."""
+    """Numbers of Gaussians in the context and added."""
 
     @property
     def ratios(self) -> dict[str, float]:
@@ -43,7 +42,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Measured:
-    """All samples of one case, or of one method."""
+    """All samples of one case or method."""
 
     name: str
     samples: tuple[Sample, ...]
@@ -60,15 +59,16 @@ class Measured:
 
     @property
     def stages(self) -> tuple[str, ...]:
+        """Names of the stages."""
         return tuple(self.samples[0].seconds)
 
     @property
     def peak_bytes(self) -> int | None:
-        """The most memory that any of them took; None where no system told."""
+        """Largest peak memory, or None if unknown."""
         known = (s.peak_bytes for s in self.samples if s.peak_bytes is not None)
         return max(known, default=None)
 
     @property
     def gaussians(self) -> Mapping[str, int]:
-        """Those of the first; the same seed adds as many each time."""
+        """Numbers of Gaussians of the first sample; the seed makes all samples equal."""
         return self.samples[0].gaussians

@@ -1,4 +1,4 @@
-"""Plain autograd over the same renderer, to tell what freezing the context is worth."""
+"""Plain autograd over the same renderer, to measure the benefit of a frozen context."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from gscompleter.types import Camera, Gaussians, Render
 
 @dataclass(frozen=True)
 class Unfrozen:
-    """A renderer that computes nothing in advance: the whole scene is merged and drawn anew at
-    each iteration, and differentiated through."""
+    """A renderer that renders and differentiates the whole scene in every iteration."""
 
     renderer: Renderer
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render as the wrapped renderer does."""
         return self.renderer.render(gaussians, camera)
 
     def freeze(self, context: Gaussians, camera: Camera) -> ReferenceView:
+        """Return a scene that is rendered anew with every call."""
         return ReferenceView(self.renderer, context, camera)

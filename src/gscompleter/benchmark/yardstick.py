@@ -1,4 +1,4 @@
-"""A fixed piece of work, so that times of several machines, and of busy hours, can be compared."""
+"""A fixed workload, to compare times of different machines and busy hours."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, merge, observed, sh_from_rgb
 
 SIDE = 256
-"""Of the image, in pixels."""
+"""Side of the image in pixels."""
 SHIFTS = (-0.2, 0.2, 0.4)
-"""Where the cameras stand that have a Gaussian for each of their pixels, in metres to the right."""
+"""Camera positions in metres to the right; each camera adds one Gaussian per pixel."""
 RUNS = 5
-"""Of which the median is taken."""
+"""Number of runs of which the median is taken."""
 
 VARIED = ("means", "quats", "scales", "opacities", "sh")
-"""What slopes are asked for."""
+"""Fields that have gradients."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Yardstick:
-    """The renderer, forward and backward: 196,608 Gaussians in an image of 256 x 256."""
+    """Rendering and gradients of 196,608 Gaussians in an image of 256 x 256."""
 
     renderer: Renderer
     gaussians: Gaussians
@@ -37,32 +37,32 @@ class Yardstick:
 
     @staticmethod
     def on(renderer: Renderer, device: str) -> Yardstick:
-        """The yardstick on a device, drawn once, so that everything is compiled."""
+        """Create the yardstick on a device, and run it once to compile everything."""
         scene = merge([surface(camera_at(shift)) for shift in SHIFTS])
         found = Yardstick(renderer, scene.to(device), camera_at(SHIFTS[-1]).to(device))
         found.draw()
         return found
 
     def draw(self) -> tuple[Tensor, ...]:
-        """One image, and the slope of its sum in everything that can vary."""
+        """Render one image and compute the gradients of its sum."""
         varied = {name: getattr(self.gaussians, name).clone() for name in VARIED}
         variables = [tensor.requires_grad_() for tensor in varied.values()]
         image = self.renderer.render(replace(self.gaussians, **varied), self.camera).image
         return torch.autograd.grad(image.sum(), variables)
 
     def seconds(self) -> float:
-        """Median of a few."""
+        """Measure the median seconds of `RUNS` runs."""
         return statistics.median(timed(self.draw) for _ in range(RUNS))
 
     def beside(self, measure: Callable[[], T]) -> tuple[T, float]:
-        """What `measure` gives, and the mean of the yardstick just before and just after."""
+        """Run `measure`, and return the mean yardstick of just before and just after."""
         before = self.seconds()
         found = measure()
         return found, (before + self.seconds()) / 2
 
 
 def timed(work: Callable[[], object]) -> float:
-    """Seconds that `work` takes, until a GPU has done its part too."""
+    """Measure the seconds of a call, including its work on a GPU."""
     start = time.perf_counter()
     work()
     if torch.cuda.is_available():
@@ -71,7 +71,7 @@ def timed(work: Callable[[], object]) -> float:
 
 
 def camera_at(shift: float) -> Camera:
-    """A camera that looks along z, `shift` metres to the right."""
+    """Make a camera along z, `shift` metres to the right."""
     K = torch.tensor([[1.2 * SIDE, 0, SIDE / 2], [0, 1.2 * SIDE, SIDE / 2], [0, 0, 1]])
     c2w = torch.eye(4)
     c2w[0, 3] = shift
@@ -79,7 +79,7 @@ def camera_at(shift: float) -> Camera:
 
 
 def surface(camera: Camera) -> Gaussians:
-    """A Gaussian for each pixel of a camera, on a wavy surface 3 m away."""
+    """Make one Gaussian per pixel of a camera, on a wavy surface 3 m away."""
     x = torch.linspace(0, 12, SIDE)
     depth = 3 + 0.5 * torch.sin(x)[None] * torch.cos(x)[:, None]
     n = SIDE * SIDE

@@ -1,4 +1,1 @@
-"""The commands, a file each, and what they can be told.
-
-Each raises an InputError for whatever the user can mend, which the command line prints.
-"""
+"""Commands, one per file. They raise InputError for errors that the user can correct."""

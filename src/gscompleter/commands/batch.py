@@ -58,15 +58,15 @@ class Counts:
 
     def sentence(self) -> str:
         """Summarize the counts, and name the option that retries earlier failures."""
-        before = f"there before {self.skipped}"
+        before = f"done earlier {self.skipped}"
         if self.skipped_failed:
-            before += f", {self.skipped_failed} of them failed (--rerun failures does these again)"
+            before += f", {self.skipped_failed} of them failed (--rerun failures repeats them)"
         return f"Done {self.done}, failed {self.failed}, {before}."
 
 
 def run_batch(options: BatchOptions) -> None:
     """Complete the scenes of a manifest, and write the table and the page."""
-    # Here, so that `--help` answers at once.
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.batch.jobs import claim_folder, missing

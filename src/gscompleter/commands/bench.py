@@ -123,8 +123,7 @@ def scene_case(options: BenchOptions, scene: Path) -> BenchCase:
     """Create the case of a scene."""
     if not options.context or not options.target:
         raise InputError(
-            "The bench needs to be told the frames to start from and those to complete the scene "
-            "for, as in --context 0 4 --target 8.",
+            "A scene needs context frames and targets; name them, as in --context 0 4 --target 8.",
         )
     name = scene.resolve().name
     planes = options.near, options.far
@@ -154,7 +153,7 @@ def chosen(manifest: Manifest, options: BenchOptions) -> Manifest:
     if unknown:
         known = ", ".join(case.name for case in manifest.cases)
         raise InputError(
-            f"There is no case '{quoted(min(unknown))}' to measure; choose of {known}.", "only"
+            f"There is no case '{quoted(min(unknown))}' to measure; choose one of {known}.", "only"
         )
     axes: set[str] = set() if options.quick else {*options.growth}
     growth = {axis: found for axis, found in manifest.growth.items() if axis in axes}
@@ -183,7 +182,7 @@ def measured(bench: Bench, manifest: Manifest, tell: Callable[[str], None]) -> R
     growing = [case for found in manifest.growth.values() for case in found]
     names = names_of([*manifest.cases, *growing])
     if not bench.options.quick:
-        tell(f"{manifest.cases[0].name}: once, uncounted")
+        tell(f"{manifest.cases[0].name}: first run, not counted")
         with stage("warming up"):
             bench.complete(manifest.cases[0])
     methods = method_tasks(bench, manifest.cases[0])

@@ -65,20 +65,20 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
         with preparing("reading the scene"):
             given = load_splat(options.scene, options.drop_nonfinite)
         compile_kernels([device])
-        with preparing("placing the scene"):
+        with preparing("aligning the scene"):
             task = in_frame_of_splat(task, given, options.scene, options, opened)
         task = with_working_range(task, renderer)
-        plan = f"judged by {len(task.views)} photographs on {device}"
+        plan = f"compared with {len(task.views)} photographs on {device}"
         plan += f", written to {quoted(options.out)}"
         say(console, *found_out(options, opened, task), f"To do: {plan}.")
         with output_folder(options.out, replaceable(options)) as folder:
             with clock("clean"):
-                taken = superfluous(splat_of(task), task.views, renderer, options.config)
+                removed = superfluous(splat_of(task), task.views, renderer, options.config)
             settings = settings_of(options, options.config, targets={}, models={})
-            said = {"settings": settings, "device": device, **opened_as(options, opened, task)}
-            summary = said | scores(task, taken, renderer) | {"seconds": clock.seconds}
+            facts = {"settings": settings, "device": device, **opened_as(options, opened, task)}
+            summary = facts | scores(task, removed, renderer) | {"seconds": clock.seconds}
             with stage("writing"):
-                write(folder, task, taken, {"version": __version__, **summary})
+                write(folder, task, removed, {"version": __version__, **summary})
     return summary
 
 
@@ -108,8 +108,8 @@ def write(folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[s
     given = splat_of(task)
     if taken.all():
         raise InputError(
-            "The photographs are better without any Gaussian of the splat; check that they show "
-            "the same scene."
+            "Every Gaussian of the splat makes the photographs worse; check that they show the "
+            "same scene."
         )
     assert task.brought is not None
     save_brought(folder, given, taken, given[:0], task.brought)
@@ -123,8 +123,8 @@ def tell(summary: Mapping[str, Any], out: Path) -> None:
         torch.tensor([row[f"psnr_{when}"] for row in rows]) for when in ("before", "after")
     )
     print(
-        f"{counts['removed']:,} of {counts['given']:,} Gaussians taken out in "
-        f"{summary['seconds']['total']:.1f} s; the photographs went from {before.mean():.2f} to "
-        f"{after.mean():.2f} dB, at worst by {(after - before).min():+.3f} dB: "
+        f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in "
+        f"{summary['seconds']['total']:.1f} s; mean PSNR of the photographs {before.mean():.2f} dB "
+        f"before, {after.mean():.2f} dB after, worst change {(after - before).min():+.3f} dB: "
         f"{out / 'completed.ply'}"
     )

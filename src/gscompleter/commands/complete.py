@@ -118,14 +118,14 @@ def write_done(
 ) -> dict[str, Any]:
     """Write all results but the targets and the video, and return the summary."""
     task, cameras = done.task, tuple(done.cameras.values())
-    said = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
+    facts = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
     with meanwhile(looks_around, options, done.completion, cameras, explorer) as looks:
         summary = write_report(
             folder,
             done.completion,
             task.targets,
             explorer.completer,
-            said,
+            facts,
             task.brought,
             lambda: Around(tuple(looks()), cameras),
             read_held_out(options, done.opened, task, done.cameras),
@@ -186,7 +186,7 @@ def with_splat(
         if "cpu" in parts:
             check_scene(task, given)
     compile_kernels([*parts, *([BROUGHT] if "cpu" in parts else [])])
-    with preparing("placing the scene"):
+    with preparing("aligning the scene"):
         order = order_nearby(given) if len(given) >= WORTH else None
         given = given if order is None else given[order]
         return in_frame_of_splat(task, given, path, options, opened, order)
@@ -270,18 +270,18 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
     origin = summary["frame"]["origin"]
     if any(origin):
         console.print(
-            f"The coordinates are large against the baselines, so the result is relative to "
+            f"The coordinates are very large, so the result has its origin at "
             f"{' '.join(map(str, origin))}; summary.json has the transform.",
             soft_wrap=True,
         )
     if not summary["targets"]:
         console.print(NO_TARGET)
     elif options.video:
-        console.print(f"On the way through the holes: {options.out / FILM}", soft_wrap=True)
+        console.print(f"Video: {options.out / FILM}", soft_wrap=True)
     covered = summary["coverage"]
     console.print(
-        f"From around the photographs {100 * covered['before']:.1f} % was covered before, and "
-        f"{100 * covered['after']:.1f} % is now.",
+        f"Coverage around the photographs: {100 * covered['before']:.1f} % before, "
+        f"{100 * covered['after']:.1f} % after.",
         soft_wrap=True,
     )
     unused = summary["held_out"]
@@ -289,8 +289,8 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         before = fmean(row["psnr_before"] for row in unused)
         after = fmean(row["psnr_after"] for row in unused)
         console.print(
-            f"At photographs that were not used ({len(unused)} scored) the mean PSNR was "
-            f"{before:.2f} dB before, and is {after:.2f} dB now.",
+            f"Mean PSNR of {len(unused)} photographs that were not used: {before:.2f} dB before, "
+            f"{after:.2f} dB after.",
             soft_wrap=True,
         )
     counts = summary["gaussians"]
@@ -300,4 +300,4 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         f"{options.out / 'completed.ply'}",
         soft_wrap=True,
     )
-    console.print(f"Before and after, on a page: {options.out / PAGE}", soft_wrap=True)
+    console.print(f"Report: {options.out / PAGE}", soft_wrap=True)

@@ -39,7 +39,7 @@ class ConvertOptions(Settings):
 
 def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
-    # Here, so that `--help` does not wait for torch.
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.io.ply import note_infinite_opacities
@@ -69,4 +69,4 @@ def unlabelled(gaussians: Gaussians) -> Gaussians:
 def check_free(path: Path, overwrite: bool) -> None:
     """Refuse to replace a file unless `overwrite` is set."""
     if path.exists() and not overwrite:
-        raise InputError(f"{path} is there already; name another file, or use --overwrite.")
+        raise InputError(f"{path} exists; name another file, or use --overwrite.")

@@ -67,7 +67,7 @@ def run_demo(options: DemoOptions) -> None:
     with output_folder(options.out, options.overwrite) as folder:
         scene = folder / "scene"
         write_motorcycle_scene(scene)
-        asked = CompleteOptions(
+        complete_options = CompleteOptions(
             folder=scene,
             context=(0, 1),
             target=(str(scene / "targets.json"),),
@@ -77,13 +77,13 @@ def run_demo(options: DemoOptions) -> None:
             seed=options.seed,
             quiet=options.quiet,
         )
-        summary, completion = complete_folder(asked)
+        summary, completion = complete_folder(complete_options)
         images = folder / "completion" / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
         shown = strip([read_image(images / f"{name}.png") for name in names])
         write_image(folder / "before_after.png", shown)
     if not options.quiet:
-        tell(summary, completion, replace(asked, out=options.out / "completion"))
+        tell(summary, completion, replace(complete_options, out=options.out / "completion"))
         Console(highlight=False).print(
             f"Before and after, beyond the left and the right camera: "
             f"{options.out / 'before_after.png'}",

@@ -88,7 +88,7 @@ def examined() -> Iterator[Found]:
 
 def machine_facts() -> Iterator[Found]:
     """Inspect versions, processor, memory and device."""
-    # Here and below, so that `--help` does not wait for torch.
+    # Imported here so that `--help` does not wait for torch.
     from gscompleter.benchmark.machine import machine
     from gscompleter.render import choose_device
 
@@ -103,15 +103,15 @@ def packages() -> Iterator[Found]:
     """Inspect the packages that everything needs."""
     for requirement in required():
         there = installed(requirement)
-        told = there or f"{requirement}, without which nothing runs; pip install '{requirement}'"
-        yield Found("packages", requirement.name, there is not None, told)
+        details = there or f"{requirement}, which every command needs; pip install '{requirement}'"
+        yield Found("packages", requirement.name, there is not None, details)
 
 
 def extras() -> Iterator[Found]:
     """Inspect the extras."""
     for extra, purpose in PURPOSES.items():
         if not required(extra):
-            why = f"what is installed is older than this extra, or this Python is; for {purpose}"
+            why = f"the installed version or this Python is older than this extra; for {purpose}"
             yield Found("extras", extra, False, why)
             continue
         versions = {requirement.name: installed(requirement) for requirement in required(extra)}
@@ -131,8 +131,8 @@ def required(extra: str = "") -> list[Requirement]:
         all_of_them = [Requirement(line) for line in requires(DISTRIBUTION) or []]
     except PackageNotFoundError:
         raise InputError(
-            f"What {DISTRIBUTION} needs is told by its installation, and there is none; run "
-            "`pip install .` in the folder of its sources."
+            f"{DISTRIBUTION} is not installed, so its requirements are unknown; run "
+            "`pip install .` in its source folder."
         ) from None
     return [r for r in all_of_them if is_for(extra, r)]
 
@@ -186,8 +186,10 @@ def weights() -> Iterator[Found]:
     for name, network in NETWORKS.items():
         places = [place_of_lpips(file, None) for file in (network.backbone, network.linear)]
         there = all(place.is_file() for place in places)
-        told = "for LPIPS in the tables of evaluate" + ("" if there else "; load_lpips fetches it")
-        yield Found("weights", f"lpips-{name}", there, told)
+        details = "for LPIPS in the tables of evaluate" + (
+            "" if there else "; load_lpips fetches it"
+        )
+        yield Found("weights", f"lpips-{name}", there, details)
 
 
 def viewer() -> Iterator[Found]:

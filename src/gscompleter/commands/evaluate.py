@@ -45,7 +45,7 @@ from gscompleter.runs.tasks import Task, task_of, tasks_of
 def run_evaluation(options: EvaluateOptions) -> None:
     """Run and score the methods on the cases, and write the tables."""
     if not options.paths:
-        raise InputError("No data was named; give a cases.json, or scenes with --protocol.")
+        raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     methods = methods_named(options.methods)
     shard = parse_shard(options.shard, os.environ)
@@ -72,9 +72,9 @@ def run_evaluation(options: EvaluateOptions) -> None:
     with shown_on(shown):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
-        told = f"Scored {counts.done}, failed {counts.failed}, there before {counts.skipped}."
-        console.print(told)
-        # An empty shard, where there are more shards than cases, has nothing to show.
+        line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
+        console.print(line)
+        # A shard without cases has no tables.
         if counts.done + counts.failed + counts.skipped > 0:
             show(options.out, options.quiet, num_rows=len(tasks) * len(methods))
 
@@ -200,8 +200,8 @@ def tasks_in_clips(
             notes += clip.notes
             if options.use_masks and not clip.has_masks:
                 raise InputError(
-                    f"Nothing says what is to be ignored in {clip.name}: it has neither masks nor "
-                    "boxes of what moves; leave --use-masks out."
+                    f"{clip.name} has neither masks nor boxes of moving objects; leave --use-masks "
+                    "out."
                 )
             clip = clip if options.ego_mask else clip.with_ego_vehicle()
             for protocol in protocols:
@@ -221,8 +221,7 @@ def cases_file(path: Path) -> Path:
     file = path / "cases.json" if os.path.isdir(path) else path
     if file.suffix != ".json" or not os.path.isfile(file) or file.name == "transforms.json":
         raise InputError(
-            f"{path} says not which frames are given and which are the target; add --protocol, as "
-            "in --protocol n-10."
+            f"{path} defines no context and target frames; add --protocol, as in --protocol n-10."
         )
     return file
 
@@ -230,7 +229,7 @@ def cases_file(path: Path) -> Path:
 def tell_skipped(skipped: Sequence[Skipped], console: Console) -> None:
     """Print the skipped clips with the reasons."""
     for clip in skipped:
-        console.print(f"Left out {clip.name}: {clip.reason}.")
+        console.print(f"Skipped {clip.name}: {clip.reason}.")
 
 
 def tell(summary: Summary, out: Path) -> None:

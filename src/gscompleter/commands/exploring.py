@@ -101,15 +101,15 @@ def sentence_of(plan: Plan, out: Path) -> str:
     """Write the sentence on the number of targets and the estimated time."""
     number = len(plan.holes)
     if number == 0:
-        return "No camera was found that has much to gain; nothing is to be completed."
-    said = "how long that takes shows only then"
+        return "No camera has much to gain; there is nothing to complete."
+    duration = "in a time that is not known in advance"
     if plan.seconds is not None:
-        said = (
-            f"which takes about {plan.seconds * number:.0f} s after the context, which took "
-            f"{plan.context_seconds:.0f} s"
+        duration = (
+            f"in about {plan.seconds * number:.0f} s after the context "
+            f"({plan.context_seconds:.0f} s)"
         )
     counted = "1 camera" if number == 1 else f"{number} cameras"
-    return f"To complete: {counted}, {said}. Edit them in {quoted(out / TARGETS)}."
+    return f"To complete: {counted}, {duration}. Edit the cameras in {quoted(out / TARGETS)}."
 
 
 def name_of(frame: int | None, near: int | None) -> str:

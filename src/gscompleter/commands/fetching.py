@@ -33,5 +33,5 @@ def local(value: Any, folder: Path) -> Any:
         path.parent.mkdir(parents=True, exist_ok=True)
         store.get(value.rstrip("/") + ("/" if found[0] else ""), str(path), recursive=found[0])
     except OSError as error:
-        raise ConnectionError(f"{value} cannot be fetched: {error}") from error
+        raise ConnectionError(f"{value} cannot be downloaded: {error}") from error
     return str(path)

@@ -34,8 +34,8 @@ class GeneratorOptions:
             knowing = [name for name, kind in GENERATORS.items() if hasattr(kind, setting)]
             if self.name not in knowing:
                 raise InputError(
-                    f"The generator {self.name!r} knows no {setting} ({quoted(value)}); leave that "
-                    f"out, or choose {' or '.join(knowing)}.",
+                    f"The generator {self.name!r} has no setting {setting} ({quoted(value)}); "
+                    f"leave it out, or choose {' or '.join(knowing)}.",
                     PREFIX + setting,
                 )
         return kind(**self.given)

@@ -40,8 +40,8 @@ SHOWN = 40
 """Most photographs on the page, in addition to the context."""
 THUMBNAIL = 160
 CLASSIC = (
-    "The page renders antialiased Gaussians as classic ones, small ones too opaque; what is saved "
-    "is right, and `view` shows it as it is."
+    "The page renders antialiased Gaussians as classic ones, small ones too opaque; saved files "
+    "are correct, and so is `gscompleter view`."
 )
 """Note on the page for antialiased scenes, which viser renders differently."""
 
@@ -62,7 +62,7 @@ class Prepared:
 def run_live(options: LiveOptions) -> None:
     """Serve the page until Ctrl-C."""
     check_viser()
-    # Here, so that its want is a sentence.
+    # Imported here because viser may be missing.
     from gscompleter.live.page import Page, Subject
 
     console = Console(stderr=True, quiet=options.quiet)
@@ -88,14 +88,23 @@ def check_viser() -> None:
 
 def prepare(options: LiveOptions, console: Console) -> Prepared:
     """Open the scene as `complete` does."""
-    asked = as_complete(options)
-    opened, task, explorer, seconds = prepared(asked, console)
-    say(console, *found_out(asked, opened, task))
+    as_complete_options = as_complete(options)
+    opened, task, explorer, seconds = prepared(as_complete_options, console)
+    say(console, *found_out(as_complete_options, opened, task))
     if task.scene is not None and task.scene.is_antialiased:
         say(console, CLASSIC)
     frames = frames_of(task)
-    asked = replace(asked, context=frames, target=(str(options.out / TARGETS),))
-    return Prepared(asked, opened, task, explorer, cameras_of(asked, opened, task), seconds)
+    as_complete_options = replace(
+        as_complete_options, context=frames, target=(str(options.out / TARGETS),)
+    )
+    return Prepared(
+        as_complete_options,
+        opened,
+        task,
+        explorer,
+        cameras_of(as_complete_options, opened, task),
+        seconds,
+    )
 
 
 def as_complete(options: LiveOptions) -> CompleteOptions:
@@ -149,7 +158,7 @@ class Saver:
         """Write the results of `complete`, and return a sentence."""
         options = self._ready.options
         if not session.steps:
-            raise InputError("Nothing has been completed; there is nothing to save.")
+            raise InputError("There is nothing to save; complete a hole first.")
         with output_folder(options.out, self._wrote or replaceable(options)) as folder:
             write_done(folder, options, done(self._ready, session), self._ready.explorer)
             write_cameras(folder / TARGETS, [step.told for step in session.steps])
@@ -168,7 +177,7 @@ def done(ready: Prepared, session: Session) -> Done:
 def serve(page: Page, options: LiveOptions) -> None:
     """Print the address, open the page, and work until Ctrl-C."""
     address = f"http://{options.host}:{page.server.get_port()}/"
-    # Whoever waits for this line finds the server listening.
+    # Printed once the server listens.
     print(f"{address} (Ctrl-C ends it)", flush=True)
     if not options.no_open:
         webbrowser.open(address)

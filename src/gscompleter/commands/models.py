@@ -47,18 +47,18 @@ def tell(found: dict[str, Path | None]) -> None:
     table.add_column("source", overflow="fold")
     for name, path in found.items():
         table.add_row(*cells(PUBLISHED[name], path))
-    # Into a file or a pipe, every row is one line.
+    # Rows are not wrapped in a file or a pipe.
     console = Console(width=None if sys.stdout.isatty() else WIDEST, markup=False, highlight=False)
     console.print(table)
-    doubts: dict[str, list[str]] = {}
+    cautions: dict[str, list[str]] = {}
     for weights in PUBLISHED.values():
         if weights.caution:
-            doubts.setdefault(weights.caution, []).append(weights.name)
+            cautions.setdefault(weights.caution, []).append(weights.name)
     print("\n(!) Whether commercial use is allowed is unclear:")
-    for caution, names in doubts.items():
+    for caution, names in cautions.items():
         print(f"    {', '.join(names)}: {caution}.")
     if not hub_is_installed():
-        print(f"\nThe hub's cache was not looked at, for huggingface_hub is missing: {INSTALL}")
+        print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")
 
 
 def cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:

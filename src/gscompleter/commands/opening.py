@@ -163,8 +163,8 @@ def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task
     frames = options.context or tuple(usable_cameras(given, range(len(given)), resolution))
     if not frames:
         raise InputError(
-            f"No photograph of {quoted(options.folder)} can be used; bring those that the splat "
-            "was trained on."
+            f"No photograph of {quoted(options.folder)} can be used; name the folder that the "
+            "splat was trained on."
         )
     return task_of(options, given, frames, (), device, check_sides)
 
@@ -224,8 +224,8 @@ def in_frame_of_splat(
 
 def with_witnesses(task: Task, given: Photographs) -> Task:
     """Add check views: unused photographs near the targets and all around."""
-    taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
-    others = [frame for frame in range(len(given)) if frame not in taken]
+    used = {view.frame for view in task.views} | {target.frame for target in task.targets}
+    others = [frame for frame in range(len(given)) if frame not in used]
     cameras = usable_cameras(given, others, WITNESS_SIDE)
     wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
     views = []
@@ -276,8 +276,8 @@ def check_targets(options: CompleteOptions) -> None:
     """Refuse `--target` together with `--auto`."""
     if options.target and options.auto is not None:
         raise InputError(
-            "Targets are named, and others are to be found besides; name them, or let them be "
-            "found, and complete the result for the others.",
+            "--target and --auto are both given; use one of them, and complete the result again "
+            "with the other.",
             "auto",
         )
 
@@ -294,15 +294,16 @@ def chosen_context(
 
     Targets are never chosen, because their photographs score the result.
     """
-    asked = {target.frame for target in targets}
+    target_frames = {target.frame for target in targets}
     resolution = working_size(options.resolution)
-    cameras = usable_cameras(given, [f for f in range(len(given)) if f not in asked], resolution)
+    cameras = usable_cameras(
+        given, [f for f in range(len(given)) if f not in target_frames], resolution
+    )
     if len(cameras) < needed_views(options):
-        there = "is 1 photograph" if len(cameras) == 1 else f"are {len(cameras)} photographs"
-        needed = "1 is" if needed_views(options) == 1 else f"{needed_views(options)} are"
+        left = "photograph is" if len(cameras) == 1 else "photographs are"
         raise InputError(
-            f"Besides the targets there {there} that can be used, and at least {needed} needed; "
-            "name fewer targets, or add photographs."
+            f"{len(cameras)} usable {left} left without the targets, and the context needs at "
+            f"least {needed_views(options)}; name fewer targets, or add photographs."
         )
     frames, candidates = list(cameras), list(cameras.values())
     wanted = [target.camera for target in targets] or overview(candidates)

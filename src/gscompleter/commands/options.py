@@ -131,8 +131,8 @@ class CompleteOptions(CompletingOptions):
     auto: Annotated[int, Interval(ge=1, le=255)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
     dry_run: bool = False
-    """Only search for the cameras, write targets.json and print the plan. The file can be edited
-    and passed to --target."""
+    """Only search for cameras, write them to targets.json (to edit and to pass to --target), and
+    print the plan."""
     out: Path
     """Folder for the completed scene (completed.ply), the report (report.html), images and
     summary.json."""

@@ -70,8 +70,8 @@ def read_held_out(
 
     `cameras` are those of all usable photographs by frame, in the frame of the result.
     """
-    taken = {view.frame for view in task.views} | {target.frame for target in task.targets}
-    others = {frame: camera for frame, camera in cameras.items() if frame not in taken}
+    used = {view.frame for view in task.views} | {target.frame for target in task.targets}
+    others = {frame: camera for frame, camera in cameras.items() if frame not in used}
     wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
     checks = {view.frame for view in task.witnesses or ()}
     held_out, device = list[HeldOut](), task.views[0].image.device

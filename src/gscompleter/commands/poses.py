@@ -28,7 +28,7 @@ class PosesOptions(ComputeOptions):
 
 def run_poses(options: PosesOptions) -> None:
     """Find and write the cameras, and print their number and error."""
-    # Here, so that `--help` waits for nothing.
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.data.structure_from_motion import find_poses
@@ -42,6 +42,6 @@ def run_poses(options: PosesOptions) -> None:
         print(note)
     print(
         f"{found.registered} of {found.photographs} cameras and {found.points:,} points, "
-        f"{found.error:.2f} px off on average"
+        f"mean error {found.error:.2f} px"
         f"{', found by an earlier run' if found.reused else ''}: {options.out}"
     )

@@ -24,7 +24,7 @@ class ReportOptions(Settings):
 
 def run_report(options: ReportOptions) -> None:
     """Write `report.html` and print its path."""
-    # Here, so that `--help` does not wait for torch.
+    # Imported here so that `--help` does not wait for torch.
     from gscompleter.reports.completion_page import completion_page
     from gscompleter.reports.evaluation_page import TABLES, evaluation_page
     from gscompleter.reports.page import NAME, write_page

@@ -45,7 +45,7 @@ def words_of(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     for key, value in row.items():
         name = new_name(f"{prefix}{key}".replace("_", "-"))
         if name in RESERVED:
-            raise InputError(f"A row has no say in '{quoted(name)}'; the batch decides it.")
+            raise InputError(f"A row cannot set '{quoted(name)}'; the batch sets it.")
         if name == FOLDER or value is None:
             continue
         if isinstance(value, Mapping):
@@ -75,7 +75,7 @@ def split(cell: str) -> list[str]:
     try:
         return shlex.split(cell)
     except ValueError as error:
-        raise InputError(f"'{quoted(cell)}' has a quotation mark without another.") from error
+        raise InputError(f"'{quoted(cell)}' has an unmatched quotation mark.") from error
 
 
 def is_set(name: str, value: Any) -> bool:

@@ -28,7 +28,7 @@ class StripOptions(Settings):
 
 def run_strip(options: StripOptions) -> None:
     """Write the original scene and print the number of Gaussians."""
-    # Here, so that `--help` does not wait for torch.
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.progress import preparing, shown_on
@@ -40,4 +40,4 @@ def run_strip(options: StripOptions) -> None:
     with shown_on(None if options.quiet else Console(stderr=True)), preparing("stripping"):
         given, generated = strip(options.completed, options.out)
     if not options.quiet:
-        print(f"{given:,} Gaussians, {generated:,} generated ones taken out: {options.out}")
+        print(f"{given:,} Gaussians, {generated:,} generated ones removed: {options.out}")

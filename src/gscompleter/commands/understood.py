@@ -57,16 +57,16 @@ def photographs_line(opened: Opened) -> str:
     if opened.number != len(given):
         count = f"{len(given)} of {count}"
     points = given.points()
-    told = "no points" if points is None else f"{len(points):,} points"
+    num_points = "no points" if points is None else f"{len(points):,} points"
     name = "photographs without cameras" if opened.format == "photographs" else opened.format
-    return f"{name}, {count}, {cameras_line(given.frames)}, {told}"
+    return f"{name}, {count}, {cameras_line(given.frames)}, {num_points}"
 
 
 def cameras_line(frames: Sequence[Frame]) -> str:
     """Describe the cameras and lenses."""
     cameras = dict.fromkeys(frame.intrinsics for frame in frames)
     lenses = dict.fromkeys(c.distortion.projection for c in cameras if c.distortion)
-    lens = f"{' and '.join(lenses)} lens taken out" if lenses else "no lens distortion"
+    lens = f"{' and '.join(lenses)} lens distortion removed" if lenses else "no lens distortion"
     return f"{len(cameras)} {'camera' if len(cameras) == 1 else 'cameras'} with {lens}"
 
 
@@ -130,7 +130,7 @@ def count_line(task: Task) -> str:
         return f"{named} {'photograph' if named == 1 else 'photographs'} for the context, as named"
     limit = ""
     if budget.allowed < budget.wanted:
-        limit = f", for there is no memory for {budget.wanted}"
+        limit = f" (memory is too small for {budget.wanted})"
     return (
         f"at most {budget.allowed} of {budget.usable:,} photographs for the context{limit} "
         "(--context names others)"

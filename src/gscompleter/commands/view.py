@@ -52,7 +52,7 @@ class ViewOptions(Settings):
 
 def run_view(options: ViewOptions) -> None:
     """Make the page, and write it or serve it until Ctrl-C."""
-    # Here, so that `--help` does not wait for torch.
+    # Imported here so that `--help` does not wait for torch.
     from gscompleter.viewer.packages import load_libraries
     from gscompleter.viewer.page import make_page
 
@@ -73,7 +73,7 @@ def run_view(options: ViewOptions) -> None:
 def check_page(path: Path, overwrite: bool) -> None:
     """Refuse a file name without .html, and an existing file unless `overwrite` is set."""
     if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{quoted(path)} is not named as a page; name it *.html.", "save")
+        raise InputError(f"{quoted(path)} is no .html file; name it *.html.", "save")
     check_free(path, overwrite)
 
 
@@ -105,11 +105,11 @@ def tell(exhibit: Exhibit, page: Page) -> None:
     for remark in exhibit.remarks:
         print(remark)
     if page.left_out:
-        print(f"{page.left_out:,} Gaussians lie too far out to be shown.")
+        print(f"{page.left_out:,} Gaussians are too far away to be shown.")
     if page.parts:
         print(
-            f"The Gaussians are too large for one page: they lie beside it in {len(page.parts)} "
-            f"files, {', '.join(page.parts)}, which have to stay with it."
+            f"The Gaussians do not fit into one page; keep these {len(page.parts)} files beside "
+            f"it: {', '.join(page.parts)}."
         )
 
 
@@ -133,7 +133,7 @@ def serve(options: ViewOptions, page: Page) -> None:
 
     with serving(page, options.port) as server, suppress(KeyboardInterrupt):
         address = f"http://{ADDRESS}:{server.server_address[1]}/"
-        # Whoever waits for this line finds the server listening.
+        # Printed once the server listens.
         print(f"{address} (Ctrl-C ends it)", flush=True)
         if not options.no_open:
             webbrowser.open(address)

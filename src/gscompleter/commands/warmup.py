@@ -18,7 +18,7 @@ class WarmupOptions(ComputeOptions):
 
 def run_warmup(options: WarmupOptions) -> None:
     """Compile missing kernels, and print the time and the folder."""
-    # Here, so that `--help` does not wait for torch.
+    # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
     from gscompleter.compilation import PARTS, compile_kernels

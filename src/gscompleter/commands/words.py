@@ -164,8 +164,8 @@ def unboxed(box: str, words: Sequence[str], names: Collection[str]) -> str:
         return not line.strip("─- ")
 
     lines = [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
-    said = takewhile(lambda line: not is_empty(line), dropwhile(is_empty, lines))
-    sentence = " ".join(line.strip() for line in said if not line.startswith(" " * 5))
+    first_lines = takewhile(lambda line: not is_empty(line), dropwhile(is_empty, lines))
+    sentence = " ".join(line.strip() for line in first_lines if not line.startswith(" " * 5))
     usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
     needed = "" if usage is None else f"; give {lines[usage].strip()}"
     command = command_in(words, names)

@@ -21,7 +21,7 @@ S = TypeVar("S", bound="Settings")
 Count = Annotated[int, Interval(ge=0, le=100_000)]
 Share = Annotated[float, Interval(ge=0, le=1)]
 Weight = Annotated[float, Interval(ge=0, le=1e6)]
-# Room is left for what is added to it on each level and in each round.
+# Levels and rounds add to the seed.
 Seed = Annotated[int, Interval(ge=0, lt=2**62)]
 
 
@@ -84,5 +84,5 @@ def sentence_on(wrong: ErrorDetails, name: str, settings: object) -> str:
     given = wrong["input"]
     shown = f"'{quoted(given)}'" if isinstance(given, str) else quoted(given)
     if wrong["type"] == "dataclass_type":
-        return f"{name} holds settings of its own, got {shown}."
+        return f"{name} is a group of settings, got {shown}."
     return f"{name} {re.sub(r'^[A-Z][a-z]+ should', 'must', wrong['msg'])}, got {shown}."

@@ -1,1 +1,1 @@
-"""The door: posed photographs in whatever format a user holds them."""
+"""Readers for posed photographs in every supported format."""

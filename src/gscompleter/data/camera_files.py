@@ -1,4 +1,4 @@
-"""Files of cameras alone, in whatever format a user or a program wrote them."""
+"""Readers for files that hold cameras without photographs."""
 
 from __future__ import annotations
 
@@ -21,17 +21,7 @@ from gscompleter.io.json_file import read_json
 
 
 def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
-    """The cameras of a file in its order.
-
-    Args:
-        path: A JSON file of the form of nerfstudio's `transforms.json`, of Inria's `cameras.json`
-            or of SuperSplat's poses, a folder with a `transforms.json` or a COLMAP model, or the
-            images.txt or images.bin of such a model.
-        resolution: Of images whose size the file does not tell: their height and width in pixels.
-
-    Raises:
-        InputError: where the file or one of its cameras is missing or impossible.
-    """
+    """Read the cameras of a file in its order; `load_cameras` lists the formats."""
     if is_image_file(path):
         return read_image_file(path)
     if os.path.isdir(path):

@@ -1,7 +1,7 @@
-"""Lists of cameras as 3DGS trainers write them: the `cameras.json` of Inria's code.
+"""Lists of cameras in the layout of Inria's 3DGS code (`cameras.json`).
 
-Each entry has id, img_name, width, height, position, rotation, fx and fy. Position and rotation
-are camera-to-world in OpenCV axes; the principal point is the middle of the image.
+Each entry has id, img_name, width, height, position, rotation, fx and fy. Position and rotation are
+camera-to-world in OpenCV axes; the principal point is the image centre.
 """
 
 from __future__ import annotations
@@ -30,19 +30,16 @@ ADVICE = "export the cameras again"
 
 
 def holds_camera_list(path: Path) -> bool:
-    """Whether `path` is a JSON list of cameras, or a folder with one called `cameras.json`."""
+    """Check whether `path` is a JSON list of cameras, or a folder with a `cameras.json`."""
     file = path / NAME if os.path.isdir(path) else path
     return file.suffix == ".json" and os.path.isfile(file) and begins_a_list(file)
 
 
 def open_camera_list(path: Path) -> Iterator[Photographs]:
-    """The photographs of a `cameras.json`, called by the name of its folder.
+    """Open the photographs of a `cameras.json`; the folder names the scene.
 
-    They lie beside it, in `images` or in one of the other folders of photographs. Frames are
-    numbered in the order of the sorted names of those whose photograph is there.
-
-    Raises:
-        InputError: as `read_camera_list`, and where none of the photographs is there.
+    Photographs lie beside the file, in `images` or another usual folder. Frames are numbered by the
+    sorted names of the photographs that exist.
     """
     file = path / NAME if os.path.isdir(path) else path
     finder = ImageFinder([file.parent])
@@ -53,11 +50,7 @@ def open_camera_list(path: Path) -> Iterator[Photographs]:
 
 
 def read_camera_list(path: Path) -> list[Frame]:
-    """The cameras of a JSON list in its order, without photographs.
-
-    Raises:
-        InputError: where it is damaged, or a camera is impossible.
-    """
+    """Read the cameras of a JSON list in its order, without photographs."""
     content = read_json(path, ADVICE)
     if not isinstance(content, list) or not content:
         raise InputError(f"{quoted(path)} lists no cameras; a list of cameras is needed, {ADVICE}.")

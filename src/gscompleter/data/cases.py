@@ -1,9 +1,9 @@
-"""Completion cases on posed photographs, written down in a file.
+"""Completion cases: which frames are context, target and neighbours.
 
-A case names two or more context frames and a target frame whose photograph no stage sees, and
-frames beside the target ("neighbours"), which a flat billboard in front of the target camera
-cannot satisfy. A file of cases is JSON: `{"resolution": [h, w], "cases": [{"scene", "context",
-"target", "near", "far", "neighbours"}, ...]}` with scene folders beside the file.
+A case has two or more context frames, a target frame whose photograph no stage sees, and frames
+beside the target ("neighbours"), which a flat billboard in front of the target cannot satisfy. A
+file of cases is JSON: `{"resolution": [h, w], "cases": [{"scene", "context", "target", "near",
+"far", "neighbours"}, ...]}`. Scene folders are relative to the file.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ class Case:
     """One completion task."""
 
     scene: Path
-    """Folder of the scene."""
     context: tuple[int, ...]
     target: int
     neighbours: tuple[int, ...]
     """Frames beside the target, for scoring only."""
     resolution: Resolution
-    """Height and width, or what else `PosedPhotographs.views` takes."""
+    """Height and width, or another `Resolution`."""
     near: float | None = None
     far: float | None = None
     ignore_masked: bool = False
-    """Whether what is masked in the photographs is ignored."""
+    """True if masked pixels of the photographs are ignored."""
     ego_mask: bool = True
-    """True if the vehicle that carries the camera is ignored."""
+    """True if pixels of the vehicle that carries the camera are ignored."""
 
     @property
     def name(self) -> str:
+        """Scene, context frames and target in one line."""
         return f"{self.scene.name} {'+'.join(map(str, self.context))}>{self.target}"
 
     def load(self, frames: tuple[int, ...]) -> list[View]:
-        """Photographs of `frames`."""
+        """Load the photographs of `frames`."""
         scene = open_photographs(self.scene, near=self.near, far=self.far)
         scene = scene if self.ego_mask else scene.with_ego_vehicle()
         views = scene.views(frames, self.resolution)
@@ -56,7 +56,7 @@ class Case:
 
 
 def holds_cases(path: Path) -> bool:
-    """Whether `path` is a folder with a `cases.json`, or a JSON file with cases."""
+    """Check whether `path` is a folder with a `cases.json`, or a JSON file with cases."""
     if os.path.isdir(path):
         return os.path.isfile(path / NAME)
     if path.suffix != ".json" or not os.path.isfile(path):
@@ -66,12 +66,9 @@ def holds_cases(path: Path) -> bool:
 
 
 def open_cases(path: Path) -> Iterator[Photographs]:
-    """The scenes of the cases that `path` is or holds, each once and in their order.
+    """Open each scene of a file or folder of cases once, in their order.
 
-    The near and far planes of a scene enclose those of all its cases, where all have them.
-
-    Raises:
-        InputError: as `read_cases`, and while iterating, where a scene cannot be opened.
+    Near and far enclose those of all cases of the scene, or are None if one case lacks them.
     """
     cases = read_cases(path / NAME if os.path.isdir(path) else path)
     for scene in dict.fromkeys(case.scene for case in cases):
@@ -86,11 +83,7 @@ def open_cases(path: Path) -> Iterator[Photographs]:
 
 
 def read_cases(path: Path) -> list[Case]:
-    """The cases of a file.
-
-    Raises:
-        InputError: where the file is missing or holds no cases.
-    """
+    """Read the cases of a file."""
     content = read_json(path, "name a file of cases")
     try:
         height, width = content["resolution"]

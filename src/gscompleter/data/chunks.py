@@ -1,9 +1,9 @@
-"""Data sets in the chunk format of pixelSplat, which MVSplat, DepthSplat and VolSplat share.
+"""Data sets in the chunk format of pixelSplat, MVSplat, DepthSplat and VolSplat.
 
-A folder holds `000000.torch`, `000001.torch`, … and an `index.json` that maps the key of each
-scene to its chunk. A chunk is a list of scenes: `key`, `cameras` [n, 18] and `images`, a list of
-n tensors with the bytes of JPEG or PNG files. One chunk is in memory at a time, however many clips
-are held, and an image is decoded only when its frame is asked for.
+A folder holds `000000.torch`, `000001.torch`, … and an `index.json` that maps the key of each scene
+to its chunk. A chunk is a list of scenes: `key`, `cameras` [n, 18] and `images`, a list of n
+tensors with the bytes of JPEG or PNG files. Only one chunk is in memory at a time, and an image is
+decoded when its frame is read.
 """
 
 from __future__ import annotations
@@ -26,27 +26,22 @@ from gscompleter.io.json_file import read_json
 from gscompleter.reading import check_file
 
 TEST = "test"
-"""The half of a data set that is evaluated on, in a folder of its own."""
+"""Folder of the test split of a data set."""
 INDEX = "index.json"
 
 
 def holds_chunks(path: Path) -> bool:
-    """Whether `path` is a chunk or an index of them, or a folder that has some."""
+    """Check whether `path` is a chunk, an index of chunks, or a folder with either."""
     if os.path.isfile(path):
         return path.suffix == ".torch" or path.name == INDEX
     return _folder_of(path) is not None
 
 
 def open_chunks(path: Path) -> Iterator[Photographs]:
-    """The scenes of a data set, chunk by chunk.
+    """Open the scenes of a data set, chunk by chunk.
 
-    Args:
-        path: A folder with an `index.json` and chunks, a folder with such a folder `test`, a
-            folder of chunks without index, an index, or one chunk.
-
-    Raises:
-        InputError: where there are no chunks, or the index is damaged; while iterating, where a
-            chunk is missing, damaged, holds pickled objects, or disagrees with the index.
+    `path` is a folder of chunks, with or without an `index.json`, or a folder with such a folder
+    `test`, an index, or one chunk. Damage inside a chunk raises an InputError while iterating.
     """
     if path.suffix == ".torch":
         return _scenes_of(path)
@@ -62,13 +57,11 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
 
 
 def _folder_of(path: Path) -> Path | None:
-    """The folder with the chunks: `path`, or the half of the data set in it."""
     folders = (path, path / TEST)
     return next((f for f in folders if os.path.isfile(f / INDEX) or any(f.glob("*.torch"))), None)
 
 
 def _indexed(index: Path) -> Iterator[Photographs]:
-    """The scenes of the chunks that an index lists."""
     content = read_json(index, "download it again")
     if (
         not isinstance(content, dict)
@@ -87,13 +80,13 @@ def _indexed(index: Path) -> Iterator[Photographs]:
 
 
 def _checked(path: Path, content: Mapping[str, str], index: Path) -> list[Photographs]:
-    """The scenes of a chunk, which are those that the index has for it."""
+    """Open the scenes of a chunk and compare their names with the index."""
     scenes = list(_scenes_of(path))
     names = {scene.name for scene in scenes}
     listed = {name for name, chunk in content.items() if index.parent / chunk == path}
     for name in sorted(listed - names):
         raise InputError(
-            f"{index} says that the scene {quoted(name)} is in {path}, which does not hold it; "
+            f"{index} lists the scene {quoted(name)} in {path}, which does not hold it; "
             "write the index again, or download the chunk again."
         )
     for name in sorted(names - listed):
@@ -105,30 +98,28 @@ def _checked(path: Path, content: Mapping[str, str], index: Path) -> list[Photog
 
 
 def _scenes_of(path: Path) -> Iterator[Photographs]:
-    """The scenes of one chunk."""
     return (
         _photographs(example, path, position) for position, example in enumerate(_load_chunk(path))
     )
 
 
 def _load_chunk(path: Path) -> list[Any]:
-    """The scenes of a chunk, not checked one by one."""
     check_file(path)
     return _read_chunk(path, path.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=1)
 def _read_chunk(path: Path, _written: int) -> list[Any]:
-    """The last one stays in memory, for the frames that are asked for one after the other."""
+    """Read a chunk; the last one stays cached, because frames are read one after the other."""
     refuse_pointer(path)
     try:
         with warnings.catch_warnings():
-            # About pickle protocols, in the moment before the file is refused.
+            # Torch warns about pickle protocols just before the file is refused.
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True)
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
-    # On damaged bytes the unpickler raises whatever the next instruction leads to.
+    # Damaged bytes can raise any exception.
     except Exception as error:
         raise InputError(_cannot_load(path, error)) from error
     if not isinstance(content, list) or not content:
@@ -146,12 +137,12 @@ def _cannot_load(path: Path, error: Exception) -> str:
             "run any code; save it again with tensors, strings, lists and dicts only."
         )
     if isinstance(error, MemoryError) or "allocate memory" in str(error):
-        return f"{path} asks for more memory than there is; divide it, or download it again."
+        return f"{path} needs more memory than is available; split it, or download it again."
     return f"{path} is truncated or no file of torch.save; download it again."
 
 
 def _photographs(example: Any, path: Path, position: int) -> Photographs:
-    """A scene, checked as far as that goes without decoding its images."""
+    """Check a scene without decoding its images."""
     entries = example if isinstance(example, dict) else {}
     name, cameras, images = (entries.get(key) for key in ("key", "cameras", "images"))
     if not isinstance(name, str) or not name:
@@ -166,8 +157,8 @@ def _photographs(example: Any, path: Path, position: int) -> Photographs:
         raise InputError(f"The `images` of the {called} are no list with images in it.")
     if len(images) != len(cameras):
         raise InputError(
-            f"The {called} has {len(images)} images and {len(cameras)} cameras; one camera for "
-            "each image is needed, so download the chunk again."
+            f"The {called} has {len(images)} images and {len(cameras)} cameras; each image "
+            "needs one camera, so download the chunk again."
         )
     for number, image in enumerate(images):
         if not _is_dense(image, ndim=1) or image.dtype != torch.uint8:
@@ -185,13 +176,13 @@ def _photographs(example: Any, path: Path, position: int) -> Photographs:
 
 
 def _image_bytes(path: Path, position: int, number: int) -> bytes:
-    """An image file of a chunk, of which nothing else stays in memory."""
+    """Copy the bytes of one image, so that the chunk can leave memory."""
     data: bytes = _load_chunk(path)[position]["images"][number].detach().numpy().tobytes()
     return data
 
 
 def _is_dense(value: Any, ndim: int) -> TypeGuard[Tensor]:
-    """Whether it is a tensor of `ndim` dimensions that holds a number for each of its entries."""
+    """Check whether a value is a tensor of `ndim` dimensions with storage for every entry."""
     if not isinstance(value, Tensor) or value.is_nested or value.ndim != ndim:
         return False
     if value.layout != torch.strided or value.is_meta or value.is_quantized:

@@ -1,4 +1,4 @@
-"""The frame that nerfstudio trains in, as the `dataparser_transforms.json` of a run tells it."""
+"""The training frame of nerfstudio, from the `dataparser_transforms.json` of a run."""
 
 from __future__ import annotations
 
@@ -16,13 +16,9 @@ SCALE_RANGE = (1e-9, 1e9)
 
 
 def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
-    """The similarity from the world of the reconstruction to that of the trained scene.
+    """Read the similarity from the reconstruction's frame to that of the trained scene.
 
-    The file holds a rotation and a translation (`transform`, 3×4), and a `scale` that multiplies
-    what they give.
-
-    Raises:
-        InputError: where the file cannot be read, or holds no such transform.
+    The file holds a rigid 3×4 `transform` and a `scale` that multiplies its result.
     """
     content = read_json(path, "copy it from the folder of the nerfstudio run again")
     if not isinstance(content, dict):

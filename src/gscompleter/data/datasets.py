@@ -1,4 +1,4 @@
-"""Many scenes at once, and which of them benchmarks keep."""
+"""Data sets of many scenes, and the selection that benchmarks use."""
 
 from __future__ import annotations
 
@@ -18,20 +18,17 @@ P = TypeVar("P", bound=PosedPhotographs)
 
 @dataclass(frozen=True)
 class Skipped:
-    """A scene that was left out."""
+    """A scene that was left out, and why."""
 
     name: str
     reason: str
 
 
 def open_clips(path: Path | str) -> Iterator[Photographs]:
-    """The scenes in a file or folder of any of `FORMATS`, a folder of such, or a `cases.json`.
+    """Open the scenes in a file or folder of any format, a folder of such, or a `cases.json`.
 
-    Of a vehicle with several cameras a scene is what the front camera saw. What it is, is found
-    out at once; the scenes are read one at a time.
-
-    Raises:
-        InputError: where it is none of these, and while iterating, where a scene is damaged.
+    For a vehicle with several cameras only the front camera is used. Scenes are read one at a time,
+    so damage raises an InputError while iterating.
     """
     path = Path(path)
     if holds_cases(path):
@@ -44,7 +41,7 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
 
 
 def looking_ahead(clip: Photographs) -> Photographs:
-    """The photographs of the front camera, where a vehicle has several; else all."""
+    """Keep the frames of the front camera if a vehicle has several cameras."""
     if clip.front is None:
         return clip
     ahead = tuple(frame for frame in clip.frames if frame.sensor == clip.front)
@@ -52,7 +49,7 @@ def looking_ahead(clip: Photographs) -> Photographs:
 
 
 def usable(clips: Iterable[P], skipped: list[Skipped]) -> Iterator[P]:
-    """The scenes that benchmarks keep, one at a time; the others are appended to `skipped`."""
+    """Yield the scenes that benchmarks keep, and append the others to `skipped`."""
     for clip in clips:
         reason = clip.reason_to_skip()
         if reason is None:

@@ -1,8 +1,8 @@
-"""DGP's scenes, as DDAD publishes them: a JSON file of all sensors, and one of calibrations.
+"""Scenes in DGP format, as DDAD publishes them: JSON files of sensors and calibrations.
 
 Every image has the pose of its camera, camera-to-world in OpenCV axes. A sample names the
-calibration that its images share, which lists intrinsics by the names of the cameras. The point
-cloud of the same sample gives sparse depth.
+calibration that its images share, with intrinsics by camera name. The point cloud of the sample
+gives sparse depth.
 """
 
 from __future__ import annotations
@@ -30,26 +30,21 @@ from gscompleter.reading import open_file, read_head
 CALIBRATIONS = "calibration"
 ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26
-"""Bytes at the beginning of a file that tell whether it is a scene."""
+"""Bytes read from a file to detect a scene."""
 MAX_SWEEP = 1 << 28
-"""Largest points of a sweep, in bytes."""
+"""Largest points of a lidar sweep, in bytes."""
 
 
 def holds_dgp(path: Path) -> bool:
-    """Whether `path` is the scene file of DGP, or a folder with one."""
+    """Check whether `path` is a DGP scene file, or a folder with one."""
     return _scene_file(path) is not None
 
 
 def open_dgp(path: Path) -> Iterator[Photographs]:
-    """The photographs of a scene of DGP, called by the name of its folder.
+    """Open the photographs of a DGP scene; its folder names it.
 
-    Frames of all cameras are numbered together in the order of their sorted names, which are
-    paths below the folder: all of the first camera, then all of the second. The first by name, in
-    DDAD CAMERA_01, is the front camera.
-
-    Raises:
-        InputError: where there is no scene file, it or the calibration is damaged, or no image is
-            listed.
+    Frames of all cameras are numbered by their sorted names, which are paths below the folder. The
+    first camera by name, in DDAD CAMERA_01, is the front camera.
     """
     file = _scene_file(path)
     if file is None:
@@ -94,7 +89,7 @@ def _frame(
 
 
 def _sweeps(content: Any) -> dict[str, Any]:
-    """The point cloud of the sample that each datum belongs to, by the datum's key."""
+    """Map the key of each datum to the point cloud of its sample."""
     data = {str(d.get("key")): d for d in _list(content, "data") if isinstance(d, dict)}
     found: dict[str, Any] = {}
     for sample in _list(content, "samples"):
@@ -105,24 +100,20 @@ def _sweeps(content: Any) -> dict[str, Any]:
 
 
 def _points(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
-    """The points of a sweep in the world frame, without those that are not finite."""
+    """Read the finite points of a sweep in the world frame."""
     try:
         with open_file(path) as file, zipfile.ZipFile(file) as archive:
             points = _array(archive)
         finite = points[np.isfinite(points).all(axis=1)]
     except InputError:
         raise
-    except Exception as error:  # a damaged archive or array fails in any way
+    except Exception as error:  # damaged archives and arrays raise anything
         raise InputError(f"{quoted(path)} is no point cloud of DGP; {ADVICE}.") from error
     return finite @ world_from_laser[:3, :3].T + world_from_laser[:3, 3]
 
 
 def _array(archive: zipfile.ZipFile) -> Float[np.ndarray, "n 3"]:
-    """Read the first three columns of the array `data`.
-
-    Raises:
-        ValueError: if it is larger than `MAX_SWEEP`, or no table of numbers.
-    """
+    """Read the first three columns of `data`; raises a ValueError if unsuitable or too large."""
     if archive.getinfo("data.npy").file_size > MAX_SWEEP:
         raise ValueError
     with archive.open("data.npy") as file:
@@ -133,22 +124,22 @@ def _array(archive: zipfile.ZipFile) -> Float[np.ndarray, "n 3"]:
 
 
 def _pose(pose: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
-    def numbers(part: str, *keys: str) -> list[float]:
+    def read_numbers(part: str, *keys: str) -> list[float]:
         entry = _object(pose, part)
         return [number_of(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
 
     c2w = np.eye(4)
-    c2w[:3, :3] = rotation_of(numbers("rotation", "qw", "qx", "qy", "qz"))
-    c2w[:3, 3] = numbers("translation", "x", "y", "z")
+    c2w[:3, :3] = rotation_of(read_numbers("rotation", "qw", "qx", "qy", "qz"))
+    c2w[:3, 3] = read_numbers("translation", "x", "y", "z")
     return c2w
 
 
 def _calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
-    """The intrinsics of the cameras by their names, without the size of their images."""
+    """Read the intrinsics by camera name, without image sizes."""
     file = _calibration_file(scene, content)
     calibration = read_json(file, ADVICE)
     names, entries = _list(calibration, "names"), _list(calibration, "intrinsics")
-    # Those of other sensors than cameras are zeros.
+    # Entries of other sensors are zeros.
     pairs = [(n, e) for n, e in zip(names, entries, strict=False) if _is_camera(n, e)]
     return {
         name: _intrinsics(entry, f"camera {quoted(name)} of {quoted(file)}")
@@ -169,7 +160,7 @@ def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
 
 
 def _calibration_file(scene: Path, content: Any) -> Path:
-    """The calibration of the first sample: `calibration/KEY.json`, or calibration.json."""
+    """Find the calibration of the first sample: `calibration/KEY.json` or calibration.json."""
     samples = _list(content, "samples")
     key = samples[0].get("calibration_key") if samples and isinstance(samples[0], dict) else None
     folder = scene.parent / CALIBRATIONS
@@ -183,7 +174,6 @@ def _calibration_file(scene: Path, content: Any) -> Path:
 
 
 def _scene_file(path: Path) -> Path | None:
-    """The scene file that `path` is or holds; None where there is none."""
     files = sorted(path.glob("scene*.json")) if os.path.isdir(path) else [path]
     return next((file for file in files if _is_scene(file)), None)
 

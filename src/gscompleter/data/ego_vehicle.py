@@ -1,8 +1,8 @@
-"""Pixels that show the vehicle that carries the camera, such as its bonnet.
+"""Detection of the vehicle that carries the camera, such as its bonnet, in photographs.
 
-They stay where they are in the image while the camera moves, so that stereo finds them at infinity.
-What tells them from a road, which hardly changes either, is their outline: it lies across the
-direction in which everything fixed to the ground moves through the image, and it stays.
+The vehicle does not move in the image, so stereo places it at infinity. A road hardly changes
+either. The difference is the outline of the vehicle: it stays in place although it crosses the
+direction in which the ground moves through the image.
 """
 
 from __future__ import annotations
@@ -24,56 +24,51 @@ from gscompleter.data.poses import pose_defect
 from gscompleter.errors import InputError
 
 FEWEST, MOST = 6, 12
-"""Photographs of a camera that a vehicle is searched in: none is found in fewer."""
+"""Fewest and most photographs of a camera that are searched; with fewer, nothing is found."""
 SIDE, MIN_SIDE = 256, 16
-"""Longer side of the small copies of them, and the least of the shorter, in pixels."""
+"""Longer side of the small copies, and smallest shorter side, in pixels."""
 MAX_TURN = 25.0
-"""Degrees by which the direction of travel and the downward axis of a camera on a vehicle may be
-off their means."""
+"""Largest deviation of the travel direction and the down axis from their means, in degrees."""
 STEADY = 0.8
-"""Smallest share of the photographs in which they are not."""
+"""Smallest share of the photographs within `MAX_TURN`."""
 MIN_GRADIENT = 2.5
-"""Change of brightness, in 256ths a pixel, from which there is an edge."""
+"""Smallest brightness gradient of an edge, in 256ths per pixel."""
 PERSISTENT = 0.7
-"""Smallest share of the photographs in which an edge that stays has the same direction."""
+"""Smallest share of the photographs in which a static edge has the same direction."""
 ACROSS = 0.4
-"""Smallest cosine between the normal of an edge and the motion of the ground through the image at
-which the ground would have moved the edge away."""
+"""Smallest cosine between an edge normal and the ground's motion that would move the edge."""
 HORIZON = 0.1
-"""First row of the ground, below the vanishing point, as a share of the image's height."""
+"""First row of the ground below the vanishing point, as a share of the image height."""
 STRICT, LENIENT = 0.55, 0.4
-"""Cost of a column of an outline: to decide whether there is a vehicle, and to follow its outline
-where that is faint."""
+"""Cost per column of an outline: to detect a vehicle, and to follow a faint outline."""
 STEEPEST = 4
-"""Rows by which an outline rises or falls at most from a column to the next."""
+"""Largest change of the outline from one column to the next, in rows."""
 BEND_COST = 0.1
-"""Cost of each of these rows, against an edge that stays in every photograph."""
+"""Cost of each such row, relative to an edge that is static in every photograph."""
 MIN_WIDTH = 0.25
-"""Smallest share of the columns in which the outline stays although the ground would move it."""
+"""Smallest share of the columns with a static edge that moving ground would have moved."""
 MIN_SUPPORT = 0.6
-"""Smallest share of the length of an outline that stays."""
+"""Smallest static share of the length of an outline."""
 MIN_AREA, MAX_AREA = 0.01, 0.5
-"""Smallest and largest share of an image that a vehicle fills."""
+"""Smallest and largest share of the image that a vehicle covers."""
 MAX_STAYING = 0.3
-"""Largest share of the edges elsewhere that stay: of more the camera hardly moves."""
+"""Largest static share of the edges elsewhere; above it the camera hardly moves."""
 CLEAR = 4
-"""Rows between two outlines, and from one to what else is looked at, in pixels of small copies."""
+"""Rows between two outlines, and between an outline and other edges, in small copies."""
 DENT = 0.12
-"""Share of the columns over which an outline falls at most where it was lost in between."""
+"""Largest width of a dip of the outline that is filled, as a share of the columns."""
 MARGIN = 1
-"""Rows by which an outline is raised, in pixels of the small copies."""
+"""Rows added above the outline, in pixels of the small copies."""
 
 
 @dataclass(frozen=True, eq=False)
 class EgoVehicle:
-    """Finds the vehicle in the photographs of one of its cameras, once it is asked for."""
+    """Lazy detector of the vehicle in the photographs of one of its cameras."""
 
     frames: tuple[Frame, ...]
-    """Those of the camera, in their order."""
 
     def __call__(self) -> Bool[np.ndarray, "h w"] | None:
-        """True on the vehicle, in a small copy of the photograph as it is stored; None where there
-        is none."""
+        """Return True on the vehicle in a small copy of the stored photograph, or None."""
         return self._mask
 
     @cached_property
@@ -93,8 +88,7 @@ class EgoVehicle:
 
 
 def read_small(frames: Sequence[Frame]) -> list[tuple[Frame, Float[np.ndarray, "h w"]]]:
-    """Read small copies of photographs; none of those that cannot be read, or are of another size
-    than most are."""
+    """Read small copies of the readable photographs of the most common size."""
     found = []
     for frame in frames:
         with suppress(InputError):
@@ -105,8 +99,7 @@ def read_small(frames: Sequence[Frame]) -> list[tuple[Frame, Float[np.ndarray, "
 
 
 def looking_for_vehicle(frames: Sequence[Frame]) -> tuple[Frame, ...]:
-    """Let frames find the vehicle that carries their camera, where there is one. Nothing is read
-    before they are asked for it."""
+    """Attach a lazy vehicle detector to each frame."""
     cameras: dict[Hashable, list[Frame]] = {}
     for frame in frames:
         cameras.setdefault((frame.sensor, frame.intrinsics), []).append(frame)
@@ -117,8 +110,7 @@ def looking_for_vehicle(frames: Sequence[Frame]) -> tuple[Frame, ...]:
 def select_frames(
     frames: Sequence[Frame],
 ) -> tuple[list[Frame], Float[np.ndarray, "3"] | None]:
-    """Select photographs at equal distances along the way of a camera on a vehicle, and measure the
-    direction of travel in the axes of the camera; None where it does not travel as on a vehicle."""
+    """Select evenly spaced photographs and the travel direction in camera axes, or None."""
     usable = [f for f in frames if pose_defect(f.c2w) is None and f.has_photograph()]
     if len(usable) < FEWEST:
         return [], None
@@ -134,12 +126,9 @@ def select_frames(
 def steady_motion(
     poses: Float[np.ndarray, "n 4 4"], steps: Float[np.ndarray, "n-1"]
 ) -> Float[np.ndarray, "3"] | None:
-    """Measure the direction of travel in the axes of a camera; None where it is not the same all
-    the time, or the camera tilts.
+    """Estimate the travel direction in camera axes; None if it varies or the camera tilts.
 
-    Args:
-        poses: Camera-to-world, in the order of time.
-        steps: Distances from each to the next, in scene units.
+    `poses` are camera-to-world in time order, `steps` the distances between them in scene units.
     """
     if (steps > 0).sum() < FEWEST - 1:
         return None
@@ -150,7 +139,7 @@ def steady_motion(
 
 
 def mean_direction(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
-    """Average directions; None where they are not steady."""
+    """Average directions; None if they are not steady."""
     units = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     mean = np.median(units, axis=0)
     length = np.linalg.norm(mean)
@@ -161,15 +150,10 @@ def mean_direction(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] 
 def ground_flow(
     motion: Float[np.ndarray, "3"], pinhole: Pinhole, shape: tuple[int, ...]
 ) -> tuple[Float[np.ndarray, "h w 2"], int]:
-    """Predict in which direction (x, y) what stands still moves through the image, as unit vectors,
-    and from which row downward it is ground that is near.
+    """Predict the image motion of the static scene (unit x, y) and the first row of near ground.
 
-    Lens distortion, which turns these directions a little, is left out.
-
-    Args:
-        motion: Direction of travel in the axes of the camera.
-        pinhole: The camera.
-        shape: Height and width of the small copies.
+    `motion` is the travel direction in camera axes, `shape` the height and width of the small
+    copies. Lens distortion, which turns these directions slightly, is ignored.
     """
     height, width = shape
     small = pinhole.resized(width, height)
@@ -185,28 +169,24 @@ def ground_flow(
 
 @dataclass(frozen=True)
 class Edges:
-    """Edges of photographs of one camera, pixel by pixel."""
+    """Edge statistics of the photographs of one camera, per pixel."""
 
     occurring: Float[np.ndarray, "h w"]
-    """Share of the photographs that have an edge there."""
+    """Share of the photographs with an edge there."""
     staying: Float[np.ndarray, "h w"]
-    """Share of them that have an edge there of the same direction."""
+    """Share of the photographs with an edge of the same direction there."""
     across: Float[np.ndarray, "h w"]
-    """Cosine between the normal of what stays and the motion of the ground."""
+    """Cosine between the normal of the static edge and the motion of the ground."""
 
 
 def find_static_region(
     images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 2"], first: int
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Find the region at the lower edge that stays the same; None where there is none.
+    """Find the static region at the lower image border; None if there is none.
 
-    Of several outlines that stay, such as those of a bonnet and of wipers before it, the highest
-    counts.
-
-    Args:
-        images: Brightness, from 0 to 255, of photographs of one camera at distant places.
-        flow: As `ground_flow` has it.
-        first: Highest row that the region may reach.
+    Of several static outlines, such as those of the bonnet and the wipers, the highest counts.
+    `images` are brightness in [0, 255], `flow` is from `predict_ground_flow`, and `first` is the
+    highest row that the region may reach.
     """
     edges, (height, width) = find_edges(images, flow), images.shape[1:]
     found, limit = np.full(width, height), np.full(width, height)
@@ -222,7 +202,7 @@ def find_static_region(
 
 
 def without_dents(outline: Int[np.ndarray, "w"]) -> Int[np.ndarray, "w"]:
-    """Raise an outline where it falls for a few columns and rises again."""
+    """Fill narrow dips of an outline."""
     window = np.ones((1, math.ceil(DENT * len(outline))), np.uint8)
     rows = np.pad(outline, len(outline) // 2, mode="edge").astype(np.float32)[None]
     filled = cv2.morphologyEx(rows, cv2.MORPH_OPEN, window)[0]
@@ -230,7 +210,7 @@ def without_dents(outline: Int[np.ndarray, "w"]) -> Int[np.ndarray, "w"]:
 
 
 def find_edges(images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 2"]) -> Edges:
-    """Find edges, and which of them stay where they are."""
+    """Find edges and how static they are."""
     smooth = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in images]
     gradients = np.stack([np.stack(np.gradient(image)[::-1], axis=-1) for image in smooth])
     normal = np.median(gradients, axis=0)
@@ -246,22 +226,18 @@ def find_edges(images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 
 def trace_outline(
     edges: Edges, first: int, limit: Int[np.ndarray, "w"], cost: float
 ) -> Int[np.ndarray, "w"]:
-    """Trace the outline that follows best what stays, column by column, by dynamic programming.
+    """Trace the outline along the most static edges by dynamic programming over columns.
 
-    Args:
-        edges: What stays.
-        first: Highest row that it may reach.
-        limit: Row of each column above which it has to stay; the image's height where there is
-            none.
-        cost: Of each column, against the reward for an edge that stays in every photograph. Where
-            the outline runs along the lower edge, there is neither.
+    It stays below row `first` and above row `limit` of each column. `cost` per column is relative
+    to an edge that is static in every photograph; the lower image border has neither cost nor
+    reward.
     """
     height, width = edges.staying.shape
     rows = np.arange(height)[:, None]
     reward = edges.staying * (0.5 + 0.5 * edges.across) - cost
     reward = np.where((rows >= first) & (rows < limit), reward, -1.0)
-    reward = np.concatenate([reward, np.zeros((1, width))])  # the lower edge: no vehicle there
-    bends = np.array([0, *range(-STEEPEST, 0), *range(1, STEEPEST + 1)])  # of equals the first one
+    reward = np.concatenate([reward, np.zeros((1, width))])  # lower border: no vehicle
+    bends = np.array([0, *range(-STEEPEST, 0), *range(1, STEEPEST + 1)])  # argmax takes the first
     total, came = reward[:, 0], np.zeros((height + 1, width), np.int64)
     for column in range(1, width):
         padded = np.pad(total, STEEPEST, constant_values=-np.inf)
@@ -277,7 +253,7 @@ def trace_outline(
 
 
 def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
-    """Decide whether what lies below an outline is carried along with the camera."""
+    """Decide whether the region below an outline moves with the camera."""
     height, width = edges.staying.shape
     inside = below(outline, height)
     if not MIN_AREA <= inside.mean() <= MAX_AREA:
@@ -295,10 +271,10 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
 
 
 def near_rows(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Grow a mask by a row upward and downward."""
+    """Dilate a mask by one row upward and downward."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((3, 1), np.uint8)) > 0
 
 
 def below(outline: Int[np.ndarray, "w"], height: int) -> Bool[np.ndarray, "h w"]:
-    """True from the row of an outline downward."""
+    """Fill the region from each column's outline row downward."""
     return np.arange(height)[:, None] >= outline

@@ -1,6 +1,6 @@
-"""The one door: posed photographs in whatever format they lie.
+"""Detection and opening of posed photographs in all formats.
 
-A format is a file of this package and a line in `FORMATS`.
+A format is a module of this package and a line in `FORMATS`.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ class Format:
     """A layout of posed photographs on disk."""
 
     holds: Callable[[Path], bool]
-    """Whether a file or folder is of it, by names and first bytes."""
+    """Detects the format of a file or folder by names and first bytes."""
     open: Callable[[Path], Iterable[Photographs]]
-    """The scenes in such a file or folder, one at a time. It reads nothing but cameras."""
+    """Opens the scenes in such a file or folder one at a time; reads only cameras."""
     unit: str | None = None
-    """What the coordinates are in, where the format says."""
+    """Unit of the coordinates, or None if the format does not define it."""
 
 
 SCENE_DEPTH = 2
-"""Levels of folders below the given one whose scenes an error message names."""
+"""Levels of subfolders searched for scenes that an error message names."""
 MAX_NAMED = 4
-"""Most scenes that it names."""
+"""Most scenes that the message names."""
 
 FORMATS = {
     "chunks": Format(holds_chunks, open_chunks),
@@ -64,21 +64,22 @@ FORMATS = {
     "waymo": Format(holds_waymo, open_waymo, "m"),
     "real-estate-10k": Format(holds_camera_files, open_camera_files),
 }
-"""By the names that `open_photographs` takes, in the order in which they are tried."""
+"""Formats by the names that `open_photographs` takes, in the order of detection."""
 
 
 def open_photographs(
     path: Path | str, format: str | None = None, near: float | None = None, far: float | None = None
 ) -> Photographs:
-    """The photographs of one scene, with nothing read but its cameras.
+    """Open the photographs of one scene; reads only its cameras.
 
     Args:
-        path: A file or folder of one of `FORMATS` with a single scene in it.
-        format: Name of its format; if left out, found by what lies there.
-        near: As `Photographs` has it, and so `far`.
+        path: A file or folder of one of `FORMATS` with a single scene.
+        format: Name of the format; detected if None.
+        near: Smallest z-depth in scene units; that of the files if None.
+        far: Largest z-depth in scene units; that of the files if None.
 
     Raises:
-        InputError: where there is no scene or more than one, or its cameras cannot be read.
+        InputError: If there is no scene or more than one, or its cameras cannot be read.
     """
     check_planes(near, far)
     path = Path(path)
@@ -98,11 +99,7 @@ def open_photographs(
 
 
 def format_of(path: Path, name: str | None = None) -> str:
-    """The name of a format: the one that is given, or else that which a file or folder is of.
-
-    Raises:
-        InputError: where there is no such format, or the path is of none.
-    """
+    """Return the given format name after checking it, or detect the format of `path`."""
     if name is not None and name not in FORMATS:
         raise InputError(
             f"There is no format '{quoted(name)}'; choose one of {', '.join(FORMATS)}."
@@ -118,12 +115,7 @@ def format_of(path: Path, name: str | None = None) -> str:
 
 
 def refuse_scenes_below(path: Path) -> None:
-    """Refuse a folder without photographs of its own that has scenes in folders below it.
-
-    Raises:
-        InputError: where it has one with cameras, or several with a folder of photographs each; it
-            names them.
-    """
+    """Refuse a folder without photographs whose subfolders hold scenes, and name them."""
     if not os.path.isdir(path) or _has_image_folder(path) or _has_images(path):
         return
     found = list(_scenes_below(path, lambda folder: recognised(folder) is not None))
@@ -150,7 +142,7 @@ def _has_images(path: Path) -> bool:
 def _scenes_below(
     path: Path, is_scene: Callable[[Path], bool], depth: int = SCENE_DEPTH
 ) -> Iterator[Path]:
-    """List the scenes at most `depth` folders below one, by their names; no results of ours."""
+    """List the scenes at most `depth` folders down, sorted; skips our own results."""
     for folder in sorted(path.iterdir()):
         if not folder.is_dir() or not is_own(folder):
             continue
@@ -161,12 +153,12 @@ def _scenes_below(
 
 
 def recognised(path: Path) -> str | None:
-    """The name of the first format that a file or folder is of; None where it is of none."""
+    """Detect the first format that fits a file or folder; None if none does."""
     return next((name for name, format in FORMATS.items() if format.holds(path)), None)
 
 
 def accepted() -> str:
-    """Describe what can be opened, for error messages."""
+    """Describe the accepted formats for error messages."""
     return (
         "name photographs with cameras, in one of these formats (docs/formats.md): "
         f"{', '.join(FORMATS)}"

@@ -1,4 +1,4 @@
-"""How an image is brought to a resolution: shrunk whole, or resized to cover it and cropped."""
+"""Resizing of images and cameras to a resolution."""
 
 from __future__ import annotations
 
@@ -13,27 +13,29 @@ from gscompleter.data.limits import MAX_SIDE
 from gscompleter.errors import InputError, quoted
 
 Resolution = tuple[int, int] | int | None
-"""Height and width in pixels, which images are resized to cover and cropped to in their centre; or
-the most pixels of their longer side, to which larger ones are shrunk whole; or None for their own
-size."""
+"""Target size of images.
+
+Height and width in pixels: resize to cover, then crop the centre. One number: shrink to at most
+this longer side. None: keep the size.
+"""
 
 
 @dataclass(frozen=True)
 class Framing:
-    """Resize to `resized`, then keep what begins at `corner` and is as large as `size`."""
+    """Resize to `scaled_size`, then crop `size` at `corner` (all x, y)."""
 
     resized: tuple[int, int]
     corner: tuple[int, int]
     size: tuple[int, int]
 
     def camera(self, pinhole: Pinhole) -> Pinhole:
-        """The camera of the framed image."""
+        """Return the camera of the framed image."""
         return pinhole.resized(*self.resized).cropped(*self.corner, *self.size)
 
     def image(
         self, image: Shaped[np.ndarray, "h w *c"], filtering: Image.Resampling
     ) -> Shaped[np.ndarray, "h2 w2 *c"]:
-        """The framed image."""
+        """Resize and crop an image."""
         left, top = self.corner
         width, height = self.size
         resized = resize(image, self.resized, filtering)
@@ -41,11 +43,7 @@ class Framing:
 
 
 def framing(width: int, height: int, resolution: Resolution) -> Framing:
-    """How an image of `width` by `height` pixels is brought to a resolution.
-
-    Raises:
-        InputError: where the resolution is impossible, or a strip would become too long.
-    """
+    """Compute the framing of a width × height image for a resolution."""
     check_resolution(resolution)
     if resolution is not None and not isinstance(resolution, int):
         return covering(width, height, resolution)
@@ -55,11 +53,7 @@ def framing(width: int, height: int, resolution: Resolution) -> Framing:
 
 
 def covering(width: int, height: int, resolution: tuple[int, int]) -> Framing:
-    """How an image is resized to cover `resolution` (height, width) and cropped in its centre.
-
-    Raises:
-        InputError: where a strip would become too long.
-    """
+    """Compute the framing that covers `resolution` (height, width) and crops the centre."""
     scale = max(resolution[0] / height, resolution[1] / width)
     new_width = max(round(width * scale), resolution[1])
     new_height = max(round(height * scale), resolution[0])
@@ -75,14 +69,14 @@ def covering(width: int, height: int, resolution: tuple[int, int]) -> Framing:
 def resize(
     image: Shaped[np.ndarray, "h w *c"], size: tuple[int, int], filtering: Image.Resampling
 ) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """The image resized to `size` (width, height)."""
+    """Resize an image to `size` (width, height)."""
     if image.shape[1::-1] == size:
         return image
     return np.array(Image.fromarray(image).resize(size, filtering))
 
 
 def check_resolution(resolution: Resolution) -> None:
-    """Raise an InputError where a side is not within 1 to `MAX_SIDE`."""
+    """Raise an InputError if a side is not within 1 to `MAX_SIDE`."""
     if resolution is None:
         return
     sides = (resolution,) if isinstance(resolution, int) else resolution

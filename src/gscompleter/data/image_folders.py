@@ -1,7 +1,7 @@
-"""Where photographs and masks lie that a file of cameras names by less than their path.
+"""Search for the photographs and masks that a camera file names.
 
-Exporters and users spell folders and endings in any case, and rename neither when they move
-between systems, so names are looked for as they are written first, then in any case.
+Programs and users vary the case of folders and endings, so names are tried as written first, then
+in any case.
 """
 
 from __future__ import annotations
@@ -15,42 +15,36 @@ from gscompleter.data.frame import DOWNSCALED, ENDINGS, Frame
 from gscompleter.errors import InputError, quoted
 
 ORIGINALS = "input"
-"""The folder of photographs before their distortion was removed, as 3DGS's scripts call it."""
+"""Folder of photographs before undistortion, as in the scripts of 3DGS."""
 FOLDERS = ("images", *(f"images_{n}" for n in DOWNSCALED), ORIGINALS)
-"""Of photographs, in the order in which they are looked through."""
+"""Usual folders of photographs, in search order."""
 MASKS = "masks"
 MAX_NAMED = 3
 """Missing photographs that a note names."""
 
 
 def find_path(folder: Path, relative: str) -> Path | None:
-    """The file or folder `relative` below `folder`, in any case; None where there is none."""
+    """Find `relative` below `folder`, ignoring case; None if it does not exist."""
     return _Listings().find(folder, relative)
 
 
 def image_folders(roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> list[Path]:
-    """The folders below `roots` that may hold photographs, the likeliest first.
-
-    Args:
-        roots: Folders, the nearest to the file of cameras first.
-        order: Names of folders in them. Photographs may also lie in the roots themselves.
-    """
+    """List the folders below `roots` (nearest first) that may hold photographs, likeliest first."""
     found = [find_path(root, name) for root in roots for name in order]
     return [folder for folder in found if folder is not None and folder.is_dir()] + list(roots)
 
 
 class ImageFinder:
-    """Finds the photographs and masks of one scene. Each folder is listed once at most."""
+    """Finder of the photographs and masks of one scene that lists each folder once."""
 
     def __init__(self, roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> None:
-        """`roots` and `order` as in `image_folders`."""
         masks = [find_path(root, MASKS) for root in roots]
         self.folders = image_folders(roots, order)
         self.masks = [folder for folder in masks if folder is not None]
         self.listings = _Listings()
 
     def placed(self, frame: Frame) -> Frame:
-        """The frame with its photograph and its mask, as far as they are found."""
+        """Return the frame with the paths of its photograph and mask, if they exist."""
         name = PurePosixPath(frame.name)
         masks = (f"{name}.png", f"{name.parent / name.stem}.png")
         photographs = [frame.name + ending for ending in ENDINGS]
@@ -59,7 +53,6 @@ class ImageFinder:
         )
 
     def _file(self, folders: Sequence[Path], names: Sequence[str]) -> Path | None:
-        """The first of the files of these names in the folders."""
         found = (self.listings.find(folder, name) for folder in folders for name in names)
         return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
@@ -67,11 +60,7 @@ class ImageFinder:
 def with_photographs(
     frames: Sequence[Frame], title: str
 ) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
-    """The frames whose photograph is there, by name, and a note that names those left out.
-
-    Raises:
-        InputError: where no photograph is there.
-    """
+    """Keep the frames whose photograph exists, sorted by name, and note the missing ones."""
     there = sorted((frame for frame in frames if frame.image), key=lambda frame: frame.name)
     missing = sorted(frame.name for frame in frames if not frame.image)
     if not there:
@@ -96,13 +85,12 @@ def _note(missing: Sequence[str], total: int, title: str) -> tuple[str, ...]:
 
 
 class _Listings:
-    """What lies in folders, by names in lower case, for as long as one scene is opened."""
+    """Cache of folder contents by case-folded name."""
 
     def __init__(self) -> None:
         self.known: dict[Path, dict[str, str]] = {}
 
     def find(self, folder: Path, relative: str) -> Path | None:
-        """As `find_path`."""
         if os.path.exists(folder / relative):
             return folder / relative
         found = folder

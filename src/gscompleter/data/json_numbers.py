@@ -1,4 +1,7 @@
-"""Values of JSON objects that somebody else wrote, checked where they are needed."""
+"""Validated access to values of JSON objects.
+
+All functions raise an InputError that names the key and `title`.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,7 @@ from gscompleter.errors import InputError, quoted
 def optional_number(
     entry: Mapping[str, Any], key: str, title: str, low: float, high: float
 ) -> float | None:
-    """The number at `key`, within `low` to `high`; None where there is none.
-
-    Raises:
-        InputError: where something else is there.
-    """
+    """Return the number at `key`, checked to lie in [low, high]; None if absent."""
     value = entry.get(key)
     if value is None:
         return None
@@ -32,11 +31,7 @@ def optional_number(
 
 
 def number_of(entry: Mapping[str, Any], key: str, title: str, low: float, high: float) -> float:
-    """The number at `key`, within `low` to `high`.
-
-    Raises:
-        InputError: where there is none, or something else.
-    """
+    """Return the number at `key`, checked to lie in [low, high]."""
     value = optional_number(entry, key, title, low, high)
     if value is None:
         raise InputError(f"The `{key}` of {title} is missing; add it.")
@@ -44,11 +39,7 @@ def number_of(entry: Mapping[str, Any], key: str, title: str, low: float, high: 
 
 
 def size_of(entry: Mapping[str, Any], title: str) -> tuple[int, int]:
-    """The numbers at `width` and `height`, in pixels.
-
-    Raises:
-        InputError: where one is missing or no whole number within the limits.
-    """
+    """Return `width` and `height` in pixels."""
     width, height = (
         number_of(entry, key, title, 1.0, float(MAX_SIDE)) for key in ("width", "height")
     )
@@ -58,11 +49,7 @@ def size_of(entry: Mapping[str, Any], title: str) -> tuple[int, int]:
 
 
 def text_of(entry: Mapping[str, Any], key: str, title: str) -> str | None:
-    """The path or name at `key`; None where there is none.
-
-    Raises:
-        InputError: where something else is there, or it is longer than any path.
-    """
+    """Return the path or name at `key`; None if absent."""
     value = entry.get(key)
     if value is not None and not (isinstance(value, str) and 0 < len(value) <= MAX_PATH):
         raise InputError(
@@ -74,11 +61,7 @@ def text_of(entry: Mapping[str, Any], key: str, title: str) -> str | None:
 def array_of(
     entry: Mapping[str, Any], key: str, shape: tuple[int, ...], title: str
 ) -> Float[np.ndarray, "*n"]:
-    """The nested list of numbers at `key`.
-
-    Raises:
-        InputError: where it is missing or of another shape.
-    """
+    """Return the nested list of numbers at `key` as an array of this shape."""
     try:
         array = np.array(entry.get(key), dtype=np.float64)
     except (ValueError, TypeError, OverflowError):

@@ -1,9 +1,8 @@
-"""KITTI odometry: a file of poses, and a file of calibrations of the rectified cameras.
+"""KITTI odometry sequences: a file of poses and one of camera projections.
 
-A pose is the upper 3×4 of camera-to-world of camera 0, in OpenCV axes, a line a frame. A
-calibration is the 3×4 projection of each camera from the frame of camera 0: its intrinsics, and
-how far the camera stands aside. Where it has `Tr`, the pose of the laser, sweeps in the folder
-`velodyne` give sparse depth.
+A pose is the upper 3×4 of camera-to-world of camera 0 in OpenCV axes, one line per frame. A
+calibration line is the 3×4 projection from the frame of camera 0 to a rectified camera. If it has
+`Tr`, the laser pose, the sweeps in `velodyne` give sparse depth.
 """
 
 from __future__ import annotations
@@ -28,30 +27,23 @@ from gscompleter.reading import MAX_LINE, read_head, read_lines
 
 POSES, CALIBRATION = "poses.txt", "calib.txt"
 CAMERAS = {"image_2": 2, "image_0": 0, "image_3": 3, "image_1": 1, "image_l": 0, "image_r": 1}
-"""Folders of photographs, in the order in which they are looked for, and whose they are."""
+"""Folders of photographs in search order, and their camera numbers."""
 LARGEST = 1e12
-"""Of the numbers of a matrix."""
 
 
 def holds_kitti(path: Path) -> bool:
-    """Whether `path` is a sequence of KITTI odometry, or a file of poses."""
+    """Check whether `path` is a KITTI odometry sequence, or a file of poses."""
     if os.path.isdir(path):
         return os.path.isfile(path / CALIBRATION) and _poses_of(path) is not None
     return path.suffix == ".txt" and os.path.isfile(path) and _begins_with_a_pose(path)
 
 
 def open_kitti(path: Path) -> Iterator[Photographs]:
-    """The photographs of a sequence, called by the name of its folder.
+    """Open the photographs of a sequence, numbered like the poses; its folder names it.
 
-    The colour camera on the left (2) is taken where its photographs are there, else one of the
-    others. Frames are numbered in the order of the poses.
-
-    Args:
-        path: A folder with calib.txt and with poses.txt, or with its poses in ../../poses; or a
-            file of poses, whose calibration and photographs lie beside it or in ../sequences.
-
-    Raises:
-        InputError: where a file is missing or damaged, or there are no photographs.
+    `path` is a folder with calib.txt and poses.txt, or with its poses in ../../poses; or a file of
+    poses, with calibration and photographs beside it or in ../sequences. The left colour camera (2)
+    is preferred.
     """
     poses = _poses_of(path) if os.path.isdir(path) else path
     if poses is None:
@@ -81,7 +73,7 @@ def _frame(
 
 
 def _camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:
-    """The intrinsics of a camera, and the transform from its frame to that of camera 0."""
+    """Read the intrinsics of a camera and the transform from its frame to camera 0."""
     projections = _matrices(calibration)
     if len(projections) <= camera:
         raise InputError(
@@ -94,15 +86,11 @@ def _camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarra
 def rectified(
     projection: Float[np.ndarray, "4 4"], camera: int, title: str
 ) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:
-    """The intrinsics of a rectified camera, and the transform from its frame to that of camera 0.
-
-    Raises:
-        InputError: where its projection, from the frame of camera 0, is that of no such camera.
-    """
+    """Split the projection of a rectified camera into intrinsics and the transform to camera 0."""
     K, aside = projection[:3, :3], projection[:3, 3]
     if not _is_upright(K):
         raise InputError(
-            f"The projection of camera {camera} in {title} is none of a rectified "
+            f"The projection of camera {camera} in {title} is not that of a rectified "
             "camera; name the calib.txt of KITTI odometry."
         )
     transform = np.eye(4)
@@ -112,18 +100,17 @@ def rectified(
 
 
 def _is_upright(K: Float[np.ndarray, "3 3"]) -> bool:
-    """Whether a matrix is that of intrinsics: upper triangular, with positive focal lengths."""
     return bool((np.tril(K, -1) == 0).all() and (np.diag(K) > 0).all() and K[2, 2] == 1)
 
 
 def _laser(calibration: Path) -> Float[np.ndarray, "4 4"] | None:
-    """The transform from the frame of the laser to that of camera 0, where the file has it."""
+    """Read the transform from the laser frame to camera 0, if the file has it."""
     lines = [line for line in read_lines(calibration) if line.startswith("Tr")]
     return _matrix(lines[0].partition(":")[2]) if lines else None
 
 
 def _matrices(path: Path) -> list[Float[np.ndarray, "4 4"]]:
-    """The 3×4 matrices of a file, a line each, with labels such as `P0:` or without."""
+    """Read the 3×4 matrices of a file, one per line, with or without labels such as `P0:`."""
     lines = [line for line in read_lines(path) if line.strip() and not line.startswith("Tr")]
     matrices = [_matrix(line) for line in lines]
     found = [matrix for matrix in matrices if matrix is not None]
@@ -144,14 +131,12 @@ def _matrix(line: str) -> Float[np.ndarray, "4 4"] | None:
 
 
 def _poses_of(folder: Path) -> Path | None:
-    """The poses of the sequence in a folder; None where there are none."""
     sequence = folder.resolve()
     candidates = (folder / POSES, sequence.parent.parent / "poses" / f"{sequence.name}.txt")
     return next((path for path in candidates if os.path.isfile(path)), None)
 
 
 def _sequence_of(poses: Path) -> Path:
-    """The folder of the sequence that a file of poses belongs to."""
     folder = poses.resolve().parent.parent / "sequences" / poses.stem
     return folder if os.path.isdir(folder) else poses.parent
 

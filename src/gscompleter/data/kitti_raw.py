@@ -1,8 +1,8 @@
-"""Drives of raw KITTI (synced and rectified), whose poses are those of GPS and inertial sensors.
+"""Drives of raw KITTI (synced and rectified), with poses from GPS and inertial sensors.
 
-`DATE/DATE_drive_NNNN_sync` holds `image_02/data`, `oxts/data` and perhaps `velodyne_points/data`;
-`DATE` the calibrations. Latitude and longitude become metres by a Mercator projection at the scale
-of the first latitude, as in the development kit.
+`DATE/DATE_drive_NNNN_sync` holds `image_02/data`, `oxts/data` and optionally
+`velodyne_points/data`; `DATE` holds the calibrations. Latitude and longitude become metres by a
+Mercator projection at the scale of the first latitude, as in the development kit.
 """
 
 from __future__ import annotations
@@ -25,24 +25,20 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.reading import read_lines
 
 EARTH_RADIUS = 6_378_137.0
-"""In metres."""
+"""Earth radius in metres."""
 CAMERAS = ("02", "03", "00", "01")
-"""Colour on the left, then on the right, then grey: the first that has photographs is taken."""
+"""Cameras in order of preference: colour left, colour right, then grey."""
 MAX_LATITUDE = 89.0
-"""In degrees: Mercator's map has no poles."""
+"""Largest latitude in degrees; Mercator's map has no poles."""
 
 
 def holds_kitti_raw(path: Path) -> bool:
-    """Whether `path` is the folder of a drive."""
+    """Check whether `path` is the folder of a drive."""
     return os.path.isdir(path / "oxts" / "data") and _camera_of(path) is not None
 
 
 def open_kitti_raw(path: Path) -> Iterator[Photographs]:
-    """The photographs of a drive, called by its folder, in the order of their numbers.
-
-    Raises:
-        InputError: where a calibration or the sensors of a photograph are missing or damaged.
-    """
+    """Open the photographs of a drive in the order of their numbers; its folder names it."""
     camera = _camera_of(path)
     if camera is None:
         raise InputError(
@@ -61,11 +57,10 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
 
 @dataclass(frozen=True, eq=False)
 class _Rig:
-    """How sensors stand on the vehicle."""
+    """Calibration of the sensors on the vehicle."""
 
     camera: str
     projection: Float[np.ndarray, "4 4"]
-    """Of the rectified camera, from the frame of rectified camera 0."""
     title: str
     imu_from_laser: Float[np.ndarray, "4 4"]
     laser_from_rectified: Float[np.ndarray, "4 4"]
@@ -99,7 +94,7 @@ def _frame(path: Path, image: Path, rig: _Rig, imu: Float[np.ndarray, "4 4"]) ->
 
 
 def _pose(reading: Float[np.ndarray, "6"], scale: float) -> Float[np.ndarray, "4 4"]:
-    """The pose of the inertial sensor, east, north and up of the origin of the map."""
+    """Compute the pose of the inertial sensor in map axes (east, north, up), in metres."""
     latitude, longitude, altitude, roll, pitch, yaw = reading.tolist()
     east = scale * EARTH_RADIUS * np.radians(longitude)
     north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
@@ -107,7 +102,7 @@ def _pose(reading: Float[np.ndarray, "6"], scale: float) -> Float[np.ndarray, "4
 
 
 def _reading(path: Path) -> Float[np.ndarray, "6"]:
-    """Latitude, longitude (degrees), altitude, roll, pitch and yaw (radians) at one time."""
+    """Read latitude, longitude (degrees), altitude (metres), roll, pitch and yaw (radians)."""
     words = _lines(path)[0].split() if _lines(path) else []
     numbers = _numbers(" ".join(words[:6]))
     if numbers is None or len(numbers) != 6 or abs(numbers[0]) > MAX_LATITUDE:
@@ -116,7 +111,7 @@ def _reading(path: Path) -> Float[np.ndarray, "6"]:
 
 
 def _rigid(path: Path) -> Float[np.ndarray, "4 4"]:
-    """The transform that a file tells as R and T."""
+    """Read a rigid transform from the lines R and T."""
     entries = _calibration(path)
     transform = np.eye(4)
     transform[:3, :3] = _entry(entries, "R", 9, str(path)).reshape(3, 3)
@@ -136,7 +131,6 @@ def _entry(
 
 
 def _calibration(path: Path) -> dict[str, Float[np.ndarray, "_"]]:
-    """The numbers of each line by its label; lines of other things are left out."""
     parts = (line.partition(":") for line in _lines(path))
     found = {label.strip(): _numbers(rest) for label, colon, rest in parts if colon}
     return {label: numbers for label, numbers in found.items() if numbers is not None}
@@ -155,6 +149,5 @@ def _numbers(text: str) -> Float[np.ndarray, "n"] | None:
 
 
 def _camera_of(path: Path) -> str | None:
-    """The first camera that has photographs in a drive."""
     folders = {camera: path / f"image_{camera}" / "data" for camera in CAMERAS}
     return next((c for c, folder in folders.items() if any(folder.glob("*.*"))), None)

@@ -1,7 +1,7 @@
-"""Pinhole intrinsics, and lens distortion and its removal.
+"""Pinhole intrinsics, lens distortion and undistortion.
 
-Pixels are ours throughout: the centre of the top-left one is (0.5, 0.5). OpenCV puts it at
-(0, 0), which matters only where an image is handed to it.
+Pixel coordinates put the centre of the top-left pixel at (0.5, 0.5). OpenCV puts it at (0, 0),
+which matters only when an image is passed to it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 MAX_ZOOM_OUT = 0.5
-"""Undistortion keeps at least this share of the resolution in the middle of the image."""
+"""Smallest share of the central resolution that undistortion keeps."""
 MAX_ZOOM_IN = 4.0
 
 
@@ -34,31 +34,32 @@ class Pinhole:
 
     @property
     def K(self) -> Float[Tensor, "3 3"]:
+        """Intrinsic matrix in pixels, float32."""
         return torch.tensor(
             [[self.fl_x, 0, self.cx], [0, self.fl_y, self.cy], [0, 0, 1]], dtype=torch.float64
         ).float()
 
     def resized(self, width: int, height: int) -> Pinhole:
-        """The camera of the image resized to width × height."""
+        """Return the camera of the image resized to width × height."""
         x, y = width / self.width, height / self.height
         return Pinhole(self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y, width, height)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Pinhole:
-        """The camera of the part of the image that begins at pixel (left, top)."""
+        """Return the camera of the crop that begins at pixel (left, top)."""
         return Pinhole(self.fl_x, self.fl_y, self.cx - left, self.cy - top, width, height)
 
     def zoomed(self, zoom: float) -> Pinhole:
-        """The same image plane seen `zoom` times larger about the principal point."""
+        """Magnify the image by `zoom` about the principal point, at the same size."""
         return Pinhole(
             self.fl_x * zoom, self.fl_y * zoom, self.cx, self.cy, self.width, self.height
         )
 
 
 Projection = Literal["perspective", "equidistant", "field-of-view", "division", "unified"]
-"""How a lens maps directions to its image plane, before any polynomial:
+"""Maps from directions to the image plane, before any polynomial:
 
-* perspective: as a pinhole does.
-* equidistant: radii are angles to the axis (fisheye).
+* perspective: pinhole.
+* equidistant: the radius is the angle to the axis (fisheye).
 * field-of-view: one angle ω; the radius is atan(2 r tan(ω/2)) / ω.
 * division: one number k; the radius is the ρ with ρ / (1 + k ρ²) = r.
 * unified: two numbers α and β; points are divided by α √(β r² + 1) + 1 - α.
@@ -67,33 +68,32 @@ Projection = Literal["perspective", "equidistant", "field-of-view", "division", 
 
 @dataclass(frozen=True)
 class Distortion:
-    """What a lens does to points of the image plane at z = 1: a projection, then polynomials.
+    """Lens distortion of points of the image plane at z = 1: a projection, then polynomials.
 
-    The polynomials are those of OpenCV; with the equidistant projection they are its fisheye
-    model, and COLMAP's.
+    The polynomials are OpenCV's; with the equidistant projection they are its fisheye model.
     """
 
     projection: Projection = "perspective"
     shape: tuple[float, ...] = ()
-    """The numbers of the projection, where it has some."""
+    """Parameters of the projection."""
     radial: tuple[float, ...] = ()
-    """k1, k2, … of the even powers of the radius, from the second on."""
+    """Coefficients k1, k2, … of even powers of the radius, from the second on."""
     tangential: tuple[float, float] = (0.0, 0.0)
-    """p1 and p2."""
+    """Coefficients p1 and p2."""
     denominator: tuple[float, ...] = ()
-    """k4, k5 and k6 of OpenCV's rational model, whose polynomial divides the radial one."""
+    """Coefficients k4, k5 and k6 of OpenCV's rational model, which divide the radial polynomial."""
     prism: tuple[float, float] = (0.0, 0.0)
-    """s1 and s3 of a thin prism: what the squared radius adds to x and y."""
+    """Thin-prism coefficients s1 and s3, which multiply r² in x and y."""
 
     def __bool__(self) -> bool:
-        """Whether a photograph needs undistorting."""
+        """Return True if a photograph needs undistortion."""
         polynomials = (*self.radial, *self.tangential, *self.denominator, *self.prism)
         return self.projection != "perspective" or any(polynomials)
 
 
 def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np.ndarray, "*n 2"]:
-    """Where the lens puts points of the image plane at z = 1; NaN where it shows none of them."""
-    # Far outside the photograph polynomials overflow, and a division has no solution.
+    """Distort points of the image plane at z = 1; NaN outside the field of the lens."""
+    # Far outside the photograph, polynomials overflow and the division has no solution.
     with np.errstate(all="ignore"):
         return _bent(_projected(points, distortion), distortion)
 
@@ -110,7 +110,6 @@ def _projected(
 
 
 def _radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndarray, "*n"]:
-    """The radius in the image of what a pinhole shows at radius r > 0."""
     if distortion.projection == "equidistant":
         return np.arctan(r)
     if distortion.projection == "field-of-view":
@@ -124,7 +123,6 @@ def _radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndar
 
 
 def _bent(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np.ndarray, "*n 2"]:
-    """What the polynomials make of projected points."""
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
     radial = _polynomial(r2, distortion.radial) / _polynomial(r2, distortion.denominator)
@@ -141,7 +139,7 @@ def _bent(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np
 def _polynomial(
     r2: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
 ) -> Float[np.ndarray, "*n"]:
-    """1 + k1 r² + k2 r⁴ + …"""
+    """Evaluate 1 + k1 r² + k2 r⁴ + … at r²."""
     value = np.zeros_like(r2)
     for k in reversed(coefficients):
         value = r2 * (k + value)
@@ -150,20 +148,19 @@ def _polynomial(
 
 @lru_cache(maxsize=16)
 def undistorted(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
-    """The pinhole camera of the undistorted photograph, of the same size.
+    """Compute the pinhole camera of the undistorted photograph, of the same size.
 
-    Its principal point is that of the lens, and it is zoomed so far that every pixel lies
-    within the photograph and as little as possible is lost at the borders. A fisheye lens
-    loses more, since the zoom stops at `MAX_ZOOM_OUT`. None where the coefficients fold the
-    image over itself, so that no zoom serves.
+    It keeps the principal point and zooms until every pixel lies in the photograph and the borders
+    lose as little as possible. Fisheye lenses lose more, since the zoom stops at `MAX_ZOOM_OUT`.
+    Returns None if the coefficients fold the image, so that no zoom works.
     """
     if not distortion:
         return pinhole
     zoom, radius = None, np.zeros(())
     for candidate in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400):
         bent = distort(_border(pinhole.zoomed(float(candidate))), distortion)
-        # Zooming out has to move every border point outwards: beyond the fold of a
-        # polynomial, points come back into the photograph and show something else.
+        # Zooming out must move every border point outwards: beyond the fold of a polynomial,
+        # points return into the photograph and show something else.
         if not _within(pinhole, bent) or (np.linalg.norm(bent, axis=-1) < radius).any():
             break
         zoom, radius = float(candidate), np.linalg.norm(bent, axis=-1)
@@ -174,13 +171,10 @@ def undistorted(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
 def undistortion_map(
     pinhole: Pinhole, distortion: Distortion, new: Pinhole
 ) -> Float[np.ndarray, "h w 2"]:
-    """For each pixel of the undistorted image, where the photograph shows it, for `remap`.
-
-    The last one stays in memory, for the frames of one lens.
-    """
+    """Compute the photograph position of each undistorted pixel, for `remap`."""
     x, y = np.meshgrid(np.arange(new.width) + 0.5, np.arange(new.height) + 0.5)
     pixels = _pixels(pinhole, distort(_plane_points(new, x, y), distortion))
-    # Where the lens shows nothing, the nearest border stands in.
+    # The nearest border fills pixels outside the field of the lens.
     finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
     with np.errstate(over="ignore"):
         return finite.astype(np.float32)
@@ -189,13 +183,13 @@ def undistortion_map(
 def remap(
     image: Shaped[np.ndarray, "h w *c"], source: Float[np.ndarray, "h w 2"], interpolation: int
 ) -> Shaped[np.ndarray, "h w *c"]:
-    """The image whose pixels are those of `image` at `source`."""
+    """Sample `image` at the positions `source`."""
     x, y = np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
     return np.asarray(cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _border(pinhole: Pinhole) -> Float[np.ndarray, "n 2"]:
-    """The centres of the outermost pixels, on the image plane at z = 1."""
+    """Compute the outermost pixel centres on the image plane at z = 1."""
     x, y = np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5
     rows = [_plane_points(pinhole, x, np.full_like(x, edge)) for edge in (y[0], y[-1])]
     columns = [_plane_points(pinhole, np.full_like(y, edge), y) for edge in (x[0], x[-1])]
@@ -213,7 +207,7 @@ def _pixels(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> Float[np.nda
 
 
 def _within(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> bool:
-    """Whether all points fall on pixels of the photograph, up to a thousandth of a pixel."""
+    """Check whether all points fall on pixels of the photograph, within 0.001 pixels."""
     x, y = np.moveaxis(_pixels(pinhole, points), -1, 0)
     return bool(
         (x.min() >= 0.499)

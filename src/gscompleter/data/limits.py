@@ -1,8 +1,8 @@
-"""Between which bounds the numbers of a camera have to lie.
+"""Bounds for the numbers of a camera.
 
-Files hold float64 and the pipeline works in float32, where 1e300 is infinity and 1e-300 is zero.
-So numbers are compared with these bounds once, where they come in. The bounds leave room for
-every real camera, and for the squares and quotients that are made of the numbers later.
+Files hold float64 and the pipeline uses float32, where 1e300 is infinity and 1e-300 is zero.
+Numbers are checked once, on input. The bounds admit every real camera, and squares and quotients of
+its numbers.
 """
 
 from __future__ import annotations
@@ -12,24 +12,24 @@ from gscompleter.errors import InputError
 MAX_SIDE = 16_384
 """Largest width or height of an image, in pixels."""
 MAX_IN_PIXELS = 1e12
-"""Of focal lengths and principal points in pixels, before they are compared with the image."""
+"""Largest focal length or principal point, in pixels."""
 MAX_COORDINATE = 1e9
-"""Farthest a camera may stand from the origin along an axis, in scene units."""
+"""Largest coordinate of a camera centre, in scene units."""
 FOCAL_RANGE = (1e-3, 1e6)
-"""Of focal lengths, in widths (or heights) of the image."""
+"""Range of focal lengths, in image widths (or heights)."""
 MAX_CENTER = 100.0
-"""Farthest the principal point may lie from the top-left pixel, in widths (or heights)."""
+"""Largest distance of the principal point from the corner, in image widths (or heights)."""
 MAX_COEFFICIENT = 1e4
-"""Of the coefficients of a lens."""
+"""Largest lens coefficient."""
 DEPTH_RANGE = (1e-9, 1e9)
-"""Of near and far planes, and of the units of depth maps, in scene units."""
+"""Range of near and far planes and of depth map units, in scene units."""
 
 MAX_PATH = 1024
-"""Of characters in the path of a file."""
+"""Longest file path, in characters."""
 
 
 def check_planes(near: float | None, far: float | None) -> None:
-    """Raise an InputError where the near or the far plane (in scene units) is impossible."""
+    """Raise an InputError if the near or far plane (scene units) is impossible."""
     low, high = DEPTH_RANGE
     for name, value in (("near", near), ("far", far)):
         if value is not None and not low <= value <= high:

@@ -1,8 +1,8 @@
 """LLFF's `poses_bounds.npy`: poses, focal lengths and depth bounds without names.
 
-A row is a 3×5 matrix and two numbers. The columns of the matrix are the camera's axes down, right
-and back, its centre, and height, width and focal length; the numbers are the z-depths between
-which the scene lies.
+A row is a 3×5 matrix and two numbers. The matrix columns are the camera axes down, right and back,
+its centre, and height, width and focal length; the numbers are the smallest and largest z-depth of
+the scene.
 """
 
 from __future__ import annotations
@@ -29,26 +29,21 @@ from gscompleter.reading import check_file
 NAME = "poses_bounds.npy"
 IMAGES = (".jpg", ".jpeg", ".png")
 MAX_BYTES = 1 << 26
-"""Of an array: as many as of half a million cameras."""
+"""Largest array in bytes, about half a million cameras."""
 
 _NO_ARRAY = (ValueError, TypeError, EOFError, OverflowError, MemoryError, SyntaxError, TokenError)
-"""What numpy raises for files that are no arrays, or are damaged ones."""
 
 
 def holds_llff(path: Path) -> bool:
-    """Whether `path` is a folder with a `poses_bounds.npy`, or such a file."""
+    """Check whether `path` is a `poses_bounds.npy`, or a folder with one."""
     return os.path.isfile(path / NAME) or (path.name.endswith(NAME) and os.path.isfile(path))
 
 
 def open_llff(path: Path) -> Iterator[Photographs]:
-    """The photographs of a `poses_bounds.npy`, called by the name of its folder.
+    """Open the photographs of a `poses_bounds.npy`; its folder names the scene.
 
-    The rows belong to the photographs beside it, in `images` or in one of the other folders of
-    photographs, in the order of their sorted names. The near and far planes enclose all bounds.
-
-    Raises:
-        InputError: where the file is damaged, a camera impossible, or where there are not as many
-            photographs as rows.
+    Rows belong to the sorted photographs beside it, in `images` or another usual folder. The near
+    and far planes enclose all bounds.
     """
     file = path / NAME if os.path.isdir(path) else path
     rows = _read_rows(file)
@@ -93,7 +88,7 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
 
 
 def _stored_array(path: Path) -> Shaped[np.ndarray, "..."]:
-    """The array as the file has it. One that claims more than the file holds is refused."""
+    """Map the array; refuse one that claims more than the file holds."""
     check_file(path)
     try:
         with warnings.catch_warnings():
@@ -109,16 +104,15 @@ def _stored_array(path: Path) -> Shaped[np.ndarray, "..."]:
 
 
 def _photographs_beside(file: Path, count: int) -> list[Path]:
-    """The photographs of the first folder with as many as there are rows."""
+    """List the photographs of the first folder with one for each row."""
     folders = image_folders([file.parent])
     found = [_images_in(folder) for folder in folders]
     fitting = next((images for images in found if len(images) == count), None)
     if fitting is None:
         numbers = ", ".join(f"{len(i)} in {f.name}" for f, i in zip(folders, found, strict=True))
         raise InputError(
-            f"{quoted(file)} has {count} rows, which belong to as many photographs in order of "
-            f"their names, and there are {numbers}; put exactly these into a folder "
-            "`images` beside it."
+            f"{quoted(file)} has {count} rows, one per photograph in order of their names, but "
+            f"there are {numbers}; put exactly these photographs into a folder `images` beside it."
         )
     return fitting
 

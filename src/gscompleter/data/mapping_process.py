@@ -1,8 +1,8 @@
-"""Structure from motion in a process of its own, because COLMAP aborts on what it cannot handle.
+"""Structure from motion in a separate process, because COLMAP aborts on errors.
 
-Its argument is the JSON file of a job. It writes a JSON object per line: `{"begin": phase, "steps":
-n}`, then `{"step": 1}` about n times and `{"end": phase}`, and at last `{"result": ...}`. What
-COLMAP itself has to say goes to the standard error.
+The argument is the JSON file of a job. Output is one JSON object per line: `{"begin": phase,
+"steps": n}`, then about n times `{"step": 1}` and `{"end": phase}`, and at last `{"result": ...}`.
+COLMAP's own output goes to standard error.
 """
 
 from __future__ import annotations
@@ -36,99 +36,99 @@ from gscompleter.data.upright import Upright
 
 SEED = 0
 MAX_FEATURES = 4096
-"""In a photograph."""
+"""Most features in a photograph."""
 BATCH = 50
-"""Pairs that are matched between two steps of the progress bar."""
+"""Pairs matched per step of the progress bar."""
 LENS = "SIMPLE_RADIAL"
-"""COLMAP's camera model: one focal length, one coefficient of distortion."""
+"""COLMAP's camera model: one focal length, one distortion coefficient."""
 GUESSED_FOCAL = 1.2
-"""Focal length as a multiple of the longer side, where EXIF does not tell it."""
+"""Focal length in longer image sides, if EXIF lacks it."""
 MIN_MODEL = 3
-"""Photographs of a part that does not connect to the others for it to be told of."""
+"""Fewest photographs of a disconnected part that is reported."""
 MIN_FOR_CENTRE = 10
-"""Photographs by one camera that its principal point can be told from."""
+"""Fewest photographs per camera to refine its principal point."""
 MAX_OFF_CENTRE = 0.1
-"""Distance of a believable principal point from the centre, in longer sides of the image."""
+"""Largest plausible distance of the principal point from the centre, in longer sides."""
 FOV = 10.0, 150.0
-"""Smallest and largest plausible field of view along the longer side of an image, in degrees."""
+"""Plausible range of the field of view along the longer side, in degrees."""
 MAX_SHIFT = 0.5
-"""Largest plausible displacement of a corner of the image by the distortion of the lens, as a share
-of the distance from the centre."""
+"""Largest plausible shift of an image corner by distortion, relative to its radius."""
 HELD_FOVS = (75.0, 60.0, 90.0, 45.0)
-"""Fields of view along the longer side, in degrees, at which the focal length is held where COLMAP
-fails to find it, in the order in which they are tried."""
+"""Fields of view along the longer side, in degrees, to fix the focal length at, in order."""
 MAX_ROUNDS = 4
-"""How often cameras are placed with a focal length held, each time at the value fitted before."""
+"""Most rounds of mapping with a fixed focal length, each at the value last fitted."""
 SETTLED = 0.02
-"""Relative change of a focal length under which it is not held at its new value again."""
+"""Relative change of the focal length that counts as converged."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be done."""
+    """Input of the process."""
 
     images: Path
-    """Folder of the photographs."""
     work: Path
-    """Folder for the database and all that is not kept."""
+    """Folder for the database and temporary files."""
     model: Path
-    """Folder for the largest model. It does not exist yet."""
+    """Folder for the largest model; it does not exist yet."""
     photographs: list[Upright]
-    """In the order of their names."""
     threads: int
     wanted: int
     """Fewest photographs in a model that end the search for a focal length."""
     min_points: int
-    """Fewest points in it that do."""
+    """Fewest points in a model that end the search."""
 
     @property
     def database(self) -> Path:
+        """Path of COLMAP's database."""
         return self.work / "database.db"
 
 
 class Teller:
-    """Says how far the work is."""
+    """Reporter of progress as JSON lines."""
 
     def __init__(self, out: IO[str]) -> None:
         self.out = out
 
     @contextmanager
     def phase(self, name: str, steps: int) -> Iterator[None]:
+        """Report the begin and end of a phase."""
         self.say({"begin": name, "steps": steps})
         yield
         self.say({"end": name})
 
     def step(self) -> None:
+        """Report one step."""
         self.say({"step": 1})
 
     def say(self, line: dict[str, Any]) -> None:
+        """Write one line."""
         print(json.dumps(line), file=self.out, flush=True)
 
 
 def main() -> None:
-    """Do the job in the file that the command line names."""
-    teller = Teller(os.fdopen(os.dup(1), "w"))
-    os.dup2(2, 1)  # nothing that COLMAP prints is taken for ours
+    """Run the job in the file that the command line names."""
+    progress = Teller(os.fdopen(os.dup(1), "w"))
+    os.dup2(2, 1)  # keeps output of COLMAP apart from ours
     task = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     photographs = [Upright(**one) for one in task["photographs"]]
     images, work, model = (Path(task[name]) for name in ("images", "work", "model"))
     job = Job(images, work, model, photographs, task["threads"], task["wanted"], task["min_points"])
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(SEED)
-    find_features(job, teller)
-    match(job, pairs_of(job), teller)
-    teller.say({"result": map_all(job, teller)})
+    find_features(job, progress)
+    match(job, pairs_of(job), progress)
+    progress.say({"result": map_all(job, progress)})
 
 
 def find_features(job: Job, teller: Teller) -> None:
-    """SIFT features of all photographs. Those of one size and lens share a camera."""
+    """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
 
-    def camera(one: Upright) -> tuple[int, int, str]:
+    def make_key(one: Upright) -> tuple[int, int, str]:
         return one.width, one.height, one.lens
 
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
     extraction.sift.max_num_features = MAX_FEATURES
-    cameras = {camera(one): one for one in job.photographs}
+    cameras = {make_key(one): one for one in job.photographs}
     numbers = {key: _add_camera(job, one) for key, one in cameras.items()}
     with teller.phase("Finding features", len(job.photographs)):
         for one in job.photographs:
@@ -136,7 +136,9 @@ def find_features(job: Job, teller: Teller) -> None:
                 job.database,
                 job.images,
                 [one.name],
-                reader_options=pycolmap.ImageReaderOptions(existing_camera_id=numbers[camera(one)]),
+                reader_options=pycolmap.ImageReaderOptions(
+                    existing_camera_id=numbers[make_key(one)]
+                ),
                 extraction_options=extraction,
                 device=pycolmap.Device.cpu,
             )
@@ -152,7 +154,7 @@ def _add_camera(job: Job, one: Upright) -> int:
 
 
 def pairs_of(job: Job) -> Pairs:
-    """The photographs to match: neighbours where the names count, and all, or else those alike."""
+    """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
     names = [one.name for one in job.photographs]
     if is_sequence(names):
         return neighbours(len(names)) | alike(likeness(_largest_features(job)))
@@ -162,7 +164,6 @@ def pairs_of(job: Job) -> Pairs:
 
 
 def _largest_features(job: Job) -> list[np.ndarray]:
-    """Of each photograph, those that its likeness to others is decided by."""
     with pycolmap.Database.open(job.database) as database:
         return [_features_of(database, one.name) for one in job.photographs]
 
@@ -174,7 +175,7 @@ def _features_of(database: Any, name: str) -> np.ndarray:
 
 
 def match(job: Job, pairs: Pairs, teller: Teller) -> None:
-    """Match the features of all pairs, and keep what an essential matrix explains."""
+    """Match the features of all pairs and verify them with an essential matrix."""
     matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
@@ -196,12 +197,12 @@ def _batches(pairs: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
 
 @dataclass(frozen=True)
 class Attempt:
-    """Models from one way of treating the focal length."""
+    """Models from one treatment of the focal length."""
 
     models: list[Any]
-    """The largest first; they do not connect."""
+    """Disconnected models, the largest first."""
     was_held: bool = False
-    """True if the focal length was held at first."""
+    """True if the focal length was fixed at first."""
 
     @property
     def quality(self) -> tuple[bool, int, int]:
@@ -216,10 +217,10 @@ def map_all(job: Job, teller: Teller) -> dict[str, Any]:
     """Find cameras and points from the matches, and write the largest model.
 
     Returns:
-        The `registered` photographs of it by the names of their copies, how many each of the
-        `models` has, the largest first, its number of `points` and its mean reprojection `error`
-        in pixels, what is implausible of its lens (`defect`, None where nothing is), and the
-        `focal` length in pixels where it was held at first, else None.
+        Its `registered` photographs by the names of their copies, the sizes of all `models`
+        (largest first), its number of `points`, its mean reprojection `error` in pixels, the
+        `defect` of its lens or None, and the `focal` length in pixels if it was fixed at first,
+        else None.
     """
     attempt = select_attempt(job, teller)
     if not attempt.models:
@@ -238,7 +239,7 @@ def map_all(job: Job, teller: Teller) -> dict[str, Any]:
 
 
 def select_attempt(job: Job, teller: Teller) -> Attempt:
-    """Return the first attempt with as much as is wanted, or else the best of all."""
+    """Return the first attempt that is good enough, or else the best."""
     best = Attempt([])
     for attempt in attempts(job, teller):
         best = max(best, attempt, key=lambda one: one.quality)
@@ -249,15 +250,14 @@ def select_attempt(job: Job, teller: Teller) -> Attempt:
 
 
 def attempts(job: Job, teller: Teller) -> Iterator[Attempt]:
-    """Map with a free focal length, then with it held at each of the plausible values."""
+    """Map with a free focal length, then with each plausible fixed value."""
     yield Attempt(_models(job, teller))
     for focals in focals_to_hold(job):
         yield Attempt(map_held(job, teller, focals), was_held=True)
 
 
 def focals_to_hold(job: Job) -> list[dict[int, float]]:
-    """List focal lengths in pixels by the number of the camera: from EXIF, where all have one, then
-    those of `HELD_FOVS`."""
+    """List fixed focal lengths (pixels) by camera: from EXIF if all have it, then `FIXED_FOVS`."""
     with pycolmap.Database.open(job.database) as database:
         cameras = database.read_all_cameras()
     in_exif = {one.camera_id: one.focal_length for one in cameras if one.has_prior_focal_length}
@@ -272,10 +272,10 @@ def focals_to_hold(job: Job) -> list[dict[int, float]]:
 
 
 def map_held(job: Job, teller: Teller, focals: dict[int, float]) -> list[Any]:
-    """Map with the focal lengths held, fit them to the model, and map again until they settle.
+    """Map with fixed focal lengths, refine them, and repeat until they converge.
 
-    With a wrong focal length the mapper still connects photographs that it fails to connect with
-    a free one, and all of them together tell what it is.
+    With a wrong focal length the mapper still connects photographs that it cannot connect with a
+    free one, and together they determine the right value.
     """
     best = list[Any]()
     for _ in range(MAX_ROUNDS):
@@ -292,7 +292,7 @@ def map_held(job: Job, teller: Teller, focals: dict[int, float]) -> list[Any]:
 
 
 def hold(job: Job, focals: dict[int, float]) -> None:
-    """Write focal lengths in pixels to the database, as known, and no distortion."""
+    """Fix focal lengths (pixels) in the database, without distortion."""
     with pycolmap.Database.open(job.database) as database:
         for camera in database.read_all_cameras():
             known = pycolmap.Camera.create_from_model_name(
@@ -303,13 +303,13 @@ def hold(job: Job, focals: dict[int, float]) -> None:
 
 
 def used_cameras(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
-    """List the cameras that took photographs of the model, that of most photographs first."""
+    """List the cameras of the model, that of most photographs first."""
     numbers = Counter(model.images[i].camera_id for i in model.reg_image_ids())
     return [model.cameras[number] for number, _ in numbers.most_common()]
 
 
 def lens_defect(model: pycolmap.Reconstruction) -> str | None:
-    """Describe the first lens of the model that no camera has; None where all are plausible."""
+    """Describe the first implausible lens of the model; None if all are plausible."""
     return next(filter(None, map(_defect_of, used_cameras(model))), None)
 
 
@@ -329,10 +329,9 @@ def _defect_of(camera: pycolmap.Camera) -> str | None:
 
 
 def parts(models: list[set[int]]) -> list[int]:
-    """How many photographs each of the models has, given by the numbers of their photographs, the
-    largest first.
+    """Count the photographs of each disconnected model, largest first.
 
-    The mapper may begin another model among photographs that it has placed; that is no part.
+    A second model among photographs that are already placed is no part.
     """
     sizes, placed = list[int](), set[int]()
     for model in models:
@@ -343,11 +342,10 @@ def parts(models: list[set[int]]) -> list[int]:
 
 
 def with_principal_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The model with principal points that fit it, where they can be told.
+    """Refine the principal points if there are enough photographs.
 
-    The mapper leaves them in the centres of the images, because few photographs cannot tell one
-    from a turn of the camera; nor can photographs that all look alike, which is why a point far
-    from the centre is not believed.
+    The mapper leaves them at the image centres: few photographs cannot separate them from a
+    rotation, and neither can similar photographs, so the result is rejected if far from the centre.
     """
     numbers = Counter(model.images[i].camera_id for i in model.reg_image_ids())
     if min(numbers.values()) < MIN_FOR_CENTRE:
@@ -357,8 +355,7 @@ def with_principal_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruc
 
 
 def with_fitted_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.Reconstruction:
-    """Adjust a copy of the model with the focal lengths free, and what `options` say besides;
-    return the model itself where that makes a lens implausible."""
+    """Bundle-adjust a copy with free focal lengths; return the input if a lens gets implausible."""
     refined = deepcopy(model)
     adjustment = pycolmap.BundleAdjustmentOptions(print_summary=False, **options)
     pycolmap.bundle_adjustment(refined, adjustment)
@@ -373,9 +370,9 @@ def _is_centred(camera: pycolmap.Camera) -> bool:
 
 
 def _models(job: Job, teller: Teller, is_held: bool = False) -> list[Any]:
-    """All models, the largest first; they do not connect."""
+    """Map the scene into disconnected models, the largest first."""
 
-    def first_pair() -> None:
+    def count_first_pair() -> None:
         teller.step()
         teller.step()
 
@@ -392,7 +389,7 @@ def _models(job: Job, teller: Teller, is_held: bool = False) -> list[Any]:
             job.images,
             job.work,
             options,
-            initial_image_pair_callback=first_pair,
+            initial_image_pair_callback=count_first_pair,
             next_image_callback=teller.step,
         )
     return sorted(found.values(), key=lambda model: -model.num_reg_images())

@@ -1,7 +1,7 @@
-"""Infos of mmdetection3d (version 1.1), for nuScenes and for Waymo in KITTI's layout.
+"""Infos of mmdetection3d 1.1, for nuScenes and for Waymo in KITTI's layout.
 
-A pickle lists samples: the pose of the vehicle, and the image, intrinsics and pose of each camera.
-Samples of one drive that follow each other make a scene.
+A pickle lists samples: the vehicle pose, and image, intrinsics and pose of each camera. Consecutive
+samples of one drive make a scene.
 """
 
 from __future__ import annotations
@@ -30,21 +30,20 @@ from gscompleter.reading import open_file
 ADVICE = "write the infos again with mmdetection3d 1.1"
 FRONT = "CAM_FRONT"
 MAX_GAP = 1.5
-"""Seconds from one sample to the next of a scene; those of nuScenes are half a second apart."""
+"""Largest gap between samples of a scene, in seconds; nuScenes has 0.5."""
 MAX_NUMBER = 1e12
-"""Largest entry of matrices, boxes and speeds."""
 MAX_TIME = 1e12
-"""Of a time in seconds."""
+"""Largest time in seconds."""
 MICROSECONDS = 1e12
-"""Times from here on are told in microseconds."""
+"""Smallest time that is in microseconds."""
 FIXED = frozenset(("traffic_cone", "barrier"))
-"""Things that do not move by themselves."""
+"""Classes that do not move by themselves."""
 MAX_SNIFFED = 4096
-"""Bytes at either end of a pickle that tell whether it is one of infos."""
+"""Bytes at either end of a pickle to detect infos."""
 
 
 def holds_infos(path: Path) -> bool:
-    """Whether `path` is a pickle of infos."""
+    """Check whether `path` is a pickle of infos."""
     if path.suffix != ".pkl" or not os.path.isfile(path):
         return False
     with suppress(InputError), open_file(path) as file:
@@ -55,25 +54,22 @@ def holds_infos(path: Path) -> bool:
 
 
 def open_infos(path: Path) -> Iterator[Photographs]:
-    """The scenes of a pickle of infos, called by their drive and the time they begin at.
+    """Open the scenes of a pickle, named by drive and start time.
 
-    Frames are numbered camera by camera, the front camera first, and by their time. Images are
-    looked for beside the pickle and below it, where the data set has them.
-
-    Raises:
-        InputError: where the file holds no infos, anything but plain values, or no images.
+    Frames are numbered camera by camera, the front camera first, and by time. Images are searched
+    beside the pickle and below it.
     """
     content = load_plain(path)
     samples = content.get("data_list") if isinstance(content, dict) else None
     if not isinstance(samples, list) or not samples:
         raise InputError(f"{quoted(path)} holds no infos with a `data_list`; {ADVICE}.")
     kinds = _kinds(content.get("metainfo"))
-    told = sorted((_Sample(path, kinds, *_told(s, path)) for s in samples), key=_Sample.order)
-    return (_scene(path, scene) for scene in _scenes(told))
+    ordered = sorted((_Sample(path, kinds, *_told(s, path)) for s in samples), key=_Sample.order)
+    return (_scene(path, scene) for scene in _scenes(ordered))
 
 
 class _Sample:
-    """What the vehicle recorded at one time."""
+    """Record of the vehicle at one time."""
 
     def __init__(
         self,
@@ -96,12 +92,11 @@ class _Sample:
 
     @property
     def vehicle(self) -> Float[np.ndarray, "4 4"]:
-        """Its pose in the world."""
         return _numbers(self.content, "ego2global", (4, 4), self.title)
 
     @property
     def vehicle_from_laser(self) -> Float[np.ndarray, "4 4"]:
-        """The pose of the laser; that of Waymo's infos is the vehicle itself."""
+        """Pose of the laser; identity for Waymo infos."""
         lidar = self.content.get("lidar_points")
         if not isinstance(lidar, dict) or "lidar2ego" not in lidar:
             return np.eye(4)
@@ -109,7 +104,7 @@ class _Sample:
 
 
 def _told(sample: Any, path: Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str]:
-    """A sample, its images by camera, and what errors call it."""
+    """Return a sample, its images by camera, and its name in errors."""
     title = f"a sample of {quoted(path)}"
     images = sample.get("images") if isinstance(sample, dict) else None
     if not isinstance(images, dict):
@@ -130,7 +125,7 @@ def _is_posed(image: Any) -> bool:
 
 
 def _scenes(samples: list[_Sample]) -> Iterator[list[_Sample]]:
-    """Samples of one drive that follow each other."""
+    """Group consecutive samples of one drive."""
     scene = samples[:1]
     for before, after in pairwise(samples):
         if after.drive != before.drive or after.time - before.time > MAX_GAP:
@@ -154,9 +149,9 @@ def _frame(sample: _Sample, camera: str) -> Frame:
     file = text_of(image, "img_path", title)
     assert file is not None
     laser_from_camera = _inverse(_numbers(image, "lidar2cam", (4, 4), title))
-    with np.errstate(over="ignore", invalid="ignore"):  # which leaves a defect of the pose
-        # By way of the laser: between its time and the camera's the vehicle has moved, and
-        # lidar2cam knows of it.
+    with np.errstate(over="ignore", invalid="ignore"):  # leaves a defect of the pose
+        # Through the laser frame: lidar2cam includes the vehicle's motion between the
+        # times of laser and camera.
         c2w = sample.vehicle @ sample.vehicle_from_laser @ laser_from_camera
     return Frame(
         f"{camera}/{os.path.basename(file)}",
@@ -170,7 +165,7 @@ def _frame(sample: _Sample, camera: str) -> Frame:
 
 
 def _inverse(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The inverse of a transform; NaN where it has none, for its defect to be found in it."""
+    """Invert a transform; NaN if singular, which counts as a defect of the pose."""
     try:
         return np.linalg.inv(matrix)
     except np.linalg.LinAlgError:
@@ -193,7 +188,7 @@ def _intrinsics(image: Mapping[str, Any], title: str) -> Intrinsics:
 def _numbers(
     entry: Mapping[str, Any], key: str, shape: tuple[int, ...], title: str
 ) -> Float[np.ndarray, "*n"]:
-    """Read the nested list at `key`, of numbers that can be multiplied; NaN may be among them."""
+    """Read the nested list at `key`; checks magnitude, allows NaN."""
     array = array_of(entry, key, shape, title)
     if (np.abs(array) > MAX_NUMBER).any():
         raise InputError(f"The `{key}` of {title} holds numbers beyond {MAX_NUMBER:g}; {ADVICE}.")
@@ -201,7 +196,7 @@ def _numbers(
 
 
 def _place(folder: Path, file: str, camera: str) -> Path:
-    """Where an image lies: beside the pickle, or where the data set keeps those of its camera."""
+    """Find an image beside the pickle, or in the data set's folder of its camera."""
     order = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_SIDE_LEFT", "CAM_SIDE_RIGHT")
     numbered = f"image_{order.index(camera)}" if camera in order else camera
     places = [folder / file, folder / "samples" / camera / file, folder / camera / file]
@@ -210,14 +205,13 @@ def _place(folder: Path, file: str, camera: str) -> Path:
 
 
 def _kinds(metainfo: Any) -> dict[int, str]:
-    """The names of things by their labels."""
     kinds = metainfo.get("categories") if isinstance(metainfo, dict) else None
     pairs = kinds.items() if isinstance(kinds, dict) else ()
     return {n: kind for kind, n in pairs if isinstance(n, int) and isinstance(kind, str)}
 
 
 def _tells_speeds(sample: _Sample) -> bool:
-    """Whether things around the vehicle have speeds, as those of nuScenes do."""
+    """Check whether objects have velocities, as in nuScenes."""
     things = sample.content.get("instances")
     return isinstance(things, list) and any(
         isinstance(thing, dict) and "velocity" in thing for thing in things
@@ -225,7 +219,7 @@ def _tells_speeds(sample: _Sample) -> bool:
 
 
 def _boxes(sample: _Sample) -> tuple[Box, ...]:
-    """What may move around the vehicle. Its boxes are told from the laser, by their centres."""
+    """Read the boxes of objects that may move; in the infos they are in the laser frame."""
     title = f"a box in {quoted(sample.file)}"
     world = sample.vehicle @ sample.vehicle_from_laser
     things = [thing for thing in sample.content["instances"] if isinstance(thing, dict)]

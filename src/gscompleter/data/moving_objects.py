@@ -1,4 +1,4 @@
-"""Boxes around things that move, and what of an image they cover."""
+"""Boxes around moving objects, and the pixels that they cover."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ from jaxtyping import Bool, Float
 from gscompleter.types import Camera
 
 MIN_SPEED = 0.5
-"""Metres a second from which a thing counts as moving."""
+"""Smallest speed of a moving object, in metres per second."""
 MARGIN = 0.1
-"""By how much a box is widened, in its sides: shadows, mirrors, and the time since it was drawn."""
+"""Relative enlargement of a box, for shadows, mirrors and time offsets."""
 NEAREST = 0.1
-"""z-depth at which a box is cut off, in metres."""
+"""z-depth at which a box is clipped, in metres."""
 MAX_PIXELS = 1e5
-"""Farthest corner of a projected box, in pixels from the image's: rasterisers count in integers."""
+"""Largest pixel coordinate of a projected corner; rasterisers use integers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A box around one thing."""
+    """A box around one object."""
 
     pose: Float[np.ndarray, "4 4"]
-    """Its centre and the directions of its sides, in the world frame."""
+    """Centre and axes, in the world frame."""
     sides: tuple[float, float, float]
-    """Its lengths along its own axes, in metres."""
+    """Side lengths along its own axes, in metres."""
     speed: float | None
-    """In metres a second; None where it is not known."""
+    """Speed in metres per second, or None if unknown."""
 
     @property
     def moves(self) -> bool:
-        """Whether the thing moves. One whose speed is not known may, so it counts."""
+        """True if the object moves or its speed is unknown."""
         return self.speed is None or not self.speed < MIN_SPEED
 
     def corners(self) -> Float[np.ndarray, "8 3"]:
-        """Its corners in the world frame, once it is widened."""
+        """Compute the corners of the enlarged box in the world frame."""
         signs = np.array(list(product((-0.5, 0.5), repeat=3)))
         local = signs * np.array(self.sides) * (1 + MARGIN)
         return local @ self.pose[:3, :3].T + self.pose[:3, 3]
 
 
 def upright(center: Float[np.ndarray, "3"], heading: float) -> Float[np.ndarray, "4 4"]:
-    """The pose of a box that stands upright (z up), turned by `heading` radians."""
+    """Build the pose of an upright box (z up), rotated by `heading` radians."""
     pose = np.eye(4)
     cos, sin = np.cos(heading), np.sin(heading)
     pose[:2, :2] = [[cos, -sin], [sin, cos]]
@@ -57,12 +57,9 @@ def upright(center: Float[np.ndarray, "3"], heading: float) -> Float[np.ndarray,
 def covered(
     boxes: Iterable[Box], camera: Camera, origin: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Where moving boxes lie before a camera; what stands before them is covered as well.
+    """Mask pixels covered by moving boxes, including occluders in front of them.
 
-    Args:
-        boxes: In the world frame of the files.
-        camera: Told from `origin`.
-        origin: Where its coordinates are counted from.
+    `boxes` are in the world frame of the files, `camera` in coordinates relative to `origin`.
     """
     mask = np.zeros((camera.height, camera.width), np.uint8)
     for box in boxes:
@@ -73,20 +70,20 @@ def covered(
 
 
 def _outline(corners: Float[np.ndarray, "8 3"], camera: Camera) -> np.ndarray | None:
-    """The convex outline of a box in the image, in whole pixels; None where it lies behind."""
+    """Compute the convex outline of a box in whole pixels; None if it is behind the camera."""
     c2w, K = (matrix.double().cpu().numpy() for matrix in (camera.c2w, camera.K))
     local = (corners - c2w[:3, 3]) @ c2w[:3, :3]
     if not np.isfinite(local).all() or local[:, 2].max() <= NEAREST:
         return None
     shown = _before(local)
     pixels = (shown @ K.T)[:, :2] / shown[:, 2:]
-    # The centre of the first pixel is (0, 0) here.
+    # OpenCV puts the centre of the first pixel at (0, 0).
     pixels = np.clip(pixels - 0.5, -MAX_PIXELS, MAX_PIXELS)
     return cv2.convexHull(np.rint(pixels).astype(np.int32))
 
 
 def _before(corners: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "n 3"]:
-    """The corners of the part of a box, in camera axes, that is farther away than `NEAREST`."""
+    """Clip a box (camera axes) at `NEAREST`."""
     kept = [corner for corner in corners if corner[2] > NEAREST]
     for a, b in combinations(corners, 2):
         if (a[2] > NEAREST) != (b[2] > NEAREST):

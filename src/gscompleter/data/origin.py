@@ -1,7 +1,7 @@
-"""A local origin for scenes whose coordinates are large, as those of maps are.
+"""A local origin for scenes with large coordinates, such as those of maps.
 
-At 5,000,000 m float32 has steps of half a metre, and a stereo baseline is lost in them. Poses are
-read in float64, so that the origin can be moved before anything is rounded.
+At 5,000,000 m float32 has steps of half a metre, which hides a stereo baseline. Poses are read in
+float64, so the origin can move before rounding.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from gscompleter.errors import InputError
 from gscompleter.types import Camera, Gaussians
 
 MAX_REMOTENESS = 1e3
-"""Coordinates this many times as large as the cameras' spread are told from a local origin: of
-the seven digits of float32, stereo needs four."""
+"""Ratio of coordinates to camera spread above which a local origin is used."""
 MAX_STEP = 1e-3
-"""Coarsest step of a scene's coordinates, in distances between its cameras."""
+"""Coarsest float32 step of coordinates, relative to the camera spread."""
 
 
 def local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "3"]:
-    """Where coordinates are counted from: zero, or for remote cameras the first one's centre."""
+    """Choose the coordinate origin: zero, or the first camera centre for remote cameras."""
     if not poses:
         return np.zeros(3)
     centers = np.stack([pose[:3, 3] for pose in poses])
@@ -34,17 +33,14 @@ def local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray,
 
 
 def frame_from_photographs(origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """The transform from the photographs' own frame to the one that `origin` is the zero of."""
+    """Build the transform from the photographs' frame to the frame with zero at `origin`."""
     transform = np.eye(4)
     transform[:3, 3] -= origin
     return transform
 
 
 def origin_of(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Where a scene's coordinates are to be told from beside photographs told from `origin`.
-
-    From there too, if the scene lies there; from zero, if it is in a frame of its own.
-    """
+    """Choose a scene's origin: `origin` if the scene lies near it, else zero."""
     if len(scene) == 0 or not origin.any():
         return origin
     middle = scene.means.median(dim=0).values.double().cpu().numpy()
@@ -55,11 +51,7 @@ def origin_of(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Float[np.ndar
 def told_from(
     origin: Float[np.ndarray, "3"], scene: Gaussians, cameras: Sequence[Camera]
 ) -> Gaussians:
-    """A scene in the photographs' own frame, told from `origin` (scene units) as `cameras` are.
-
-    Raises:
-        InputError: where float32 is too coarse so far from zero for what the cameras show.
-    """
+    """Express a scene relative to `origin` (scene units); refuses too coarse float32 steps."""
     if not origin.any():
         return scene
     step = float(np.spacing(np.float32(np.abs(origin).max())))

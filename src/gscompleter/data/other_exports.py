@@ -1,4 +1,4 @@
-"""Exports of other programs that hold cameras in no format of ours, and which to choose instead."""
+"""Camera exports of other programs that are not supported, and what to export instead."""
 
 from __future__ import annotations
 
@@ -9,31 +9,23 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.reading import read_head
 
 HEAD = 4096
-"""Bytes of a file that tell which program wrote it."""
 INSTEAD = {
     "Metashape": "export its cameras as COLMAP, which Metashape does since 2.2",
     "RealityScan": "export its registration as COLMAP",
     "Polycam": "turn it into nerfstudio's transforms.json by ns-process-data polycam",
 }
-"""What to do with the cameras of each program."""
 PROJECTS = {
     ".psx": "Metashape",
     ".psz": "Metashape",
     ".rspj": "RealityScan",
     ".rcproj": "RealityScan",
 }
-"""Programs by the endings of their projects."""
 
 POLYCAM_CAMERAS = ("cameras", "corrected_cameras")
-"""Folders with a JSON file for each keyframe."""
 
 
 def refuse_other_exports(path: Path) -> None:
-    """Refuse a file or folder with the cameras of a program that are not read.
-
-    Raises:
-        InputError: where it is one; it says which export to choose.
-    """
+    """Raise an InputError with advice if `path` holds cameras of an unsupported program."""
     files = sorted(path.iterdir()) if os.path.isdir(path) else [path]
     found = "Polycam" if _is_polycam(path) else None
     for file in files:
@@ -41,13 +33,12 @@ def refuse_other_exports(path: Path) -> None:
             found, path = _program_of(file), file
     if found is not None:
         raise InputError(
-            f"{quoted(path)} holds cameras as {found} keeps them, which are not read; "
+            f"{quoted(path)} holds cameras of {found}, which cannot be read; "
             f"{INSTEAD[found]}, or name a folder of the photographs alone."
         )
 
 
 def _program_of(file: Path) -> str | None:
-    """The program that a file of cameras is of; None where it is of none that is known."""
     ending = file.suffix.lower()
     if ending in (".xml", ".csv"):
         head = _head(file)
@@ -63,7 +54,7 @@ def _head(file: Path) -> bytes:
 
 
 def _is_polycam(path: Path) -> bool:
-    """Whether it is a folder of Polycam's raw data, or that of the keyframes in it."""
+    """Check for Polycam's raw data, or the keyframes in it."""
     homes = (path / home / kind for home in ("", "keyframes") for kind in POLYCAM_CAMERAS)
     found = (sorted(home.glob("*.json"))[:1] for home in homes if os.path.isdir(home))
     cameras = (file for files in found for file in files)

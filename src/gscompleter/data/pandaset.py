@@ -1,7 +1,7 @@
-"""Sequences of PandaSet: a folder for each camera with its images, intrinsics and poses.
+"""PandaSet sequences: a folder per camera with images, intrinsics and poses.
 
-Poses are camera-to-world in OpenCV axes, told as a place and a quaternion. Point clouds and boxes
-are pickles of pandas, which can run programs, and are left out.
+Poses are camera-to-world in OpenCV axes, as position and quaternion. Point clouds and boxes are
+pandas pickles, which can run code, and are not read.
 """
 
 from __future__ import annotations
@@ -28,23 +28,20 @@ FRONT = "front_camera"
 INTRINSICS, POSES = "intrinsics.json", "poses.json"
 ADVICE = "copy the sequence again"
 NO_DEPTH = (
-    "The point clouds and boxes of PandaSet are pickles of pandas, which can run programs; they "
-    "are not read."
+    "The point clouds and boxes of PandaSet are not read, because they are pandas pickles, which "
+    "can run any code."
 )
 
 
 def holds_pandaset(path: Path) -> bool:
-    """Whether `path` is the folder of a sequence."""
+    """Check whether `path` is the folder of a sequence."""
     return os.path.isfile(path / "camera" / FRONT / POSES)
 
 
 def open_pandaset(path: Path) -> Iterator[Photographs]:
-    """The photographs of a sequence, called by its folder.
+    """Open the photographs of a sequence; its folder names it.
 
-    Frames are numbered camera by camera, the front camera first, and by their time.
-
-    Raises:
-        InputError: where poses or intrinsics are missing or damaged.
+    Frames are numbered camera by camera, the front camera first, and by time.
     """
     folders = sorted((path / "camera").iterdir(), key=lambda f: (f.name != FRONT, f.name))
     cameras = [folder for folder in folders if os.path.isfile(folder / POSES)]
@@ -56,7 +53,6 @@ def open_pandaset(path: Path) -> Iterator[Photographs]:
 
 
 def _frames(folder: Path) -> list[Frame]:
-    """The photographs of one camera."""
     poses = read_json(folder / POSES, ADVICE)
     if not isinstance(poses, list):
         raise InputError(f"{quoted(folder / POSES)} is no list of poses; {ADVICE}.")
@@ -72,14 +68,14 @@ def _frame(folder: Path, number: int, pose: Any, intrinsics: Intrinsics) -> Fram
 
 
 def _pose(pose: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    def numbers(part: str, keys: str) -> list[float]:
+    def read_numbers(part: str, keys: str) -> list[float]:
         entry = pose.get(part) if isinstance(pose, dict) else None
         entry = entry if isinstance(entry, dict) else {}
         return [number_of(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
 
     c2w = np.eye(4)
-    c2w[:3, :3] = rotation_of(numbers("heading", "wxyz"))
-    c2w[:3, 3] = numbers("position", "xyz")
+    c2w[:3, :3] = rotation_of(read_numbers("heading", "wxyz"))
+    c2w[:3, 3] = read_numbers("position", "xyz")
     return c2w
 
 

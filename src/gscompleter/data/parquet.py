@@ -15,13 +15,9 @@ ADVICE = "download it again"
 def read_columns(
     path: Path, columns: Sequence[str], where: Mapping[str, object] | None = None
 ) -> dict[str, list[Any]]:
-    """Columns of a table, with the rows in which those of `where` have these values.
+    """Read columns of a table, only rows where the columns of `where` have these values.
 
-    Lists of numbers come as arrays; what is null is None. Nothing else of the file is read.
-
-    Raises:
-        InputError: where pyarrow is not installed, or the file is missing, damaged or lacks a
-            column.
+    Lists of numbers become arrays; null becomes None.
     """
     try:
         import pyarrow
@@ -41,8 +37,10 @@ def read_columns(
             keep = same if keep is None else keep & same
         found = table.to_table(list(columns), filter=keep, use_threads=False)
     except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
-        said = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"{quoted(path)} cannot be read ({quoted(said[0])}); {ADVICE}.") from error
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(
+            f"{quoted(path)} cannot be read ({quoted(lines[0])}); {ADVICE}."
+        ) from error
     return {column: [_plain(value) for value in found.column(column)] for column in columns}
 
 
@@ -53,7 +51,7 @@ def _check_columns(path: Path, needed: Sequence[str], there: Sequence[str]) -> N
 
 
 def _plain(scalar: Any) -> Any:
-    """A value as Python has it, and a list of numbers as an array."""
+    """Convert to a Python value, and a list of numbers to an array."""
     if not scalar.is_valid:
         return None
     values = getattr(scalar, "values", None)

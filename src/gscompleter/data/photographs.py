@@ -1,8 +1,7 @@
-"""Posed photographs, whatever format they lie in.
+"""Posed photographs, independent of their format.
 
-A format (one file each, listed in `formats.py`) reads cameras and says where the images lie. All
-else is here: images are read when they are asked for, lens distortion is removed, and image and
-intrinsics are brought to a resolution together.
+A format (one module each, listed in `formats.py`) reads cameras and locates images. This module
+reads images on demand, removes lens distortion, and resizes image and intrinsics together.
 """
 
 from __future__ import annotations
@@ -31,119 +30,114 @@ from gscompleter.io.image import as_image, read_depth, read_pixels
 from gscompleter.types import Camera, View
 
 MAX_FOV = 100.0
-"""Widest opening angle of a camera that benchmarks keep, in degrees."""
+"""Largest field of view that benchmarks keep, in degrees."""
 MAX_TRANSLATION = 1e3
-"""Farthest a camera may be from the origin along an axis for benchmarks, in scene units. Of a road
-it is the first camera that is the origin."""
+"""Largest camera coordinate that benchmarks keep, in scene units from the origin."""
 
 MAX_FROM_ZERO = 100.0
-"""Farthest that a vehicle may be from the zero of its map along an axis, in metres, before a local
-origin takes its place."""
+"""Largest vehicle coordinate without a local origin, in metres."""
 
 
 @runtime_checkable
 class PosedPhotographs(Protocol):
     """A named sequence of photographs with known cameras, numbered from 0.
 
-    Raises:
-        InputError: by its methods, where a frame does not exist, cannot be read or is impossible.
+    Its methods raise an InputError if a frame does not exist, cannot be read or is impossible.
     """
 
     @property
     def name(self) -> str:
-        """What evaluation indices call it."""
+        """Name in evaluation indices."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each frame is called. Frames are numbered in this order."""
+        """Names of the frames, in their order."""
 
     @property
     def origin(self) -> Float[np.ndarray, "3"]:
-        """Where the cameras' coordinates are counted from, in those of the files (float64)."""
+        """Origin of the cameras' coordinates, in those of the files (float64)."""
 
     def __len__(self) -> int:
-        """How many frames there are."""
+        """Count the frames."""
 
     def has_photograph(self, frame: int) -> bool:
-        """Whether the photograph of a frame is there, or its camera only."""
+        """Check whether the photograph of a frame exists."""
 
     def camera(self, frame: int, resolution: Resolution = None) -> Camera:
-        """The camera of a frame, as `views` has it."""
+        """Return the camera of a frame, as in `views`."""
 
     def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
-        """The photographs of `frames`, with depth where there is some. What shows the vehicle that
-        carries the camera is to be ignored, where frames know it (`ego_vehicle.py`).
+        """Load photographs with cameras, and depth if available.
 
-        Lens distortion is removed: the undistorted image has the size of the photograph and no
-        empty pixel, and the intrinsics follow (`lens.undistorted` says how).
+        Undistorted images keep the size of the photograph and have no empty pixels (see
+        `lens.undistort_pinhole`). `ignore_mask` marks the vehicle that carries the camera, if it
+        is detected.
 
-        Images are resized to cover `resolution` (height and width in pixels), then their centre
-        is cropped. Of one number, it is the most pixels that their longer side keeps. They keep
-        their own size if it is left out.
+        Args:
+            frames: Frame numbers.
+            resolution: Height and width to cover and crop to, or the most pixels of the longer
+                side; None keeps the size.
         """
 
     def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
-        """True where the photograph of a frame is to be ignored; None where nothing is.
-
-        That is where its mask is black, and where a box of something that moves lies.
-        """
+        """Return True where the photograph's mask is black or a moving box lies, or None."""
 
     def points(self) -> Float[Tensor, "n 3"] | None:
-        """Points on the surfaces of the scene, told from `origin`; None where none are known.
-
-        Raises:
-            InputError: where the file that should hold them is damaged.
-        """
+        """Load points on the scene's surfaces relative to `origin`; None if unknown."""
 
     def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
-        """Why benchmarks leave the photographs out; None where they keep them.
+        """Explain why benchmarks skip the photographs, or return None.
 
-        In data sets of one `size` (height and width) every photograph must be stored in it.
+        `size` is the height and width that every stored photograph must have.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """`PosedPhotographs` as every format here has them: a list of frames."""
+    """`PosedPhotographs` as a list of frames, for all formats."""
 
     name: str
     title: str
-    """What error messages call it."""
+    """Name in error messages."""
     frames: tuple[Frame, ...]
     origin: Float[np.ndarray, "3"]
     near: float | None = None
-    """Smallest z-depth of the scene, in scene units, where known."""
+    """Smallest z-depth of the scene, in scene units, or None if unknown."""
     far: float | None = None
-    """Largest z-depth of the scene, in scene units, where known."""
+    """Largest z-depth of the scene, in scene units, or None if unknown."""
     notes: tuple[str, ...] = ()
-    """Sentences about what was chosen or left out when they were opened."""
+    """Sentences about choices made while opening."""
     format: str | None = None
-    """Name of the format they were opened as, where one was."""
+    """Name of the format, if known."""
     sparse: Callable[[], Float[np.ndarray, "n 3"]] | None = None
-    """Reads points on the scene's surfaces, in the files' own frame, where there are some."""
+    """Reads points on the scene's surfaces, in the files' frame."""
     front: str | None = None
-    """The camera that looks ahead, of a vehicle with several; None elsewhere."""
+    """Name of the front camera of a vehicle with several cameras."""
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the frames, in their order."""
         return tuple(frame.name for frame in self.frames)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def has_photograph(self, frame: int) -> bool:
+        """Check whether the photograph of a frame exists."""
         return self.frame(frame).has_photograph()
 
     def camera(self, frame: int, resolution: Resolution = None) -> Camera:
-        """Its photograph need not exist where the file says how large it is."""
+        """Return the camera of a frame, even without its photograph if the file gives the size."""
         found = self.frame(frame)
         return self._camera(found, found.size(), resolution)
 
     def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
+        """Load photographs with cameras, and depth if available."""
         chosen = [self.frame(number) for number in frames]
         return [self._view(frame, n, resolution) for n, frame in zip(frames, chosen, strict=True)]
 
     def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
+        """Return True where the photograph's mask is black or a moving box lies, or None."""
         found = self.frame(frame)
         masks = []
         if found.mask is not None:
@@ -155,20 +149,22 @@ class Photographs:
         return torch.from_numpy(np.logical_or.reduce(masks)) if masks else None
 
     def points(self) -> Float[Tensor, "n 3"] | None:
+        """Load points on the scene's surfaces relative to `origin`; None if unknown."""
         if self.sparse is None:
             return None
         return torch.from_numpy(self.sparse() - self.origin).float()
 
     def with_ego_vehicle(self) -> Photographs:
-        """Return the same, the vehicle that carries the camera being a part of the scene."""
+        """Return a copy that keeps the vehicle that carries the camera in the scene."""
         return replace(self, frames=tuple(replace(f, vehicle=None) for f in self.frames))
 
     @property
     def has_masks(self) -> bool:
-        """Whether something is told of what is to be ignored."""
+        """True if some frame has a mask or boxes."""
         return any(frame.mask is not None or frame.boxes is not None for frame in self.frames)
 
     def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
+        """Explain why benchmarks skip the photographs; None if they are kept."""
         for number, frame in enumerate(self.frames):
             reason = _oddity(frame, self.origin) or (
                 None if size is None else _size_to_skip(frame, size)
@@ -178,7 +174,7 @@ class Photographs:
         return None
 
     def frame(self, number: int) -> Frame:
-        """The frame of that number."""
+        """Return the frame of that number."""
         if not 0 <= number < len(self):
             raise InputError(
                 f"There is no frame {number} in {self.title}, whose frames are numbered 0 to "
@@ -190,7 +186,7 @@ class Photographs:
         _, pinhole = frame.pinholes(*size)
         final = framing(*size, resolution).camera(pinhole)
         c2w = frame.c2w.copy()
-        c2w[:3, 3] -= self.origin  # in float64 still
+        c2w[:3, 3] -= self.origin  # before rounding to float32
         pose = torch.from_numpy(c2w).float()
         return Camera(pose, final.K, final.width, final.height, self.near, self.far)
 
@@ -215,11 +211,7 @@ class Photographs:
 def without_masked(
     views: Sequence[View], photographs: PosedPhotographs, resolution: Resolution = None
 ) -> list[View]:
-    """Views of photographs at a resolution, that are to be ignored where they are masked.
-
-    Raises:
-        InputError: where nothing is left of one.
-    """
+    """Mark masked pixels of views as ignored; refuses views without any other pixel."""
     found = []
     for view in views:
         assert view.frame is not None
@@ -237,7 +229,7 @@ def without_masked(
 def photographs_of(
     name: str, title: str, frames: Sequence[Frame], front: str | None = None
 ) -> Photographs:
-    """Photographs told from zero, or where that is too far away, from a local origin."""
+    """Build photographs, with a local origin if the cameras are far from zero."""
     valid = [frame.c2w for frame in frames if pose_defect(frame.c2w) is None]
     return Photographs(name, title, tuple(frames), local_origin(valid), front=front)
 
@@ -245,8 +237,7 @@ def photographs_of(
 def along_a_road(
     name: str, title: str, frames: Sequence[Frame], front: str | None = None
 ) -> Photographs:
-    """Photographs of a vehicle on a map. Maps are kilometres wide: far from their zero, coordinates
-    are told from the first camera."""
+    """Build the photographs of a vehicle, with the first camera as origin if far from zero."""
     valid = (frame.c2w[:3, 3] for frame in frames if pose_defect(frame.c2w) is None)
     first = next(valid, np.zeros(3))
     origin = first.copy() if np.abs(first).max() > MAX_FROM_ZERO else np.zeros(3)
@@ -259,13 +250,10 @@ def fitted(
     size: tuple[int, int],
     resolution: Resolution,
 ) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """The photograph of a frame without lens distortion and at a resolution.
+    """Undistort and resize the photograph of a frame, or a map [h, w] of depth or mask values.
 
-    Maps [h, w] of depth or of what is ignored are brought to its `size` (width, height) first.
-    Colours (uint8, [h, w, 3]) are blended; the values of maps never are.
-
-    Raises:
-        InputError: where the camera is impossible.
+    Maps are resized to `size` (width, height) first. Colours (uint8, [h, w, 3]) are interpolated,
+    values of maps never.
     """
     colours = pixels.ndim == 3
     if not colours:
@@ -279,7 +267,7 @@ def fitted(
 
 
 def _oddity(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
-    """What makes benchmarks leave a frame's clip out; None where they keep it."""
+    """Explain why benchmarks skip a frame; None if they keep it."""
     size = frame.intrinsics.size or frame.size()
     defect = frame.defect(*size)
     if defect is not None:
@@ -294,7 +282,7 @@ def _oddity(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
 
 
 def _size_to_skip(frame: Frame, needed: tuple[int, int]) -> str | None:
-    """Why the stored photograph is not `needed` (height, width); None if it is."""
+    """Explain why the stored photograph is not of size `needed` (height, width); None if it is."""
     found = frame.stored_size()
     if found is None:
         return "its image is missing"

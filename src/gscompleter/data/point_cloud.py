@@ -1,4 +1,4 @@
-"""The points of a PLY file: what structure from motion found of a scene's surfaces."""
+"""Point clouds in PLY files, from structure from motion."""
 
 from __future__ import annotations
 
@@ -15,11 +15,7 @@ AXES = ("x", "y", "z")
 
 
 def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:
-    """The vertices of a PLY file, in scene units.
-
-    Raises:
-        InputError: where it cannot be read, or is no PLY file with points.
-    """
+    """Read the vertices of a PLY file, in scene units."""
     try:
         with open_file(path) as file:
             file_format, elements = read_header(file, path)

@@ -1,7 +1,4 @@
-"""Poses in float64, and what makes one invalid.
-
-Poses are camera-to-world transforms in OpenCV axes.
-"""
+"""Camera-to-world poses in OpenCV axes and float64, and their validation."""
 
 from __future__ import annotations
 
@@ -14,11 +11,11 @@ from gscompleter.data.limits import MAX_COORDINATE
 from gscompleter.types import MAX_RIGID_ERROR
 
 FLOAT_NOISE = 1e-6
-"""Rotations this close to exact are taken as they are."""
+"""Largest deviation from a rotation that is kept as it is."""
 
 
 def pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
-    """What makes a pose invalid; None for a rigid transform within the limits."""
+    """Describe why a pose is invalid; None for a rigid transform within the limits."""
     if not np.isfinite(pose).all():
         return "its pose holds NaN or infinity"
     if np.abs(pose).max() > MAX_COORDINATE:
@@ -33,7 +30,7 @@ def pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
 
 
 def made_rigid(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """A valid pose with the nearest rotation, unless it is exact up to `FLOAT_NOISE`."""
+    """Replace the rotation by the nearest exact one, unless it is within `FLOAT_NOISE`."""
     rotation = pose[:3, :3]
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > FLOAT_NOISE:
         u, _, v = np.linalg.svd(rotation)
@@ -44,15 +41,12 @@ def made_rigid(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def c2w_of(viewmat: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The inverse of a world-to-camera transform.
-
-    An invalid one may have none. It stays as it is, for its defect to be found in it.
-    """
+    """Invert a world-to-camera transform; an invalid one stays, so its defect is found later."""
     return viewmat if pose_defect(viewmat) is not None else np.linalg.inv(viewmat)
 
 
 def rotation_of(quaternion: Sequence[float]) -> Float[np.ndarray, "3 3"]:
-    """The rotation of a quaternion of any length, real part first; NaN where it has none."""
+    """Compute the rotation of a quaternion (real part first, any length); NaN if it is zero."""
     q = np.array(quaternion, dtype=np.float64)
     with np.errstate(all="ignore"):
         q = q / np.abs(q).max()

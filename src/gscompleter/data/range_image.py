@@ -1,7 +1,7 @@
-"""Range images: what a turning laser measured, a row a beam and a column a direction.
+"""Range images of a rotating laser: one row per beam, one column per direction.
 
-The first row is the highest beam. Columns begin behind the laser and turn clockwise, as seen from
-above, in the axes of the vehicle (x forward, y left, z up).
+The first row is the highest beam. Columns begin behind the laser and turn clockwise as seen from
+above, in vehicle axes (x forward, y left, z up).
 """
 
 from __future__ import annotations
@@ -13,23 +13,16 @@ from jaxtyping import Float
 def inclinations_of(
     values: Float[np.ndarray, "h"] | None, low: float, high: float, height: int
 ) -> Float[np.ndarray, "h"]:
-    """The elevation of each row in radians, the highest first.
+    """Compute the elevation of each row in radians, highest first.
 
-    Args:
-        values: Elevations in rising order; None where they are even from `low` to `high`.
-        low: Lower end of the lowest beam, in radians.
-        high: Upper end of the highest one.
-        height: Rows of the range image.
+    `values` are ascending, or None if uniform between the beam edges `low` and `high`.
     """
     even = low + (np.arange(height) + 0.5) / height * (high - low)
     return (even if values is None else values)[::-1]
 
 
 def azimuths_of(width: int, extrinsic: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "w"]:
-    """The direction of each column in radians, in the axes of the laser.
-
-    The middle column looks along the vehicle: the yaw of the laser is taken off.
-    """
+    """Compute the direction of each column in radians, in laser axes; the middle points ahead."""
     yaw = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
     return np.pi * (1 - 2 * (np.arange(width) + 0.5) / width) - yaw
 
@@ -39,13 +32,7 @@ def points_of(
     inclinations: Float[np.ndarray, "h"],
     extrinsic: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "h w 3"]:
-    """The measured points in the frame of the vehicle, in metres.
-
-    Args:
-        ranges: Distances from the laser in metres.
-        inclinations: As `inclinations_of` has them.
-        extrinsic: The pose of the laser on the vehicle.
-    """
+    """Compute the measured points (metres) in the vehicle frame; `extrinsic` is the laser pose."""
     elevation = inclinations[:, None]
     azimuth = azimuths_of(ranges.shape[1], extrinsic)[None]
     level = np.cos(elevation)
@@ -57,12 +44,12 @@ def points_of(
 def moved(
     points: Float[np.ndarray, "*n 3"], pose: Float[np.ndarray, "*n 4 4"] | Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "*n 3"]:
-    """Points in the frame that `pose` stands in, all by one pose or each by its own."""
+    """Transform points from the local frame of `pose`, one for all or one per point."""
     return (pose[..., :3, :3] @ points[..., None])[..., 0] + pose[..., :3, 3]
 
 
 def poses_of(angles_and_places: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 4 4"]:
-    """Poses told as roll, pitch, yaw (radians; rolled first, then pitched, then yawed), x, y, z."""
+    """Build poses from roll, pitch, yaw (radians; rolled first, yawed last) and x, y, z."""
     (sr, sp, sy), (cr, cp, cy) = (
         np.moveaxis(turn(angles_and_places[..., :3]), -1, 0) for turn in (np.sin, np.cos)
     )

@@ -1,4 +1,4 @@
-"""RealEstate10K camera files, and cameras as they and pixelSplat's chunks hold them."""
+"""RealEstate10K camera files, and the camera rows they share with pixelSplat's chunks."""
 
 from __future__ import annotations
 
@@ -18,33 +18,24 @@ from gscompleter.reading import read_head, read_lines
 
 
 def holds_camera_files(path: Path) -> bool:
-    """Whether `path` is a RealEstate10K camera file or a folder with some."""
+    """Check whether `path` is a RealEstate10K camera file, or a folder with some."""
     if os.path.isdir(path):
         return bool(_camera_files(path))
     return path.suffix == ".txt" and _is_camera_file(path)
 
 
 def open_camera_files(path: Path) -> Iterator[Photographs]:
-    """The photographs of each camera file that `path` is or holds, in the order of their names.
-
-    Raises:
-        InputError: as `read_camera_file`.
-    """
+    """Open the photographs of each camera file that `path` is or holds, sorted by name."""
     files = _camera_files(path) if os.path.isdir(path) else [path]
     return (read_camera_file(file) for file in files)
 
 
 def read_camera_file(path: Path) -> Photographs:
-    """The photographs of a RealEstate10K camera file, called by the name of the file.
+    """Read a RealEstate10K camera file; the file names the scene.
 
-    Its first line is the address of the video. Each of the others is a frame: timestamp, fx,
-    fy, cx, cy in image widths and heights, two unused numbers, and the upper three rows of the
-    world-to-camera transform. The image of a frame is named for its timestamp and lies in a
-    folder beside the file that has its name, or beside the file itself. Frames are numbered in
-    the order of the file.
-
-    Raises:
-        InputError: where it is missing or no such file.
+    The first line is the address of the video. Each other line is a frame: timestamp, fx, fy, cx,
+    cy in image widths and heights, two unused numbers, and the upper 3×4 of world-to-camera. The
+    image is named after the timestamp and lies in a folder named after the file, or beside it.
     """
     try:
         lines = [line for line in read_lines(path, errors="strict") if line.strip()][1:]
@@ -52,7 +43,7 @@ def read_camera_file(path: Path) -> Photographs:
         raise InputError(f"{path} is not a text file; name a camera file.") from error
     if not lines:
         raise InputError(
-            f"{path} lists no frames; below the line with the address, one line a frame is needed."
+            f"{path} lists no frames; below the line with the address, each frame needs a line."
         )
     frames = [_frame(line, number, path) for number, line in enumerate(lines)]
     return photographs_of(path.stem, str(path), frames)
@@ -61,9 +52,9 @@ def read_camera_file(path: Path) -> Photographs:
 def intrinsics_and_pose(
     numbers: Float[np.ndarray, "18"],
 ) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:
-    """Of fx, fy, cx, cy, two unused numbers, and the upper rows of world-to-camera.
+    """Split a row: fx, fy, cx, cy, two unused numbers, and the upper 3×4 of world-to-camera.
 
-    The pose is camera-to-world, or where that does not exist, the transform as it is.
+    The pose is camera-to-world, or the transform itself if it cannot be inverted.
     """
     fx, fy, cx, cy = numbers[:4].tolist()
     viewmat = np.vstack([numbers[6:].reshape(3, 4), [0, 0, 0, 1]])

@@ -1,7 +1,7 @@
-"""Pickles of plain values: nothing that a file names is ever imported or called.
+"""Pickles of plain values; nothing that a file names is imported or called.
 
-A pickle is a program. Infos of data sets need little of it: numbers, texts, lists and dictionaries,
-and single numbers of NumPy, which are built here from their bytes.
+A pickle is a program. Infos of data sets need only numbers, texts, lists, dictionaries and NumPy
+scalars, which are built here from their bytes.
 """
 
 from __future__ import annotations
@@ -18,19 +18,14 @@ from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.reading import check_plain, read_bytes
 
 MAX_BYTES = 1 << 30
-"""Of a file."""
+"""Largest file in bytes."""
 MAX_REPEATS = 4
-"""Values for each byte of a file; there are more where it repeats itself."""
+"""Most values per byte of a file, as a bound on self-repetition."""
 NUMBERS = frozenset(["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"])
-"""Kinds of numbers that are built."""
 
 
 def load_plain(path: Path) -> Any:
-    """The plain value in a pickle.
-
-    Raises:
-        InputError: where the file cannot be read, is none, or holds anything but plain values.
-    """
+    """Load the plain value in a pickle; anything else raises an InputError."""
     refuse_pointer(path)
     try:
         data = read_bytes(path, MAX_BYTES)
@@ -39,33 +34,32 @@ def load_plain(path: Path) -> Any:
         return value
     except InputError:
         raise
-    except Exception as error:  # a damaged pickle fails in any way that its opcodes can
+    except Exception as error:  # damaged pickles raise anything
         raise InputError(
             f"{quoted(path)} is no pickle of plain values ({type(error).__name__}: "
             f"{quoted(str(error))}); write it again with lists and numbers only."
         ) from error
 
 
-# The unpickler in C reserves as much memory as a file of a few bytes asks for; that in Python grows
-# with what is there.
+# The unpickler in C allocates any size that a few bytes claim; the one in Python does not.
 class _Plain(pickle._Unpickler):
-    """An unpickler that knows three names, and dictionaries with plain keys alone.
+    """Unpickler that knows three names, and dictionaries with plain keys only.
 
-    To hash tuples within tuples overflows the stack of the process; sets need that too.
+    Hashing nested tuples overflows the stack of the process; sets would need it too.
     """
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
         found = KNOWN.get((module.replace("numpy._core", "numpy.core"), name))
         if found is None:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}")
+            raise pickle.UnpicklingError(f"it names {module}.{name}")
         return found
 
     def persistent_load(self, pid: Any) -> Any:
-        raise pickle.UnpicklingError("it asks for what lies outside of it")
+        raise pickle.UnpicklingError("it refers to external objects")
 
 
 class _Kind:
-    """What NumPy calls a dtype, as far as a single number needs it."""
+    """Stand-in for a NumPy dtype of a single number."""
 
     def __init__(self, code: str, align: bool = False, copy: bool = False) -> None:
         if code not in NUMBERS:
@@ -83,7 +77,7 @@ def _number(kind: _Kind, data: bytes) -> bool | int | float:
 
 def _bytes_of(text: str, encoding: str) -> bytes:
     if encoding != "latin1":
-        raise pickle.UnpicklingError(f"it asks for the encoding {quoted(encoding)}")
+        raise pickle.UnpicklingError(f"it uses the encoding {quoted(encoding)}")
     return text.encode("latin1")
 
 
@@ -92,19 +86,19 @@ KNOWN: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy", "dtype"): _Kind,
     ("_codecs", "encode"): _bytes_of,
 }
-"""What is built where a pickle has one of these names."""
+"""Constructors for the accepted names."""
 
 
 def _guarded(code: bytes, is_plain: Callable[[list[Any]], bool]) -> Callable[[Any], None]:
-    """Load an instruction only where what lies on the unpickler's stack is plain."""
+    """Run an instruction only if the unpickler's stack is plain."""
     load: Callable[[Any], None] = pickle._Unpickler.dispatch[code[0]]
 
-    def guarded(unpickler: Any) -> None:
+    def load_guarded(unpickler: Any) -> None:
         if not is_plain(unpickler.stack):
             raise pickle.UnpicklingError("it holds a key or an object that is not plain")
         load(unpickler)
 
-    return guarded
+    return load_guarded
 
 
 def _are_keys(keys: Sequence[Any]) -> bool:

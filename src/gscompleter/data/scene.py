@@ -1,4 +1,4 @@
-"""Views and cameras of one scene, and cameras in nerfstudio's `transforms.json` layout."""
+"""Views and cameras of one scene, and writing of nerfstudio's `transforms.json`."""
 
 from __future__ import annotations
 
@@ -26,24 +26,23 @@ def load_views(
     near: float | None = None,
     far: float | None = None,
 ) -> list[View]:
-    """The photographs of a scene with their cameras, and with true depth where it is there.
+    """Load the photographs of a scene with their cameras, and true depth if available.
 
-    Lens distortion is removed, as `PosedPhotographs.views` says. Where coordinates are
-    so large that float32 would lose the baselines, cameras are told from a local origin,
-    `open_photographs(scene).origin`.
+    Lens distortion is removed, as in `PosedPhotographs.views`. If coordinates are so large that
+    float32 would lose the baselines, cameras are relative to `open_photographs(scene).origin`.
 
     Args:
-        scene: A folder with nerfstudio's `transforms.json`, the path of that file, or what
-            else `open_photographs` opens.
-        frames: Numbers of the frames, which are numbered in the order of their sorted
-            `file_path`; all frames if left out. Only these are read.
+        scene: A folder with nerfstudio's `transforms.json`, that file, or any other path that
+            `open_photographs` opens.
+        frames: Frame numbers, counted by sorted `file_path`; all frames if None. Only these are
+            read.
         resolution: Height and width in pixels, or the most pixels of the longer side, as in
             `PosedPhotographs.views`.
-        near: Smallest z-depth of the scene, in scene units, where known.
-        far: Largest z-depth of the scene, in scene units, where known.
+        near: Smallest z-depth of the scene, in scene units, if known.
+        far: Largest z-depth of the scene, in scene units, if known.
 
     Raises:
-        InputError: where the scene, one of the frames or an image is missing or impossible.
+        InputError: If the scene, a frame or an image is missing or impossible.
     """
     photographs = open_photographs(scene, near=near, far=far)
     return photographs.views(range(len(photographs)) if frames is None else frames, resolution)
@@ -56,18 +55,12 @@ def load_camera(
     near: float | None = None,
     far: float | None = None,
 ) -> Camera:
-    """The camera of one frame, as `load_views` has it.
+    """Load the camera of a frame, as in `load_views`; None takes the only frame.
 
-    Its photograph need not exist where `w` and `h` say how large it is.
-
-    Args:
-        scene: As in `load_views`.
-        frame: Number of the frame; may be left out where there is one only.
-        resolution: As in `load_views`, and so `near` and `far`.
+    Its photograph may be missing if the file has `w` and `h`.
 
     Raises:
-        InputError: where the scene or the frame is missing or impossible, and where there are
-            several frames and none is chosen.
+        InputError: If the scene or frame is missing or impossible, or none of several is chosen.
     """
     photographs = open_photographs(scene, near=near, far=far)
     if frame is None and len(photographs) > 1:
@@ -85,21 +78,19 @@ def load_cameras(
     far: float | None = None,
     origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Camera]:
-    """All cameras of a file of cameras, in its order.
-
-    No images are needed where the file says how large they are.
+    """Load all cameras of a file in its order, without photographs.
 
     Args:
-        path: A JSON file of the form of nerfstudio's `transforms.json`, of Inria's `cameras.json`
-            or of SuperSplat's poses, a folder with a `transforms.json` or a COLMAP model, or the
+        path: A JSON file in the layout of nerfstudio's `transforms.json`, Inria's `cameras.json` or
+            SuperSplat's poses; a folder with a `transforms.json` or a COLMAP model; or the
             images.txt or images.bin of such a model.
-        resolution: As in `load_views`, and so `near` and `far`. SuperSplat's poses need height
-            and width.
-        origin: Where the coordinates of the scene are counted from, which is
-            `open_photographs(scene).origin`, in scene units.
+        resolution: As in `load_views`; SuperSplat's poses need height and width.
+        near: As in `load_views`.
+        far: As in `load_views`.
+        origin: Origin of the scene's coordinates, `open_photographs(scene).origin`, in scene units.
 
     Raises:
-        InputError: where the file or one of its cameras is missing or impossible.
+        InputError: If the file or one of its cameras is missing or impossible.
     """
     check_planes(near, far)
     zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_cameras(Path(path), resolution))
@@ -110,17 +101,17 @@ def load_cameras(
 def write_cameras(
     path: Path | str, cameras: Sequence[Camera], file_paths: Sequence[str] | None = None
 ) -> None:
-    """Write cameras as a JSON file that `load_cameras` reads back bit for bit.
+    """Write cameras to a JSON file that `load_cameras` reads back bit for bit.
 
     Near and far planes are not part of the format.
 
     Args:
         path: The JSON file.
         cameras: At least one camera.
-        file_paths: Where their images lie, relative to its folder, for a scene's `transforms.json`.
+        file_paths: Image paths relative to its folder, for the `transforms.json` of a scene.
 
     Raises:
-        InputError: where the file cannot be written.
+        InputError: If the file cannot be written.
     """
     frames = [_entry(camera) for camera in cameras]
     if file_paths is not None:

@@ -1,4 +1,4 @@
-"""Sparse z-depth: what a laser measured, at the pixels of a camera."""
+"""Sparse z-depth from laser points."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from gscompleter.types import Camera
 
 
 def sparse_depth(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "h w"]:
-    """z-depth, in scene units, of the points that fall into each pixel; 0 where none does.
+    """Project points to z-depth in scene units: the nearest per pixel, 0 without one.
 
-    The nearest of several wins. A point that only a surface between two measured ones hides stays.
+    Points behind an unmeasured surface remain visible.
     """
     pixels, z = project(points, camera)
     seen = inside(pixels, z, camera)

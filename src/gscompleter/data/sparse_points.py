@@ -1,4 +1,4 @@
-"""Between which depths a scene lies, as the sparse points of its reconstruction tell."""
+"""Depth range of a scene from the sparse points of its reconstruction."""
 
 from __future__ import annotations
 
@@ -16,26 +16,17 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.types import Camera
 
 MIN_POINTS = 100
-"""Fewest points in the sight of the cameras that tell a depth range."""
+"""Fewest visible points that define a depth range."""
 PERCENTILES = (0.01, 0.99)
-"""Of the points' z-depths: what lies beyond is taken for mismatched."""
+"""Percentiles of z-depth; points beyond are taken for mismatches."""
 NEAR_ROOM, FAR_ROOM = 0.5, 2.0
-"""What the nearest and the farthest depth are multiplied by: much carries no point."""
+"""Factors on the nearest and farthest depth, because many surfaces have no points."""
 
 
 def with_depth_range(
     photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
 ) -> Photographs:
-    """The photographs with the planes that their points tell, where they are not known.
-
-    Args:
-        photographs: With or without points.
-        frames: Numbers of the frames whose cameras are to see the points.
-        resolution: To which images are cropped or shrunk.
-
-    Raises:
-        InputError: where a frame does not exist or is impossible, or the points are damaged.
-    """
+    """Set missing near and far planes from the points that the cameras of `frames` see."""
     if photographs.near is not None and photographs.far is not None:
         return photographs
     points = photographs.points()
@@ -52,10 +43,9 @@ def with_depth_range(
 def depth_range_of_points(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera]
 ) -> tuple[float, float] | None:
-    """Near and far plane, in scene units, that enclose the points in sight of the cameras.
+    """Compute near and far planes (scene units) around the points that the cameras see.
 
-    Hidden points count too, which the percentiles bear. None where fewer than `MIN_POINTS` are in
-    sight, or the range is impossible.
+    Returns None for too few points. Hidden points count too; the percentiles tolerate them.
     """
     depths = torch.cat([torch.zeros(0), *(_depths_in_sight(points, c) for c in cameras)])
     if len(depths) < MIN_POINTS:
@@ -66,12 +56,12 @@ def depth_range_of_points(
 
 
 def with_room(nearest: float, farthest: float) -> tuple[float, float]:
-    """Near and far plane around depths, in scene units, with room for what carries no point."""
+    """Widen a depth range (scene units) for surfaces without points."""
     return NEAR_ROOM * nearest, FAR_ROOM * farthest
 
 
 def _depths_in_sight(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "m"]:
-    """The z-depths of the points that project into the image of a camera."""
+    """Compute the z-depths of the points that project into the image."""
     local = (points - camera.center) @ camera.c2w[:3, :3]
     front = local[local[:, 2] > 0]
     pixels = (front @ camera.K.T)[:, :2] / front[:, 2:]

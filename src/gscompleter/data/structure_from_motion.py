@@ -1,8 +1,8 @@
-"""Photographs without poses: their cameras are found by COLMAP, on the CPU.
+"""Camera poses for photographs without poses, by COLMAP on the CPU.
 
-The folder that is written has COLMAP's standard layout: upright copies in `images`, the model in
-`sparse/0`. A `summary.json` beside them says which photographs it was made from, so that the next
-run need not find them again. COLMAP runs in a process of its own (`mapping_process`).
+The output folder has COLMAP's standard layout: upright copies in `images`, the model in `sparse/0`.
+A `summary.json` records the input photographs, so that the next run can reuse the result. COLMAP
+runs in a separate process (`mapping_process`).
 """
 
 from __future__ import annotations
@@ -30,70 +30,69 @@ from gscompleter.progress import track
 from gscompleter.threads import threads
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
-"""Of photographs, in any case."""
+"""Endings of photographs, in any case."""
 NO_PHOTOGRAPHS = (MASKS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALED))
-"""Folders beside those of photographs."""
+"""Folders that hold no photographs of the user."""
 POSES = "colmap"
-"""The folder of a completion's output with the cameras that were found for it."""
+"""Output folder of a completion for the poses found for it."""
 MIN_PHOTOGRAPHS = 3
-"""With two, neither the focal length nor a wrong match can be told."""
+"""Fewest photographs; two determine neither a focal length nor a wrong match."""
 MIN_SHARE = 0.25
-"""Smallest share of the photographs in a model: fewer are a failure, not a part of the scene."""
+"""Smallest share of the photographs in a usable model."""
 WANTED_SHARE = 0.5
 """Share of the photographs in a model below which other focal lengths are tried."""
 MIN_POINTS = 30
-"""Fewest points of a model: as many as COLMAP wants in common with one photograph."""
+"""Fewest points of a model; COLMAP needs as many in common with one photograph."""
 MAX_THREADS = 4
 MAX_NAMED = 5
-"""Photographs that a note names at most."""
+"""Most photographs that a note names."""
 PROCESS = "gscompleter.data.mapping_process"
 
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """What came out of a folder of photographs."""
+    """Result of structure from motion on a folder of photographs."""
 
     photographs: int
-    """How many there were."""
+    """Number of input photographs."""
     missing: tuple[str, ...]
-    """Those whose camera was not found."""
+    """Photographs without a camera."""
     models: tuple[int, ...]
-    """Cameras in each of the models that do not connect, the largest first; it was kept."""
+    """Cameras in each disconnected model, the largest and kept one first."""
     points: int
     """Points of the model."""
     error: float
-    """Mean distance of a point to its features, in pixels of the copies."""
+    """Mean reprojection error, in pixels of the copies."""
     focal: float | None = None
-    """Focal length in pixels of the copies where it was held at first, because COLMAP failed with
-    a free one; else None."""
+    """Focal length in pixels of the copies if it had to be fixed at first, else None."""
     reused: bool = False
-    """Whether an earlier run had found them."""
+    """True if the result is from an earlier run."""
 
     @property
     def registered(self) -> int:
-        """How many cameras were found."""
+        """Number of cameras found."""
         return self.photographs - len(self.missing)
 
     @property
     def is_too_little(self) -> bool:
-        """True if there are too few photographs or points in the model to go on with."""
+        """True if the model has too few photographs or points."""
         enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * self.photographs)
         return self.registered < enough or self.points < MIN_POINTS
 
     @property
     def notes(self) -> list[str]:
-        """What the user should know, in sentences."""
+        """Sentences for the user."""
         notes, place = [], ""
         if self.focal is not None:
             notes.append(
-                "COLMAP failed with a free focal length, so it was held at plausible values first: "
-                f"{self.registered} of {self.photographs} cameras were found so, and a focal "
-                f"length of {self.focal:.0f} px fits them."
+                f"{self.registered} of {self.photographs} cameras were found with a focal length "
+                f"of {self.focal:.0f} px, fixed at plausible values first, because COLMAP failed "
+                "with a free one."
             )
         if len(self.models) > 1:
             *others, last = map(str, self.models)
             notes.append(
-                f"The photographs fall into {len(self.models)} parts that do not connect, of "
+                f"The photographs fall into {len(self.models)} parts that do not connect, with "
                 f"{', '.join(others)} and {last} cameras; the largest is kept."
             )
             place = " in it"
@@ -107,9 +106,8 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
     """Find the cameras of the `photographs` in a folder and write them to the folder `out`.
 
     Raises:
-        InputError: where there are too few photographs or one is damaged, too few cameras or points
-            are found or the lens is implausible, pycolmap is not installed or gives up, or `out`
-            cannot be written.
+        InputError: If there are too few photographs, cameras or points, a photograph is damaged,
+            the lens is implausible, pycolmap is missing or fails, or `out` cannot be written.
     """
     names = photographs_in(photographs)
     known = _fingerprint(photographs, names)
@@ -125,16 +123,12 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
 
 
 def holds_photographs(path: Path) -> bool:
-    """Whether `path` is a folder with photographs in it, with or without cameras."""
+    """Check whether `path` is a folder with photographs, with or without cameras."""
     return os.path.isdir(path) and bool(_listed(path))
 
 
 def photographs_in(folder: Path) -> list[str]:
-    """The photographs below a folder, relative to it, as people count.
-
-    Raises:
-        InputError: where there is no such folder, or too few photographs are in it.
-    """
+    """List the photographs below a folder in natural order; at least `MIN_PHOTOGRAPHS`."""
     if not os.path.isdir(folder):
         raise InputError(f"There is no folder {quoted(folder)}; name a folder of photographs.")
     names = _listed(folder)
@@ -147,11 +141,7 @@ def photographs_in(folder: Path) -> list[str]:
 
 
 def check_pycolmap() -> None:
-    """Refuse to go on without pycolmap.
-
-    Raises:
-        InputError: where it is not installed.
-    """
+    """Raise an InputError if pycolmap is not installed."""
     if find_spec("pycolmap") is None:
         raise InputError(
             "Finding the cameras of photographs needs pycolmap, which is not installed; run "
@@ -160,7 +150,6 @@ def check_pycolmap() -> None:
 
 
 def _listed(folder: Path) -> list[str]:
-    """All photographs below a folder that are the user's own."""
     found: list[Path] = []
     for home, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if is_own(Path(home, name))]
@@ -170,21 +159,19 @@ def _listed(folder: Path) -> list[str]:
 
 
 def is_own(folder: Path) -> bool:
-    """Tell whether a folder may hold photographs of the user: not one that is hidden, of masks,
-    depth maps or smaller copies, or a result of ours."""
+    """Check that a folder may hold photographs: not hidden, masks, depth, copies or our result."""
     if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
         return False
     return not os.path.isfile(folder / SUMMARY)
 
 
 def _fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
-    """Size in bytes and time of the last change of each photograph."""
     stats = {name: (folder / name).stat() for name in names}
     return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
 
 def _found_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
-    """Read what an earlier run found for these photographs; None for nothing or too little."""
+    """Read the earlier result for these photographs; None if missing or too small."""
     if not os.path.isfile(out / SUMMARY) or not os.path.isdir(out / "sparse" / "0"):
         return None
     content = read_json(out / SUMMARY, "name another folder")
@@ -230,11 +217,7 @@ def _find(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
 
 
 def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> None:
-    """Refuse a reconstruction with too little in it, or with a lens that no camera has.
-
-    Raises:
-        InputError: where it is like that; `defect` describes the lens.
-    """
+    """Raise an InputError for a model that is too small or has an implausible lens."""
     if not found.is_too_little and defect is None:
         return
     lens = "" if defect is None else f", {defect}"
@@ -246,7 +229,7 @@ def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> 
 
 
 def _mapped(copies: Sequence[Upright], folder: Path) -> dict[str, Any]:
-    """What `mapping_process` says of the copies in `folder/images`."""
+    """Run `mapping_process` on the copies in `folder/images`."""
     with tempfile.TemporaryDirectory(dir=folder) as work:
         job = {
             "images": str(folder / "images"),
@@ -282,7 +265,7 @@ def _result_of(job: Path, complaints: IO[str]) -> dict[str, Any]:
 
 
 def _followed(process: subprocess.Popen[str]) -> tuple[str, dict[str, Any] | None]:
-    """Show the progress of a process; returns the last phase it began, and its result."""
+    """Show the progress of a process; return the last phase and its result."""
     assert process.stdout is not None
     phase, result = "Starting", None
     lines = (json.loads(line) for line in process.stdout)
@@ -295,17 +278,15 @@ def _followed(process: subprocess.Popen[str]) -> tuple[str, dict[str, Any] | Non
 
 
 def _show(lines: Iterator[dict[str, Any]], phase: str, steps: int) -> None:
-    """A bar that follows the steps of a phase until there are no more."""
     for _ in track(range(steps), phase):
         if "step" not in next(lines, {}):
             return
 
 
 def _gave_up(phase: str, code: int, complaints: IO[str]) -> str:
-    """Why there is no result."""
     complaints.seek(0)
-    said = [line.strip() for line in complaints if line.strip()]
-    reason = f": {quoted(said[-1], 200)}" if said else f" with exit code {code}"
+    messages = [line.strip() for line in complaints if line.strip()]
+    reason = f": {quoted(messages[-1], 200)}" if messages else f" with exit code {code}"
     return (
         f"COLMAP gave up while {phase[0].lower()}{phase[1:]}{reason}; leave out photographs that "
         "may be damaged, and try again."

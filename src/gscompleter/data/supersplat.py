@@ -1,8 +1,8 @@
-"""Camera poses that SuperSplat keeps: the `poseSets` of a project's document.json, or the list.
+"""Camera poses of SuperSplat: the `poseSets` of a project's document.json, or the list.
 
-A pose has a position and a target in SuperSplat's world, which is that of the splat turned by half
-a turn about z, so that y points up. It says neither how large the image is nor how it is rolled:
-SuperSplat's cameras stand upright, and their opening angle is that of the longer side.
+A pose has a position and a target in SuperSplat's world, which is that of the splat rotated by 180°
+about z, so that y points up. It has neither image size nor roll: cameras are upright, and their
+field of view is that of the longer side.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from gscompleter.data.json_numbers import array_of, optional_number
 from gscompleter.errors import InputError, quoted
 
 DEFAULT_FOV = 60.0
-"""Opening angle that SuperSplat gives poses without one, in degrees."""
+"""SuperSplat's default field of view, in degrees."""
 FOV_RANGE = (1.0, 179.0)
-"""Of opening angles, in degrees."""
+"""Range of the field of view, in degrees."""
 SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
-"""What the axes of SuperSplat's world are multiplied by: half a turn about z."""
+"""Axis factors from SuperSplat's world to the splat: 180° about z."""
 ADVICE = "export the camera poses from SuperSplat again"
 
 
 def is_supersplat(content: Any) -> bool:
-    """Whether the content of a JSON file holds poses of SuperSplat."""
+    """Check whether the content of a JSON file holds poses of SuperSplat."""
     if isinstance(content, dict):
         return "poseSets" in content
     first = content[0] if isinstance(content, list) and content else None
@@ -38,20 +38,11 @@ def is_supersplat(content: Any) -> bool:
 
 
 def poses_of(content: Any, path: Path, resolution: Resolution) -> list[Frame]:
-    """The cameras of SuperSplat's poses in the frame of the splat, in the order of the file.
-
-    Args:
-        content: Of the JSON file.
-        path: The file, for error messages.
-        resolution: Height and width in pixels of the images.
-
-    Raises:
-        InputError: where the poses are damaged, or no height and width are given.
-    """
+    """Read SuperSplat's poses as cameras in the frame of the splat; `resolution` must be given."""
     if resolution is None or isinstance(resolution, int):
         raise InputError(
-            f"The poses of SuperSplat in {quoted(path)} do not say how large the images are; give "
-            "a resolution (height and width).",
+            f"The poses of SuperSplat in {quoted(path)} have no image size; give a resolution "
+            "(height and width).",
             "resolution",
         )
     poses = _poses(content)
@@ -84,7 +75,7 @@ def _frame(pose: Any, title: str, resolution: tuple[int, int]) -> Frame:
 def _upright(
     position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Camera-to-world of an upright camera that looks at a target; NaN where it looks along y."""
+    """Build camera-to-world of an upright camera that points at a target; NaN along y."""
     with np.errstate(all="ignore"):
         z = (target - position) / np.linalg.norm(target - position)
         x = np.cross([0.0, 1.0, 0.0], z)

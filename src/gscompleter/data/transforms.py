@@ -1,4 +1,4 @@
-"""nerfstudio's `transforms.json`, checked, without opening any image."""
+"""Validated reading of nerfstudio's `transforms.json`, without opening images."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from gscompleter.io.json_file import begins_a_list, read_json
 
 NAME = "transforms.json"
 SPLITS = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
-"""The files of a scene in parts, as of the synthetic scenes of NeRF."""
+"""Files of a scene in parts, as in NeRF's synthetic scenes."""
 HOMES = ("", "nerfstudio")
-"""Where the file lies in the folder of a scene; DL3DV has the second."""
+"""Subfolders that may hold the file; DL3DV has the second."""
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""nerfstudio's cameras look along -z with y up, ours along z with y down."""
+"""Axis flip: nerfstudio's cameras look along -z with y up, ours along z with y down."""
 
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 ANGLE_RANGE = (1e-5, 3.14159)
-"""Of opening angles, in radians; below π."""
+"""Range of fields of view in radians, below π."""
 
 Pair = tuple[float | None, float | None]
 
@@ -44,26 +44,22 @@ _INTRINSICS = (
     *("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy"),
     *("camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2"),
 )
-"""Keys that may stand at the top, for all frames, or in a frame, for it alone."""
+"""Keys allowed at the top for all frames, or in a frame."""
 
 
 def holds_transforms(path: Path) -> bool:
-    """Whether `path` is a folder with a `transforms.json`, whole or in parts, or a JSON object."""
+    """Check for a JSON object, or a folder with a `transforms.json`, whole or in parts."""
     if os.path.isdir(path):
         return bool(_files(path))
     return path.suffix == ".json" and os.path.isfile(path) and not begins_a_list(path)
 
 
 def open_transforms(path: Path) -> Iterator[Photographs]:
-    """The photographs of a `transforms.json`, called by the name of its folder.
+    """Open the photographs of a `transforms.json`; its folder names the scene.
 
-    Frames are numbered in the order of their sorted `file_path`, those of `transforms_train.json`,
-    `_val` and `_test` together. Where one has no path, as in a list of cameras, the order of the
-    file counts. Poses and points stay in the frame of the file: the `applied_transform`, which
-    tells how the exporter came from COLMAP's frame to it, is not undone.
-
-    Raises:
-        InputError: as `read_frames`.
+    Frames are numbered by sorted `file_path`, those of train, val and test together; if one lacks a
+    path, by their order in the file. Poses and points stay in the frame of the file:
+    `applied_transform`, the exporter's change of COLMAP's frame, is not undone.
     """
     files = _files(path) or [path / NAME]
     frames = [frame for file in files for frame in read_frames(file)]
@@ -76,13 +72,12 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
 
 
 def _name_of(file: Path, whole: bool) -> str:
-    """What the scene of a file is called: as its folder, or as the file with a name of its own."""
+    """Name the scene of a file: after its folder, or after a file with its own name."""
     folder = file.resolve().parent
     return file.stem if whole else (folder.parent if folder.name in HOMES else folder).name
 
 
 def _files(scene: Path) -> list[Path]:
-    """The JSON files of a scene, or the file itself; none where there is none."""
     if not os.path.isdir(scene):
         return [scene]
     for folder in (scene / home for home in HOMES):
@@ -94,7 +89,7 @@ def _files(scene: Path) -> list[Path]:
 
 
 def _points_of(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
-    """What reads the points that one of the files names; None where there are none."""
+    """Return a reader of the points that a file names; None if there are none."""
     for file in files:
         name = text_of(_read_transforms(file), "ply_file_path", str(file))
         if name is not None and os.path.isfile(file.parent / name):
@@ -103,14 +98,10 @@ def _points_of(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | Non
 
 
 def read_frames(path: Path) -> list[Frame]:
-    """The frames of a JSON file in its order.
+    """Read the frames of a JSON file in its order, with exactly rigid poses.
 
-    Poses within `MAX_RIGID_ERROR` of a rigid transform are made exactly rigid (the nearest
-    rotation), unless they are so already up to `FLOAT_NOISE`.
-
-    Raises:
-        InputError: where the file is missing, is not JSON or has no frames, and where a pose
-            or the intrinsics of one are missing or impossible.
+    Poses within `MAX_RIGID_ERROR` of a rigid transform get the nearest rotation, unless they are
+    within `FLOAT_NOISE` of it.
     """
     content = _read_transforms(path)
     entries = content.get("frames")
@@ -156,7 +147,6 @@ def _frame(
 
 
 def _matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    """A transform from nested lists of 3 or 4 rows."""
     if matrix is None:
         raise InputError(f"The `transform_matrix` of {title} is missing; add its camera-to-world.")
     try:
@@ -171,18 +161,18 @@ def _matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:
 
 
 def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def pair(*keys: str, low: float = -MAX_IN_PIXELS, high: float = MAX_IN_PIXELS) -> Pair:
+    def read_pair(*keys: str, low: float = -MAX_IN_PIXELS, high: float = MAX_IN_PIXELS) -> Pair:
         x, y = (optional_number(entry, key, title, low, high) for key in keys)
         return x, y
 
-    focal = pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
-    angle = pair("camera_angle_x", "camera_angle_y", low=ANGLE_RANGE[0], high=ANGLE_RANGE[1])
+    focal = read_pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
+    angle = read_pair("camera_angle_x", "camera_angle_y", low=ANGLE_RANGE[0], high=ANGLE_RANGE[1])
     if focal == angle == (None, None):
         raise InputError(
             f"The focal length of {title} is missing; add `fl_x` and `fl_y`, or `camera_angle_x`."
         )
-    size = _size(pair("w", "h", low=1.0, high=float(MAX_SIDE)), title)
-    return Intrinsics(size, focal, pair("cx", "cy"), angle, _distortion(entry, title))
+    size = _size(read_pair("w", "h", low=1.0, high=float(MAX_SIDE)), title)
+    return Intrinsics(size, focal, read_pair("cx", "cy"), angle, _distortion(entry, title))
 
 
 def _size(size: Pair, title: str) -> tuple[int, int] | None:

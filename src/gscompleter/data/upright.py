@@ -1,6 +1,6 @@
-"""Photographs as structure from motion can take them: upright, of a bounded size, in plain colours.
+"""Upright copies of photographs, of bounded size, for structure from motion.
 
-COLMAP ignores the orientation that a camera writes into EXIF, so the pixels themselves are turned.
+COLMAP ignores the EXIF orientation, so the pixels themselves are rotated.
 """
 
 from __future__ import annotations
@@ -18,40 +18,36 @@ from gscompleter.io.image import FORMATS
 from gscompleter.reading import check_file
 
 MAX_SIDE = 1600
-"""Longer side of a copy in pixels. SIFT finds no better places for features in larger ones."""
+"""Longest side of a copy in pixels; SIFT finds no better features in larger ones."""
 QUALITY = 95
-"""Of the JPEG files that are written where a photograph is turned or made smaller."""
+"""JPEG quality of rotated or shrunk copies."""
 FULL_FRAME = 43.2666
-"""Diagonal of 36 x 24 mm, which EXIF refers the "focal length in 35 mm film" to."""
+"""Diagonal of 36 x 24 mm, the reference of EXIF's "focal length in 35 mm film"."""
 ORIENTATION, MAKE, MODEL = 0x0112, 0x010F, 0x0110
 EXIF, FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x8769, 0x920A, 0xA405
 
 
 @dataclass(frozen=True)
 class Upright:
-    """A copy that is upright, and what is known of the camera that took it."""
+    """An upright copy of a photograph, and known data of its camera."""
 
     name: str
-    """Its file, relative to the folder of copies."""
+    """File, relative to the folder of copies."""
     source: str
-    """The file it was made from, relative to the folder of photographs."""
+    """Source file, relative to the folder of photographs."""
     width: int
     height: int
     focal: float | None
-    """Focal length in pixels of the copy, where EXIF tells it."""
+    """Focal length in pixels of the copy from EXIF, or None."""
     lens: str
-    """The same for photographs that one camera took with one lens at one zoom, as far as EXIF
-    tells them apart."""
+    """Key of camera, lens and zoom from EXIF."""
 
 
 def write_upright(root: Path, source: str, folder: Path) -> Upright:
-    """Write the copy of the photograph `source` below `root` to the same place below `folder`.
+    """Write an upright copy of the photograph `root`/`source` to the same place in `folder`.
 
-    A JPEG or PNG in 8-bit colours or grey that is upright and small is copied byte for byte; a
-    format that COLMAP may not read becomes a PNG.
-
-    Raises:
-        InputError: where it is damaged or no image, or another copy has its name.
+    A small upright 8-bit JPEG or PNG is copied byte for byte; a format that COLMAP may not read
+    becomes a PNG.
     """
     check_file(root / source)
     refuse_pointer(root / source)
@@ -64,21 +60,21 @@ def write_upright(root: Path, source: str, folder: Path) -> Upright:
             return Upright(name, source, width, height, _focal(exif, width, height), _lens(exif))
     except InputError:
         raise
-    # A damaged file can fail in any way.
+    # Damaged files raise anything.
     except Exception as error:
         raise InputError(
-            f"{quoted(root / source)} is no image that can be read ({quoted(str(error))}); copy it "
+            f"{quoted(root / source)} cannot be read as an image ({quoted(str(error))}); copy it "
             "again, or take it out of the folder."
         ) from error
 
 
 def _name(source: str, format: str | None) -> str:
-    """What the copy is called. In COLMAP's lists a space ends a name, and # begins a comment."""
+    """Name the copy; in COLMAP's lists a space ends a name, and # begins a comment."""
     return re.sub(r"[\s#]", "_", source) + ("" if format in ("JPEG", "PNG") else ".png")
 
 
 def _free(target: Path, source: Path) -> Path:
-    """Where to write the copy of `source`; no other one is there."""
+    """Create the folder of the copy; refuse a name that is taken."""
     if target.exists():
         raise InputError(
             f"The copy of {quoted(source)} would be called {target.name} like that of another "
@@ -89,18 +85,17 @@ def _free(target: Path, source: Path) -> Path:
 
 
 def _write(image: Image.Image, exif: Image.Exif, source: Path, target: Path) -> tuple[int, int]:
-    """Write the copy; returns its width and height in pixels."""
     plain = image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L")
     upright = exif.get(ORIENTATION, 1) == 1
     if plain and upright and max(image.size) <= MAX_SIDE:
-        image.load()  # a truncated file is found out here
+        image.load()  # detects truncated files
         shutil.copyfile(source, target)
         return image.size
-    # A JPEG is decoded at half or a quarter of its size where that is enough.
+    # Decodes a JPEG at half or a quarter of its size if that is enough.
     image.draft("RGB", (MAX_SIDE, MAX_SIDE))
     copy = ImageOps.exif_transpose(image).convert("RGB")
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
-    copy.info.clear()  # no orientation stays behind that a reader could obey once more
+    copy.info.clear()  # removes the orientation, which is applied already
     if image.format == "JPEG":
         copy.save(target, format="JPEG", quality=QUALITY, subsampling=0)
     else:
@@ -109,7 +104,7 @@ def _write(image: Image.Image, exif: Image.Exif, source: Path, target: Path) -> 
 
 
 def _focal(exif: Image.Exif, width: int, height: int) -> float | None:
-    """Focal length in pixels from its equivalent in 35 mm film; None where there is none."""
+    """Compute the focal length in pixels from the 35 mm equivalent; None if there is none."""
     millimetres = _number(exif.get_ifd(EXIF).get(FOCAL_LENGTH_35))
     if millimetres is None or not 1 <= millimetres <= 5000:
         return None
@@ -118,12 +113,17 @@ def _focal(exif: Image.Exif, width: int, height: int) -> float | None:
 
 def _lens(exif: Image.Exif) -> str:
     detail = exif.get_ifd(EXIF)
-    told = (exif.get(MAKE), exif.get(MODEL), detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35))
-    return " ".join(str(value) for value in told if value is not None)
+    values = (
+        exif.get(MAKE),
+        exif.get(MODEL),
+        detail.get(FOCAL_LENGTH),
+        detail.get(FOCAL_LENGTH_35),
+    )
+    return " ".join(str(value) for value in values if value is not None)
 
 
 def _number(value: Any) -> float | None:
-    """A value of EXIF as a number; broken ones are common, and count as none."""
+    """Convert an EXIF value; broken ones are common and give None."""
     try:
         return float(value)
     except (TypeError, ValueError, ZeroDivisionError):

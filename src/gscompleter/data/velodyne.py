@@ -1,4 +1,4 @@
-"""Sweeps of KITTI's laser: x, y, z and reflectance as float32, in the frame of the laser."""
+"""KITTI's laser sweeps: x, y, z and reflectance as float32, in the laser frame."""
 
 from __future__ import annotations
 
@@ -11,17 +11,13 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.reading import read_bytes
 
 BYTES = 16
-"""Of a point."""
+"""Size of a point in bytes."""
 MAX_BYTES = 1 << 28
 """Largest sweep, in bytes."""
 
 
 def read_sweep(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
-    """The points of a sweep in the world frame, in metres.
-
-    Raises:
-        InputError: where the file cannot be read, or is none of whole points.
-    """
+    """Read the points of a sweep in the world frame, in metres."""
     data = read_bytes(path, MAX_BYTES)
     if len(data) % BYTES:
         raise InputError(f"{quoted(path)} is truncated: it ends within a point; copy it again.")

@@ -1,9 +1,9 @@
-"""Segments of the Waymo Open Dataset, version 2: a parquet file for each component and segment.
+"""Segments of the Waymo Open Dataset, version 2: a parquet file per component and segment.
 
-`camera_image/SEGMENT.parquet` holds the photographs, a row for each camera and time, with the pose
-of the vehicle as it was taken; `camera_calibration` the cameras on the vehicle. Where the segment
-has them, `lidar`, `lidar_calibration`, `lidar_pose` and `vehicle_pose` give sparse depth, and
-`lidar_box` what moves. Axes of vehicle and cameras are x forward, y left, z up.
+`camera_image/SEGMENT.parquet` holds the photographs, a row per camera and time, with the vehicle
+pose; `camera_calibration` the cameras. If present, `lidar`, `lidar_calibration`, `lidar_pose` and
+`vehicle_pose` give sparse depth, and `lidar_box` moving objects. Axes of vehicle and cameras are x
+forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -30,35 +30,32 @@ from gscompleter.errors import InputError, quoted
 
 IMAGES = "camera_image"
 CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
-"""By the numbers that the tables give them."""
+"""Camera names by their numbers in the tables."""
 SIGN = 3
-"""The type of boxes around things that never move."""
+"""Box type of signs, which never move."""
 CAMERA_FROM_OPENCV = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-"""From x right, y down, z forward to x forward, y left, z up."""
+"""Axis change from x right, y down, z forward to x forward, y left, z up."""
 
 Beams = tuple[Float[np.ndarray, "h"] | None, float, float]
-"""The inclinations of a laser's beams in radians, in rising order, and where they begin and end."""
+"""Beam elevations of a laser in radians, ascending, and their lower and upper end."""
 
 LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "k3", "p1", "p2")
 TIME, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
 
 
 def holds_waymo(path: Path) -> bool:
-    """Whether `path` is a folder of segments, or the photographs of one segment."""
+    """Check whether `path` is a folder of segments, or the photographs of one."""
     if os.path.isdir(path):
         return any((path / IMAGES).glob("*.parquet"))
     return path.suffix == ".parquet" and path.parent.name == IMAGES and os.path.isfile(path)
 
 
 def open_waymo(path: Path) -> Iterator[Photographs]:
-    """The segments in a folder, or the one whose photographs are named, called by their names.
+    """Open the segments in a folder, or the named one.
 
-    Frames are numbered camera by camera, the front camera first, and by their time.
-
-    Raises:
-        InputError: where a table is missing or damaged, or pyarrow is not installed.
+    Frames are numbered camera by camera, the front camera first, and by time.
     """
     if os.path.isdir(path):
         names = [file.stem for file in sorted((path / IMAGES).glob("*.parquet"))]
@@ -73,21 +70,21 @@ class Segment:
     """Twenty seconds of one drive."""
 
     root: Path
-    """The folder with a folder for each component."""
+    """Folder with a subfolder per component."""
     name: str
 
     def file(self, component: str) -> Path:
-        """Where a component of it lies."""
+        """Return the path of a component."""
         return self.root / component / f"{self.name}.parquet"
 
     def has(self, *components: str) -> bool:
-        """Whether all of these components are there."""
+        """Check whether all these components exist."""
         return all(os.path.isfile(self.file(component)) for component in components)
 
     def rows(
         self, component: str, columns: dict[str, str], **where: int
     ) -> Iterator[dict[str, Any]]:
-        """Rows of a component, their values by the keys of `columns`; `where` tells the time."""
+        """Read rows of a component as dicts with the keys of `columns`, filtered by `where`."""
         keys = {{"time": TIME, "camera": CAMERA}[key]: value for key, value in where.items()}
         found = read_columns(self.file(component), list(columns.values()), keys)
         values = [found[column] for column in columns.values()]
@@ -134,7 +131,7 @@ def _frame(
 
 
 def _cameras(segment: Segment) -> dict[int, tuple[Intrinsics, Float[np.ndarray, "4 4"]]]:
-    """The intrinsics of each camera, and its pose on the vehicle in the axes of Waymo."""
+    """Read intrinsics and pose on the vehicle (Waymo axes) of each camera."""
     prefix = "[CameraCalibrationComponent]"
     columns = {"camera": CAMERA, **{key: f"{prefix}.intrinsic.{key}" for key in LENS}}
     columns |= {"width": f"{prefix}.width", "height": f"{prefix}.height"}
@@ -164,7 +161,6 @@ def _intrinsics(row: dict[str, Any], title: str) -> Intrinsics:
 
 
 def _image(segment: Segment, time: int, camera: int) -> bytes:
-    """The JPEG file of a photograph."""
     columns = {"image": "[CameraImageComponent].image"}
     found = [row["image"] for row in segment.rows(IMAGES, columns, time=time, camera=camera)]
     if len(found) != 1 or not isinstance(found[0], bytes):
@@ -176,10 +172,9 @@ def _image(segment: Segment, time: int, camera: int) -> bytes:
 
 @lru_cache(maxsize=2)
 def _points(segment: Segment, time: int) -> Float[np.ndarray, "n 3"]:
-    """What the lasers of the vehicle measured first, in the world frame and in metres.
+    """Read the first laser returns in the world frame, in metres.
 
-    The laser on the roof turns while the vehicle drives, and `lidar_pose` has where the vehicle
-    was at each of its measurements.
+    The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
     vehicle = _vehicle(segment, time)
     prefix = "[LiDARComponent].range_image_return1"
@@ -201,7 +196,7 @@ def _points(segment: Segment, time: int) -> Float[np.ndarray, "n 3"]:
 
 
 def _fit_together(ranges: np.ndarray, beams: Beams, poses: np.ndarray) -> bool:
-    """Whether each row of a range image has a beam, and each pixel a pose where any has."""
+    """Check that the range image has one beam per row and one pose per pixel, if any."""
     values, low, high = beams
     known = low is not None and high is not None if values is None else len(values) == len(ranges)
     return known and (poses.ndim == 2 or poses.shape[:2] == ranges.shape)
@@ -213,14 +208,13 @@ def _hits(
     extrinsic: Float[np.ndarray, "4 4"],
     vehicle: Float[np.ndarray, "h w 4 4"] | Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "n 3"]:
-    """What a laser hit, in the world frame; `vehicle` is one pose, or that at each pixel."""
+    """Compute hit points in the world frame; `vehicle` is one pose or one per pixel."""
     local = points_of(ranges, inclinations_of(*beams, len(ranges)), extrinsic)
     hit = np.isfinite(ranges) & (ranges > 0)
     return moved(local[hit], vehicle if vehicle.ndim == 2 else vehicle[hit])
 
 
 def _vehicle(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
-    """The pose of the vehicle at that time."""
     title = str(segment.file("vehicle_pose"))
     columns = {"pose": "[VehiclePoseComponent].world_from_vehicle.transform"}
     found = [
@@ -232,7 +226,6 @@ def _vehicle(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
 
 
 def _lasers(segment: Segment) -> dict[int, tuple[Beams, Float[np.ndarray, "4 4"]]]:
-    """The inclinations of each laser, as `inclinations_of` takes them, and its pose."""
     prefix = "[LiDARCalibrationComponent]"
     columns = {"laser": LASER, "pose": f"{prefix}.extrinsic.transform"}
     columns |= {key: f"{prefix}.beam_inclination.{key}" for key in ("values", "min", "max")}
@@ -244,7 +237,7 @@ def _lasers(segment: Segment) -> dict[int, tuple[Beams, Float[np.ndarray, "4 4"]
 
 
 def _poses_while_turning(segment: Segment, time: int) -> dict[int, Float[np.ndarray, "h w 4 4"]]:
-    """Poses of the vehicle at each pixel of the range images that have them."""
+    """Read vehicle poses per pixel of each range image, if present."""
     if not segment.has("lidar_pose"):
         return {}
     prefix = "[LiDARPoseComponent].range_image_return1"
@@ -257,7 +250,6 @@ def _poses_while_turning(segment: Segment, time: int) -> dict[int, Float[np.ndar
 
 
 def _image_of(row: dict[str, Any], file: Path) -> Float[np.ndarray, "h w c"] | None:
-    """The values of a range image in their shape; None where there are none."""
     values, shape = row["values"], row["shape"]
     if values is None or shape is None:
         return None
@@ -267,7 +259,7 @@ def _image_of(row: dict[str, Any], file: Path) -> Float[np.ndarray, "h w c"] | N
 
 
 def _boxes(segment: Segment, time: int) -> tuple[Box, ...]:
-    """What stands or moves around the vehicle, signs left out."""
+    """Read the boxes of objects around the vehicle, except signs."""
     vehicle = _vehicle(segment, time)
     prefix = "[LiDARBoxComponent]"
     columns = {"type": f"{prefix}.type", "heading": f"{prefix}.box.heading"}
@@ -279,16 +271,15 @@ def _boxes(segment: Segment, time: int) -> tuple[Box, ...]:
 
 
 def _box(row: dict[str, Any], vehicle: Float[np.ndarray, "4 4"]) -> Box:
-    def vector(of: str) -> Float[np.ndarray, "3"]:
-        return np.array([row[f"{of}_{axis}"] for axis in "xyz"], dtype=np.float64)
+    def read(key: str) -> Float[np.ndarray, "3"]:
+        return np.array([row[f"{key}_{axis}"] for axis in "xyz"], dtype=np.float64)
 
-    speed, (length, width, height) = float(np.linalg.norm(vector("speed"))), vector("size").tolist()
-    pose = vehicle @ upright(vector("center"), np.float64(row["heading"]))
+    speed, (length, width, height) = float(np.linalg.norm(read("speed"))), read("size").tolist()
+    pose = vehicle @ upright(read("center"), np.float64(row["heading"]))
     return Box(pose, (length, width, height), speed if np.isfinite(speed) else None)
 
 
 def _matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    """A transform from its 16 numbers, row by row."""
     if values is None or len(values) != 16 or not np.isfinite(values).all():
         raise InputError(f"A transform in {title} is damaged; {ADVICE}.")
     return np.asarray(values, dtype=np.float64).reshape(4, 4)

@@ -1,1 +1,1 @@
-"""In which frame a user's splat lies, told from the photographs it was trained on."""
+"""Alignment of an input splat with the photographs it was trained on."""

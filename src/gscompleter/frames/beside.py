@@ -1,4 +1,4 @@
-"""What trainers leave beside a splat about its frame: their cameras, or the transform itself."""
+"""Files that trainers leave with a splat: their cameras, or the transform of the scene."""
 
 from __future__ import annotations
 
@@ -22,29 +22,28 @@ from gscompleter.frames.trainers import WORLDS
 from gscompleter.types import Gaussians
 
 DATAPARSER = "dataparser_transforms.json"
-"""What a nerfstudio run writes about the frame that it trains in."""
+"""File of a nerfstudio run with the transform that it applied to the scene."""
 CAMERAS = "cameras"
-"""How the names of lists of cameras begin. The rest may name the splat, as in `splat_small.ply`
-and `cameras_small.json`."""
+"""Prefix of camera lists; the rest may match the splat: `cameras_2.json` for `splat_2.ply`."""
 ITERATION = "iteration_"
-"""Folders in which Inria's trainer keeps splats, two below that of its cameras.json."""
+"""Prefix of the folders of Inria's trainer, two levels below its cameras.json."""
 MAX_PAIRS = 200
-"""Photographs by which two lists of cameras are compared."""
+"""Photographs by which two camera lists are compared."""
 
 
 @dataclass(frozen=True)
 class GivenSplat:
-    """A user's splat, and where word of its frame may lie."""
+    """An input splat, and the folders where its trainer may have left files."""
 
     path: Path
     scene: Gaussians
     origin: Float[np.ndarray, "3"]
-    """Where the coordinates of `scene` are counted from, in those of its file."""
+    """Origin of the coordinates of `scene`, in the frame of its file."""
     photographs: Path
-    """The folder of the photographs, or a file in it."""
+    """Folder of the photographs, or a file in it."""
 
     def folders(self) -> list[Path]:
-        """In which trainers leave files, the nearest to the splat first."""
+        """List the folders where trainers leave files, the nearest to the splat first."""
         near = self.path.resolve().parent
         model = [near.parent.parent] if near.name.startswith(ITERATION) else []
         scene = self.photographs if self.photographs.is_dir() else self.photographs.parent
@@ -54,13 +53,10 @@ class GivenSplat:
 def frames_left(
     splat: GivenSplat, photographs: Photographs
 ) -> Iterator[tuple[Literal["cameras", "dataparser"], Matrix]]:
-    """Transforms from the photographs' frame to the splat's that trainers' files tell.
+    """Yield transforms from the photographs' frame to the splat's, as found in trainers' files.
 
-    Both frames are told from their origins. What nerfstudio writes leads from the world of the
-    reconstruction, out of which its transforms.json has been turned in one of two ways.
-
-    Raises:
-        InputError: where one of the files is damaged.
+    Both frames are relative to their origins. The transform of nerfstudio starts from the world of
+    the reconstruction, which one of the `WORLDS` turns into that of its transforms.json.
     """
     to_photographs = np.linalg.inv(frame_from_photographs(photographs.origin))
     to_splat = frame_from_photographs(splat.origin)
@@ -79,17 +75,17 @@ def frames_left(
 
 
 def usable(frame: Frame) -> bool:
-    """Whether its pose is one."""
+    """Return True if the pose of a frame is valid."""
     return pose_defect(frame.c2w) is None
 
 
 def to_local(frame: Frame, origin: Float[np.ndarray, "3"]) -> Matrix:
-    """The pose of a frame told from `origin`."""
+    """Compute the pose of a frame relative to `origin`."""
     return frame_from_photographs(origin) @ frame.c2w
 
 
 def camera_lists(splat: GivenSplat) -> list[Path]:
-    """The lists of cameras whose name belongs to the splat's, the closest name first."""
+    """Find the camera lists whose name matches the splat, the best match first."""
     found = []
     for folder in splat.folders():
         files = sorted(folder.glob(f"{CAMERAS}*.json"), key=lambda file: (-len(file.stem), file))
@@ -99,9 +95,10 @@ def camera_lists(splat: GivenSplat) -> list[Path]:
 
 
 def between_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) -> Matrix | None:
-    """The similarity from the poses of `ours` to those of the same names in `theirs`.
+    """Fit the similarity from the poses `ours` to those of the same names in `theirs`.
 
-    None where fewer than two have their name in common, or they do not stand apart.
+    Returns:
+        None if fewer than two names match, or all cameras have one position.
     """
     pairs = in_common(list(ours), list(theirs))
     pairs = pairs[:: max(1, len(pairs) // MAX_PAIRS)]
@@ -110,10 +107,7 @@ def between_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) ->
 
 
 def in_common(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[str, str]]:
-    """The names of both lists that are the same but for endings, and for folders.
-
-    Folders count where the names in them repeat, as do those of the cameras of a rig.
-    """
+    """Match names that differ only in extension, or in folder if base names are unique."""
     for spelled in (without_ending, stem):
         a, b = once(ours, spelled), once(theirs, spelled)
         if len(a.keys() & b.keys()) >= 2:
@@ -122,17 +116,17 @@ def in_common(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[str, str
 
 
 def once(names: Sequence[str], spelled: Callable[[str], str]) -> dict[str, str]:
-    """The names by another spelling, without those that share theirs."""
+    """Index names by their normalized form; ambiguous ones are dropped."""
     count = Counter(map(spelled, names))
     return {spelled(name): name for name in names if count[spelled(name)] == 1}
 
 
 def without_ending(name: str) -> str:
-    """`images/0001` of `images/0001.jpg`."""
+    """Drop the extension: `images/0001` for `images/0001.jpg`."""
     path = PurePosixPath(name)
     return str(path.with_name(path.stem)) if path.name else name
 
 
 def stem(name: str) -> str:
-    """`0001` of `images/0001.jpg`."""
+    """Get the base name: `0001` for `images/0001.jpg`."""
     return PurePosixPath(name).stem

@@ -1,4 +1,4 @@
-"""How far a render shows things from where the photograph shows them."""
+"""Displacement between a render and a photograph, by optical flow."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 MIN_TRACKED = 15
-"""Fewest corners that must be followed for their drift to tell anything."""
+"""Fewest tracked corners for a valid median."""
 MAX_CORNERS = 200
 MAX_RETURN = 1.0
-"""Pixels by which a corner may miss where it came from when it is followed back."""
+"""Largest error of a corner tracked forward and back, in pixels."""
 Grey = UInt8[np.ndarray, "h w"]
 Corners = Float[np.ndarray, "n 1 2"]
 
@@ -20,15 +20,10 @@ Corners = Float[np.ndarray, "n 1 2"]
 def drift(
     drawn: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]
 ) -> float:
-    """Median distance in pixels between corners of a render and where a photograph has them.
+    """Compute the median displacement of corners from a render to a photograph, in pixels.
 
-    Corners are followed by their surroundings (Lucas and Kanade), there and back. Infinity where
-    too few can be.
-
-    Args:
-        drawn: Brightness of the render, in the exposure of the photograph.
-        truth: Brightness of the photograph.
-        where: The pixels that the render covers.
+    Both are brightness in the exposure of the photograph. Corners in the valid pixels are tracked
+    forward and back (Lucas-Kanade). Infinity if too few survive.
     """
     render, photograph = grey(drawn), grey(truth)
     mask = where.astype(np.uint8)
@@ -45,10 +40,7 @@ def drift(
 
 
 def followed(before: Grey, after: Grey, corners: Corners) -> tuple[Corners, Bool[np.ndarray, "n"]]:
-    """Where corners of one image are in another, and which of them were found.
-
-    Windows of 15 px on four levels reach for about 50 px.
-    """
+    """Track corners by up to about 50 px to another image, and mark those that were found."""
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after, corners, np.zeros_like(corners), winSize=(15, 15), maxLevel=3
     )
@@ -56,5 +48,5 @@ def followed(before: Grey, after: Grey, corners: Corners) -> tuple[Corners, Bool
 
 
 def grey(brightness: Float[np.ndarray, "h w"]) -> Grey:
-    """Brightness in [0, 1] as bytes."""
+    """Convert brightness in [0, 1] to bytes."""
     return (255 * brightness.clip(0, 1)).round().astype(np.uint8)

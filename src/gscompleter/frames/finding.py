@@ -1,4 +1,4 @@
-"""The frame of a user's splat: as given, as a known trainer leaves it, or found by the images."""
+"""Estimates the similarity from the photographs' frame to the splat's frame."""
 
 from __future__ import annotations
 
@@ -29,65 +29,66 @@ from gscompleter.render.proxy import proxy_of
 from gscompleter.types import Gaussians, View
 
 CLEARLY = 2.0
-"""dB by which a frame must fit better than a simpler one to take its place. A blurred splat in the
-right frame gains one from being a little smaller."""
+"""Gain in dB by which a frame must fit better than a simpler one; blur alone can cause 1 dB."""
 
 FAR_OFF = 2.0
-"""Pixels of drift in small photographs from which a user should know of it."""
+"""Displacement in pixels of the small photographs from which the user is warned."""
 
 Method = Literal["given", "cameras", "dataparser", "normalised", "similarity"]
 Candidate = tuple[Method, Matrix]
-"""A transform from the photographs' frame to the splat's, and where it comes from."""
+"""A transform from the photographs' frame to the splat's, and its source."""
 
 
 @dataclass(frozen=True)
 class SplatFrame:
-    """Where a splat lies relative to its photographs."""
+    """The frame of a splat relative to its photographs."""
 
     method: Method
-    """As given, by cameras or the transform that a trainer left, as a known trainer normalises,
-    or by the images."""
+    """Source of the transform: none, a file of the trainer, its normalisation, or the images."""
     transform: Matrix
     """From the frame of the photographs to that of the splat."""
     fit: FrameFit
-    """How well the splat fits the photographs there."""
+    """Fit of the splat to the photographs under `transform`."""
     given: FrameFit
-    """How well it fits them as they were given."""
+    """Fit under the identity."""
 
     def sentence(self) -> str:
-        """What was found, for the user."""
-        found = f"the photographs at {self.fit.psnr:.1f} dB ({self.given.psnr:.1f} dB as given)"
+        """Describe the alignment in a sentence."""
+        found = (
+            f"it fits the photographs at {self.fit.psnr:.1f} dB ({self.given.psnr:.1f} dB as given)"
+        )
         where = {
             "given": f"The splat fits the photographs as it is, at {self.fit.psnr:.1f} dB",
-            "cameras": f"The splat lies in the frame of its trainer's list of cameras: {found}",
-            "dataparser": f"The splat lies in the frame of dataparser_transforms.json: {found}",
-            "normalised": f"The splat lies in the frame that its trainer normalised to: {found}",
-            "similarity": f"The splat lies in another frame, which the images told: {found}",
+            "cameras": f"The splat is in the frame of its trainer's camera list: {found}",
+            "dataparser": f"The splat is in the frame of dataparser_transforms.json: {found}",
+            "normalised": f"The splat is in the frame that its trainer normalised to: {found}",
+            "similarity": f"The splat is in a frame found by matching image features: {found}",
         }[self.method]
         if not FAR_OFF < self.fit.drift < math.inf:
             return f"{where}."
-        return f"{where}; but details are {self.fit.drift:.1f} px (of {LONG_SIDE}) off."
+        return (
+            f"{where}; but details are off by {self.fit.drift:.1f} px in images of {LONG_SIDE} px."
+        )
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that tells where a splat lies."""
+    """The splat and the photographs that it is aligned with."""
 
     scene: Gaussians
-    """The splat. One of very many lies in an order in which neighbours follow each other."""
+    """The splat. Large ones are in spatial order, so that neighbours are adjacent."""
     views: Sequence[View]
     """A few small photographs, in their own frame."""
     renderer: Renderer
 
     def near(self, transform: Matrix) -> Evidence:
-        """The same with what the photographs can see of the splat if that is about where it lies,
-        by a transform from their frame to its."""
+        """Simplify the splat to what the cameras see under `transform`, photographs to splat."""
         cameras = [moved_camera(view.camera, transform) for view in self.views]
         proxy = proxy_of(self.scene, cameras)
         return replace(self, scene=thinned(self.scene if proxy is None else proxy.scene))
 
     def at(self, transform: Matrix) -> FrameFit:
-        """The fit under a transform from the photographs' frame to the splat's."""
+        """Score a transform from the photographs' frame to the splat's."""
         views = [moved_view(view, transform) for view in self.views]
         return frame_fit(self.near(transform).scene, views, self.renderer)
 
@@ -98,18 +99,15 @@ def find_frame(
     points: Points | None = None,
     left: Iterable[Candidate] = (),
 ) -> SplatFrame:
-    """Where the splat lies, by how well it fits its photographs.
+    """Estimate the frame of the splat by how well it fits its photographs.
 
-    Frames are tried from the simplest on until one fits, and the first in which all is in place
-    ends the search. One that fits gives way only to one that fits better by `CLEARLY`.
-
-    Args:
-        poses: Of all photographs [n, 4, 4], camera-to-world.
-        points: Sparse points in their frame, where there are some.
-        left: What the splat's trainer left word of.
+    Frames are tried from the simplest on, up to the first that is exact. One that fits is replaced
+    only by one that fits better by `MIN_IMPROVEMENT`. `poses` are camera-to-world of all
+    photographs,
+    `points` sparse points in their frame.
 
     Raises:
-        InputError: where no frame was found that fits.
+        InputError: No frame fits.
     """
     given = evidence.at(np.eye(4))
     best = SplatFrame("given", np.eye(4), given, given)
@@ -133,14 +131,14 @@ def find_frame(
 def candidates(
     poses: Poses, points: Points | None, left: Iterable[Candidate]
 ) -> Iterator[Candidate]:
-    """Frames other than the given one that can be known without the images, simplest first."""
+    """Yield frames that are known without the images, the simplest first."""
     yield from left
     for _, transform in trainers_frames(poses, points):
         yield "normalised", transform
 
 
 def known_frame(evidence: Evidence, best: SplatFrame, others: Iterable[Candidate]) -> SplatFrame:
-    """`best`, or a clearly better one of `others`; the first in which all is in place."""
+    """Select the best of `best` and `others`, stopping at the first that is exact."""
     for method, transform in others:
         fit = evidence.at(transform)
         if better(fit, best.fit):
@@ -151,14 +149,14 @@ def known_frame(evidence: Evidence, best: SplatFrame, others: Iterable[Candidate
 
 
 def better(fit: FrameFit, than: FrameFit) -> bool:
-    """Whether a fit is clearly the better one, and of not much less of the photographs."""
+    """Return True if a fit is clearly better and has at least half of the coverage."""
     if not fit.fits or fit.covered < 0.5 * than.covered:
         return False
     return not than.fits or fit.margin > than.margin + CLEARLY
 
 
 def polished(evidence: Evidence, found: SplatFrame) -> SplatFrame:
-    """`found`, or the similarity near it that features agree with where it is clearly better."""
+    """Refine an alignment by image features; keep `found` unless the result is clearly better."""
     evidence = evidence.near(found.transform)
     photographs = photographs_of(evidence.views)
     transform = refined(evidence.scene, photographs, found.transform, evidence.renderer)
@@ -173,7 +171,7 @@ def polished(evidence: Evidence, found: SplatFrame) -> SplatFrame:
 def similarity_frame(
     evidence: Evidence, points: Points | None, given: FrameFit
 ) -> SplatFrame | None:
-    """The first similarity by which the splat shows what the photographs show; None without one."""
+    """Search all directions for the first similarity that fits, or return None."""
     renderer = evidence.renderer
     if not stand_apart([pose_of(view.camera) for view in evidence.views]):
         return None

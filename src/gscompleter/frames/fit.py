@@ -1,4 +1,4 @@
-"""How well a splat fits photographs: it is drawn at their cameras and compared."""
+"""Scores a splat against photographs: it is rendered at their cameras and compared."""
 
 from __future__ import annotations
 
@@ -17,74 +17,73 @@ from gscompleter.render import Renderer, each_view
 from gscompleter.types import Camera, Gaussians, Render, View
 
 GAINS = (0.5, 2.0)
-"""Contrasts between which a photograph's exposure may differ from the splat's."""
+"""Range of the exposure gain between a render and a photograph."""
 MIN_COVERED = 0.05
-"""Share of an image that must be covered for it to tell anything."""
+"""Smallest share of covered pixels for a valid score."""
 MIN_MARGIN = 3.0
-"""dB above a flat image from which a render shows what the photograph shows: half of its
-variance is explained."""
+"""Smallest margin in dB of a match: half of the photograph's variance is explained."""
 MIN_PSNR = 30.0
-"""dB from which even a flat photograph, most of it covered, is shown as it is."""
+"""PSNR in dB above which a flat photograph counts as a match, if half of it is covered."""
 MAX_DRIFT = 0.25
-"""Pixels, of small photographs, up to which things are where they belong. A good splat in its
-frame has 0.1; one that is 0.5 % too large 0.5."""
+"""Largest displacement of an exact alignment, in pixels of the small photographs.
+
+A scale error of 0.5 % causes 0.5.
+"""
 
 
 @dataclass(frozen=True)
 class ImageFit:
-    """How well the splat shows one photograph."""
+    """Fit of the splat to one photograph."""
 
     psnr: float
-    """In dB over the covered pixels, after the exposures were evened out."""
+    """PSNR in dB over the covered pixels, after matching the exposure."""
     margin: float
-    """How far that is above the best flat image, in dB."""
+    """PSNR above that of the best flat image, in dB."""
     covered: float
-    """Share of the pixels that the splat covers."""
     drift: float
-    """Pixels from where the splat shows corners to where the photograph does; infinity where
-    too few are recognised."""
+    """Displacement of corners from render to photograph, in pixels; infinity if unknown."""
 
     @property
     def shows(self) -> bool:
-        """Whether the splat shows what the photograph shows."""
+        """True if the splat shows the content of the photograph."""
         flat = self.psnr >= MIN_PSNR and self.covered >= 0.5
         return self.covered >= MIN_COVERED and (self.margin >= MIN_MARGIN or flat)
 
 
 @dataclass(frozen=True)
 class FrameFit:
-    """How well the splat shows photographs.
+    """Fit of the splat to several photographs.
 
-    Its figures are medians over the better half of those that see it, for a splat need not have
-    been trained on all.
+    Figures are medians over the better half of those that see the splat: it may not be trained on
+    all.
     """
 
     images: tuple[ImageFit, ...]
 
     @property
     def fits(self) -> bool:
-        """Whether the splat shows what two of the photographs show, or the only one."""
+        """True if the splat matches two photographs, or the only one."""
         shown = sum(image.shows for image in self.images)
         return shown >= max(1, min(2, len(self.images)))
 
     @property
     def in_place(self) -> bool:
-        """Whether it fits, and shows things where the photographs do."""
+        """True if the splat fits and is displaced by at most `MAX_DRIFT`."""
         return self.fits and self.drift <= MAX_DRIFT
 
     @property
     def psnr(self) -> float:
-        """In dB; 0 where no photograph sees the splat."""
+        """PSNR in dB; 0 if no photograph sees the splat."""
         return self._middle("psnr", 0.0)
 
     @property
     def margin(self) -> float:
-        """In dB above the best flat image."""
+        """PSNR above that of the best flat image, in dB."""
         return self._middle("margin", 0.0)
 
     @property
     def drift(self) -> float:
-        """In pixels; infinity where it is not known."""
+        """Displacement in pixels; infinity if unknown."""
         return self._middle("drift", math.inf)
 
     @property
@@ -100,7 +99,7 @@ class FrameFit:
 
 
 def frame_fit(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> FrameFit:
-    """How well `scene` fits the photographs at their cameras, which are in its frame."""
+    """Score `scene` against photographs whose cameras are in its frame."""
 
     def fit(view: View) -> ImageFit:
         return compared(seen_from(scene, view.camera, renderer), view.image)
@@ -109,7 +108,7 @@ def frame_fit(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> Fr
 
 
 def seen_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
-    """The render of `scene`, in the unit of its own depths, which no camera need know yet."""
+    """Render `scene`, with a near plane derived from its own depths."""
     z = z_depths(scene.means, camera)
     unit = z[z > 0].median().item() if (z > 0).any() else 1.0
     with torch.no_grad():
@@ -117,27 +116,27 @@ def seen_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
 
 
 def compared(render: Render, photograph: Float[Tensor, "h w 3"]) -> ImageFit:
-    """The fit of one image."""
+    """Score a render against one photograph."""
     where = render.alpha >= COVERED
     covered = where.float().mean().item()
     if covered < MIN_COVERED:
         return ImageFit(0.0, 0.0, covered, math.inf)
     truth = photograph[where].double()
-    drawn = evened_out(render.image[where].double(), truth)
-    psnr = decibels((drawn - truth).square().mean())
+    rendered = evened_out(render.image[where].double(), truth)
+    psnr = decibels((rendered - truth).square().mean())
     margin = psnr - decibels((truth - truth.mean()).square().mean())
-    shown = photograph.double().index_put((where,), drawn)
+    shown = photograph.double().index_put((where,), rendered)
     before, after = (i.mean(dim=-1).cpu().numpy() for i in (shown, photograph.double()))
     return ImageFit(psnr, margin, covered, drift(before, after, where.cpu().numpy()))
 
 
 def evened_out(drawn: Float[Tensor, "n 3"], truth: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """`drawn` in the exposure of `truth`: one gain and one offset, by least squares."""
+    """Match the exposure of `truth` by one gain and one offset (least squares)."""
     centred = drawn - drawn.mean()
     gain = (centred * (truth - truth.mean())).sum() / centred.square().sum().clamp_min(1e-12)
     return gain.clamp(*GAINS) * centred + truth.mean()
 
 
 def decibels(error: Float[Tensor, ""]) -> float:
-    """PSNR of a mean squared error, at most 100 dB."""
+    """Convert a mean squared error to PSNR in dB, at most 100."""
     return -10 * math.log10(max(error.item(), 1e-10))

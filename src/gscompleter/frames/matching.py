@@ -1,4 +1,4 @@
-"""Features of photographs that are found again in renders of the splat."""
+"""Matches features of photographs with renders of the splat."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gscompleter.types import Camera, Gaussians, View
 MIN_INLIERS = 15
 """Fewest matches that must agree with a pose."""
 MAX_ERROR = 3.0
-"""Pixels by which a match may miss its place."""
+"""Largest reprojection error of an inlier, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -35,24 +35,24 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Located:
-    """A photograph whose camera was found in the splat."""
+    """A photograph whose pose in the splat was found."""
 
     photograph: Photograph
     pose: Matrix
     """Camera-to-world in the splat's frame."""
     points: Float[np.ndarray, "m 3"]
-    """Of the splat, in its frame, that agree with that pose."""
+    """Inlier points of the splat, in its frame."""
     pixels: Float[np.ndarray, "m 2"]
-    """Where the photograph shows them."""
+    """Pixels of the points in the photograph."""
 
 
 def photographs_of(views: Sequence[View]) -> list[Photograph]:
-    """The views with their features."""
+    """Extract the features of all views."""
     return [Photograph(view.camera, features_in(view)) for view in views]
 
 
 def features_in(view: View) -> Features:
-    """The features of an image."""
+    """Extract the features of one view."""
     camera, pose = view.camera, pose_of(view.camera)
     pixels = np.ascontiguousarray(view.image.detach().cpu().clamp(0, 1).float().numpy())
     K = camera.K.detach().cpu().double().numpy()
@@ -62,7 +62,7 @@ def features_in(view: View) -> Features:
 def located(
     scene: Gaussians, camera: Camera, photographs: Sequence[Photograph], renderer: Renderer
 ) -> list[Located]:
-    """Those of the photographs that show what `camera` sees of the splat, with their poses."""
+    """Find the poses of the photographs that show what `camera` sees of the splat."""
     render = seen_from(scene, camera, renderer)
     features = features_in(View(render.image, camera))
     surface = unproject(render.depth, camera).where((render.alpha >= COVERED)[..., None], torch.nan)
@@ -74,9 +74,9 @@ def located(
 def _located(
     features: Features, places: Float[np.ndarray, "h w 3"], photograph: Photograph
 ) -> Located | None:
-    """The photograph's pose by what it shares with a render; None where that is too little."""
-    drawn, pixels = matches(features, photograph.features)
-    columns, rows = np.floor(drawn).astype(int).T
+    """Estimate a photograph's pose by PnP against a render; None with too few inliers."""
+    rendered, pixels = matches(features, photograph.features)
+    columns, rows = np.floor(rendered).astype(int).T
     points = places[rows.clip(0, len(places) - 1), columns.clip(0, places.shape[1] - 1)]
     known = np.isfinite(points).all(axis=1)
     points, pixels = points[known], pixels[known]
@@ -93,7 +93,7 @@ def _located(
 
 
 def _pose(rotation: Float[np.ndarray, "3 1"], shift: Float[np.ndarray, "3 1"]) -> Matrix:
-    """Camera-to-world of OpenCV's world-to-camera rotation vector and shift."""
+    """Convert OpenCV's world-to-camera vectors to camera-to-world."""
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = cv2.Rodrigues(rotation)[0], shift.ravel()
     return np.linalg.inv(viewmat)

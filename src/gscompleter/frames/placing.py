@@ -1,4 +1,4 @@
-"""A user's splat and the photographs of a folder, brought together."""
+"""Aligns an input splat with a folder of photographs."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from gscompleter.render import Renderer
 def frame_of_splat(
     splat: GivenSplat, photographs: Photographs, frames: Sequence[int], renderer: Renderer
 ) -> SplatFrame:
-    """Where a splat lies relative to the photographs, both told from their origins.
+    """Estimate the transform from photographs to splat, relative to their origins.
 
-    Args:
-        frames: Numbers of photographs to look at in any case.
+    The photographs numbered `frames` are used in any case.
 
     Raises:
-        InputError: where it fits in no frame, or one of `frames` cannot be used.
+        InputError: No frame fits, or one of `frames` cannot be read.
     """
     views = [view.to(splat.scene.means.device) for view in witnesses(photographs, frames)]
     points = photographs.points()

@@ -1,4 +1,4 @@
-"""A similarity made exact: matched features of all photographs must agree with it."""
+"""Refines a similarity by features matched in all photographs."""
 
 from __future__ import annotations
 
@@ -21,20 +21,15 @@ from gscompleter.render import Renderer, each_view
 from gscompleter.types import Gaussians
 
 ROUNDS = 2
-"""Each draws the splat where the former has put the cameras."""
+"""Iterations, each with renders at the cameras of the previous one."""
 SETTLED = 0.25
-"""Pixels by which a round moves the points of a photograph, in the middle of all photographs, up to
-which another would change nothing."""
+"""Median change of the reprojected points, in pixels, at which the iteration stops."""
 
 
 def refined(
     scene: Gaussians, photographs: Sequence[Photograph], transform: Matrix, renderer: Renderer
 ) -> Matrix | None:
-    """The similarity near `transform` that features agree with; None where too few are found.
-
-    Args:
-        transform: From the frame of the photographs to that of `scene`.
-    """
+    """Refine a similarity (photographs to splat) by features; None if too few match."""
     for _ in range(ROUNDS):
         cameras = [moved_camera(photograph.camera, transform) for photograph in photographs]
         alone = [[photograph] for photograph in photographs]
@@ -51,7 +46,7 @@ def refined(
 
 
 def similarity_of(found: Sequence[Located]) -> Matrix | None:
-    """Photographs' frame to the splat's, by located photographs; None where they are too few."""
+    """Fit photographs' frame to splat's frame by located photographs; None if too few."""
     before = [pose_of(place.photograph.camera) for place in found]
     if not stand_apart(before):
         return None
@@ -60,12 +55,12 @@ def similarity_of(found: Sequence[Located]) -> Matrix | None:
 
 
 def reprojected(found: Sequence[Located], start: Matrix) -> Matrix:
-    """The similarity whose reprojection errors are smallest; outliers hardly count.
+    """Minimize the robust reprojection error over similarities.
 
-    The seven unknowns change the splat's points, seen from the photographs' frame: the logarithm
-    of the scale, a rotation vector, and a shift in units of the points' spread.
+    The seven unknowns move the splat's points in the photographs' frame: logarithm of the scale,
+    rotation vector, and shift in units of the points' spread.
     """
-    # Here, for they take half a second to import and few splats need them.
+    # Imported here, because it takes half a second and few splats need it.
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
@@ -87,19 +82,19 @@ def reprojected(found: Sequence[Located], start: Matrix) -> Matrix:
 
 
 def brought_back(place: Located, transform: Matrix) -> Float[np.ndarray, "m 3"]:
-    """The points of the splat that a photograph shows, in the photographs' frame."""
+    """Transform the inlier points of a photograph to the photographs' frame."""
     back = np.linalg.inv(transform)
     return place.points @ back[:3, :3].T + back[:3, 3]
 
 
 def _shift(place: Located, before: Matrix, after: Matrix) -> float:
-    """By how much a photograph's points move in it from one similarity to another, in pixels."""
+    """Compute the median change of the reprojection error between two similarities, in pixels."""
     seen = [_misses(brought_back(place, m), place) for m in (before, after)]
     return float(np.median(np.abs(seen[1] - seen[0])))
 
 
 def _misses(points: Float[np.ndarray, "m 3"], place: Located) -> Float[np.ndarray, "k"]:
-    """How far points miss their pixels, along x and y, in pixels."""
+    """Compute the reprojection errors along x and y, in pixels."""
     pose = pose_of(place.photograph.camera)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     homogeneous = local @ place.photograph.camera.K.detach().cpu().double().numpy().T

@@ -1,4 +1,4 @@
-"""A splat in an unknown frame: it is looked at from all around until photographs are recognised."""
+"""Searches the frame of a splat: rendered from all directions until photographs match."""
 
 from __future__ import annotations
 
@@ -18,25 +18,21 @@ Middle = tuple[Float[np.ndarray, "3"], float]
 """Centre and radius of points."""
 
 DIRECTIONS = 40
-"""Around the splat, about 30° apart: features bear a turn of half of that, and any roll."""
+"""Directions around the splat, about 30° apart; features tolerate half of that and any roll."""
 ZOOMS = (1.0, 0.6, 1.7)
-"""Times the size of the splat by its points, which far Gaussians and floaters blur."""
+"""Trial factors on the size of the splat, which far Gaussians and floaters blur."""
 
 
 def searched(
     scene: Gaussians, photographs: Sequence[Photograph], points: Points, renderer: Renderer
 ) -> Iterator[Matrix]:
-    """Similarities from the photographs' frame to the splat's by which some are recognised.
-
-    Args:
-        points: On the surfaces of the scene, in the photographs' frame.
-    """
+    """Yield similarities from photographs to splat by which some photographs match."""
     seer = photographs[len(photographs) // 2].camera
     if len(scene) == 0:
         return
     solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
     goal = middle_of(solid)
-    if goal[1] == 0:  # most of it is one point, which looks the same from everywhere
+    if goal[1] == 0:  # most of it is one point: all directions are alike
         return
     for transform in starts(pose_of(seer), middle_of(points), goal):
         found = located(scene, moved_camera(seer, transform), photographs, renderer)
@@ -46,7 +42,7 @@ def searched(
 
 
 def starts(pose: Matrix, place: Middle, goal: Middle) -> Iterator[Matrix]:
-    """Similarities that bring `place` to `goal` (centre and radius), with the camera all around."""
+    """Yield similarities that map `place` to `goal` (centre, radius), from all directions."""
     (center, radius), (new_center, new_radius) = place, goal
     for zoom in ZOOMS:
         scale = zoom * new_radius / max(radius, 1e-12)
@@ -56,13 +52,13 @@ def starts(pose: Matrix, place: Middle, goal: Middle) -> Iterator[Matrix]:
 
 
 def middle_of(points: Points) -> Middle:
-    """Centre and radius of most of the points: medians, which floaters do not move."""
+    """Compute centre and radius of points as medians, which ignore floaters."""
     center = np.median(points, axis=0)
     return center, float(np.median(np.linalg.norm(points - center, axis=1)))
 
 
 def directions(count: int) -> Float[np.ndarray, "n 3"]:
-    """Unit vectors spread evenly over the sphere, on a golden spiral."""
+    """Sample unit vectors on a golden spiral over the sphere."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)
     ring = np.sqrt(1 - z * z)

@@ -1,4 +1,4 @@
-"""Similarities `x' = s R x + t` as 4x4 matrices, and cameras that are moved by them."""
+"""Similarities `x' = s R x + t` as 4x4 matrices, and cameras transformed by them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Matrix = Float[np.ndarray, "4 4"]
 def similarity(
     scale: float, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]
 ) -> Matrix:
-    """`x' = scale * rotation @ x + shift`."""
+    """Make the matrix of `x' = scale * rotation @ x + shift`."""
     matrix = np.eye(4)
     matrix[:3, :3] = scale * rotation
     matrix[:3, 3] = shift
@@ -26,17 +26,17 @@ def similarity(
 
 
 def scale_of(transform: Matrix) -> float:
-    """The factor by which a similarity multiplies lengths."""
+    """Get the scale of a similarity."""
     return float(np.cbrt(np.linalg.det(transform[:3, :3])))
 
 
 def rotation_of(transform: Matrix) -> Float[np.ndarray, "3 3"]:
-    """The turn of a similarity."""
+    """Get the rotation of a similarity."""
     return transform[:3, :3] / scale_of(transform)
 
 
 def moved_pose(c2w: Matrix, transform: Matrix) -> Matrix:
-    """A camera's pose in the frame that `transform` leads to."""
+    """Transform a camera-to-world pose by a similarity."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_of(transform) @ c2w[:3, :3]
     pose[:3, 3] = transform[:3, :3] @ c2w[:3, 3] + transform[:3, 3]
@@ -44,10 +44,7 @@ def moved_pose(c2w: Matrix, transform: Matrix) -> Matrix:
 
 
 def moved_camera(camera: Camera, transform: Matrix) -> Camera:
-    """The same camera in the frame and unit that `transform` leads to.
-
-    The identity gives the very same camera, without rounding.
-    """
+    """Transform a camera and its depth range; the identity returns the same object."""
     if np.array_equal(transform, np.eye(4)):
         return camera
     factor = scale_of(transform)
@@ -58,12 +55,12 @@ def moved_camera(camera: Camera, transform: Matrix) -> Camera:
 
 
 def moved_exactly(camera: Camera, transform: Matrix) -> Camera:
-    """The same in float64, for a file: maps have large coordinates."""
+    """Transform a camera in float64, for files: maps have large coordinates."""
     return moved_camera(replace(camera, c2w=camera.c2w.double()), transform)
 
 
 def moved_view(view: View, transform: Matrix) -> View:
-    """A photograph, its camera and its measured depth in the frame that `transform` leads to."""
+    """Transform a photograph's camera and its measured depth."""
     if np.array_equal(transform, np.eye(4)):
         return view
     depth = None if view.depth is None else view.depth * scale_of(transform)
@@ -71,29 +68,28 @@ def moved_view(view: View, transform: Matrix) -> View:
 
 
 def pose_of(camera: Camera) -> Matrix:
-    """Its camera-to-world transform as an array in float64."""
+    """Get the camera-to-world transform as a float64 array."""
     return camera.c2w.detach().cpu().double().numpy()
 
 
 def stand_apart(poses: Sequence[Matrix]) -> bool:
-    """Whether there are two cameras or more, not all in one place, so that they tell a scale."""
+    """Return True if there are two or more cameras, at different positions."""
     centers = np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
     return len(poses) >= 2 and bool(np.ptp(centers, axis=0).max() > 1e-6 * np.abs(centers).max())
 
 
 def similarity_between(before: Sequence[Matrix], after: Sequence[Matrix]) -> Matrix:
-    """The similarity that takes poses to others of the same cameras, where most of these are right.
+    """Fit the similarity between two sets of poses of the same cameras, robust to outliers.
 
-    The rotation is the one closest to most, the scale the median over cameras of their median
-    ratio of distances to others, the shift the median: a minority of wrong poses moves none far.
-    The poses of both stand apart (`stand_apart`).
+    The rotation is the one closest to most; scale and shift are medians. Both sets satisfy
+    `has_baseline`.
     """
     turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
     closeness = np.einsum("iab,jab->ij", turns, turns)
     rotation = turns[np.median(closeness, axis=1).argmax()]
     old, new = np.stack(before)[:, :3, 3], np.stack(after)[:, :3, 3]
     apart = np.linalg.norm(old[:, None] - old, axis=-1)
-    # Of two cameras that are farthest apart, one is far enough from any other.
+    # Every camera is far enough from at least one of the two that are farthest apart.
     apart[apart < 0.3 * apart.max()] = np.nan
     ratios = np.linalg.norm(new[:, None] - new, axis=-1) / apart
     scale = float(np.median(np.nanmedian(ratios, axis=1)))

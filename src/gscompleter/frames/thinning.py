@@ -1,4 +1,4 @@
-"""Fewer Gaussians that look about the same in small images."""
+"""A subset of Gaussians that renders almost the same in small images."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from torch import Tensor
 from gscompleter.types import Gaussians
 
 MAX_GAUSSIANS = 400_000
-"""Several for each pixel of a small image; more say nothing new there."""
+"""Largest number kept: several per pixel of a small image."""
 SAMPLE = 100_000
-"""Gaussians by which the sizes of all are known."""
+"""Gaussians from which the distribution of sizes is estimated."""
 
 
 def thinned(scene: Gaussians, most: int = MAX_GAUSSIANS) -> Gaussians:
-    """`scene`, or where it has more than `most` Gaussians, about as many, enlarged.
+    """Reduce a scene to about `max_gaussians` Gaussians, enlarged to cover the same area.
 
-    A Gaussian stays with a chance in proportion to its size, and one that stays stands for others
-    like it: its cross-section grows by as much as they are fewer. Which ones stay follows from
-    their order alone, and neighbours in a file are thinned evenly.
+    Gaussians are kept with a probability proportional to their size. The choice depends on their
+    order
+    alone, and neighbours in the file are thinned evenly.
     """
     if len(scene) <= most:
         return scene
@@ -33,7 +33,7 @@ def thinned(scene: Gaussians, most: int = MAX_GAUSSIANS) -> Gaussians:
 def thinning(
     scene: Gaussians, most: int = MAX_GAUSSIANS
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
-    """Indices of the Gaussians that stay, and the factor by which each one's size grows."""
+    """Select the rows to keep, and the factor by which their sizes grow."""
     if len(scene) <= most:
         return torch.arange(len(scene), device=scene.means.device), torch.ones_like(scene.opacities)
     chance = chances(scene, most)
@@ -44,10 +44,9 @@ def thinning(
 
 
 def chances(scene: Gaussians, most: int) -> Float[Tensor, "n"]:
-    """In proportion to what each Gaussian covers to the eye, as a length; `most` in sum or less.
+    """Compute keep probabilities proportional to projected size; their sum is at most the limit.
 
-    The largest hundredth count alike: floaters and the sky are large, few, and not what
-    photographs are recognised by.
+    The largest 1 % is clamped: floaters and sky are large, few, and useless for matching.
     """
     cross_section = scene.scales.prod(dim=1) / scene.scales.amin(dim=1).clamp_min(1e-30)
     size = (cross_section * scene.opacities).sqrt()

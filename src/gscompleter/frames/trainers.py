@@ -1,6 +1,6 @@
-"""The frames that trainers of splats move a scene into, computed from its cameras and points.
+"""Normalisations that splat trainers apply to a scene, computed from cameras and points.
 
-Each function takes poses (OpenCV axes) and gives transforms from their frame to the trainer's.
+Each function takes poses (OpenCV axes) and returns transforms from their frame to the trainer's.
 """
 
 from __future__ import annotations
@@ -20,15 +20,13 @@ WORLDS = (
     np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
     np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
 )
-"""Turns from COLMAP's world that nerfstudio applies before all else: none, today's, the former."""
+"""Rotations from COLMAP's world that nerfstudio applies first: none, today's, the former."""
 
 
 def trainers_frames(poses: Poses, points: Points | None = None) -> Iterator[tuple[str, Matrix]]:
-    """Every frame that a known trainer may have moved the scene into, with the trainer's name.
+    """Yield the name and transform of every known normalisation.
 
-    Args:
-        poses: Of all photographs, for trainers normalise by all of them.
-        points: The sparse points that the trainer began with, where they are known.
+    `poses` are those of all photographs, `points` the sparse points that the trainer started from.
     """
     yield "OpenSplat", opensplat(poses)
     for world in WORLDS:
@@ -40,7 +38,7 @@ def trainers_frames(poses: Poses, points: Points | None = None) -> Iterator[tupl
 
 
 def opensplat(poses: Poses) -> Matrix:
-    """Centred on the mean camera; the largest coordinate of a camera becomes 1."""
+    """Centre on the mean camera and scale the largest camera coordinate to 1."""
     centers = poses[:, :3, 3]
     offsets = centers - centers.mean(axis=0)
     scale = 1 / max(np.abs(offsets).max(), 1e-12)
@@ -48,21 +46,16 @@ def opensplat(poses: Poses) -> Matrix:
 
 
 def nerfstudio(poses: Poses, world: Float[np.ndarray, "3 3"]) -> Matrix:
-    """The mean up direction becomes z, then as `opensplat` does.
-
-    Args:
-        world: The turn that was applied to the cameras before.
-    """
+    """Rotate the mean up direction to z after the rotation `world`, then scale like OpenSplat."""
     up = -(poses[:, :3, 1] @ world.T).mean(axis=0)
     upright = similarity(1.0, shortest_turn(up, np.array([0.0, 0.0, 1.0])) @ world, np.zeros(3))
     return opensplat(np.stack([moved_pose(pose, upright) for pose in poses])) @ upright
 
 
 def gsplat_cameras(poses: Poses) -> Matrix:
-    """The first half of gsplat's normalisation: by the cameras.
+    """Compute the camera half of gsplat's normalisation.
 
-    Up is turned to the axis -y, the point that the cameras look at becomes the origin, and the
-    median distance of the cameras from it becomes 1.
+    Up becomes -y, the point that the cameras face the origin, and their median distance from it 1.
     """
     turn = shortest_turn(-poses[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
     centers, forward = poses[:, :3, 3] @ turn.T, poses[:, :3, 2] @ turn.T
@@ -73,10 +66,10 @@ def gsplat_cameras(poses: Poses) -> Matrix:
 
 
 def gsplat_points(cameras: Matrix, points: Points) -> Iterator[Matrix]:
-    """The second half: the principal axes of the points become x, y and z, largest first.
+    """Yield the point half: principal axes become x, y and z, the largest first.
 
-    Which way an eigenvector points is up to the linear algebra at hand, and newer versions turn
-    the scene upside down where it seems so: all four right-handed choices are given.
+    Signs of eigenvectors depend on the library, and newer versions flip the scene upright: all four
+    right-handed choices are yielded.
     """
     moved = points @ cameras[:3, :3].T + cameras[:3, 3]
     center = np.median(moved, axis=0)
@@ -91,7 +84,7 @@ def gsplat_points(cameras: Matrix, points: Points) -> Iterator[Matrix]:
 def shortest_turn(
     start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """The rotation about their common normal that takes one direction to a unit one."""
+    """Compute the smallest rotation from one direction to a unit vector."""
     start = start / max(float(np.linalg.norm(start)), 1e-12)
     x, y, z = np.cross(start, end)
     cosine = float(start @ end)

@@ -1,4 +1,4 @@
-"""The photographs that tell where a splat lies: a few, small, from all along the path."""
+"""Sample photographs for the alignment: a few, small, spread along the path."""
 
 from __future__ import annotations
 
@@ -15,18 +15,16 @@ from gscompleter.matching.depth_range import estimate_depth_range
 from gscompleter.types import View
 
 COUNT = 8
-"""Photographs that are looked at."""
+"""Number of sample photographs."""
 LONG_SIDE = 320
-"""Of them, in pixels: enough for features and for a blur of a pixel to be seen."""
+"""Their longer side in pixels: enough for features and for a blur of one pixel."""
 
 
 def witnesses(photographs: Photographs, frames: Sequence[int]) -> list[View]:
-    """The first of `frames`, which must be readable, and others spread over all photographs.
-
-    A photograph that cannot be read is no witness, unless it is one of `frames`.
+    """Load the first of `frames` and further photographs spread over all.
 
     Raises:
-        InputError: where one of `frames` cannot be used.
+        InputError: One of `frames` cannot be read; other unreadable photographs are skipped.
     """
     named = list(frames)[: COUNT // 2]
     spread = np.linspace(0, len(photographs) - 1, COUNT).round().astype(int).tolist()
@@ -41,21 +39,15 @@ def witnesses(photographs: Photographs, frames: Sequence[int]) -> list[View]:
 
 
 def usable_poses(photographs: Photographs) -> Poses:
-    """Camera-to-world of all frames whose pose is one, told from the photographs' origin."""
+    """Collect the valid camera-to-world poses, relative to the photographs' origin."""
     poses = [frame.c2w for frame in photographs.frames if pose_defect(frame.c2w) is None]
-    told = np.stack(poses).astype(np.float64)
-    told[:, :3, 3] -= photographs.origin
-    return told
+    shifted = np.stack(poses).astype(np.float64)
+    shifted[:, :3, 3] -= photographs.origin
+    return shifted
 
 
 def rough_points(views: Sequence[View]) -> Points:
-    """About where the scene lies, for photographs without sparse points: a grid before each.
-
-    Its depth is the middle of what matched features tell.
-
-    Raises:
-        InputError: where they have no baseline.
-    """
+    """Estimate scene points without a sparse cloud: a grid at the median depth of each view."""
     near, far = estimate_depth_range(views)
     depth = float(np.sqrt(near * far))
     rays = [view.camera.z_rays()[::16, ::16].reshape(-1, 3) for view in views]

@@ -1,8 +1,4 @@
-"""Φ: the nearest photograph and a target camera -> the image that camera would take.
-
-A generator says what it needs and answers requests; any callable of the form above is taken for one
-(`as_generator`). The table of names serves the command line.
-"""
+"""Φ: nearest photograph and target camera -> the image at the target (paper, Eq. 6)."""
 
 from __future__ import annotations
 
@@ -28,63 +24,63 @@ from gscompleter.types import Camera, SceneContext, View
 
 @dataclass(frozen=True)
 class Request:
-    """One image that Φ is asked for."""
+    """Input of Φ for one image."""
 
     nearest: View
-    """The photograph taken closest to `target`."""
+    """Photograph taken closest to `target`."""
     target: Camera
     context: SceneContext
-    """All photographs, and renders of the scene as it is; what Φ uses of it is its own affair."""
+    """All photographs, and renders of the current scene."""
 
 
 @dataclass(frozen=True)
 class Synthesis:
-    """What Φ answers."""
+    """Output of Φ for one image."""
 
     image: Float[Tensor, "h w 3"]
     """In [0, 1], of the size of the target."""
     notes: tuple[str, ...] = ()
-    """What a reader of the results should know of it, a sentence each."""
+    """Sentences about the image for a reader of the results."""
     disagrees: bool = False
-    """Whether the photographs say that it shows something else."""
+    """True if the image does not show the scene of the photographs."""
 
 
 @runtime_checkable
 class Generator(Protocol):
-    """Φ of the paper: what it needs, and the images that it synthesizes."""
+    """Interface of Φ."""
 
     @property
     def takes_margin(self) -> bool:
-        """Whether it can draw more than a target's own image, which is then completed wider."""
+        """True if Φ can synthesize a padded target image."""
 
     @property
     def at_once(self) -> int:
-        """Most requests that it takes together; with 1 each sees what the ones before added."""
+        """Largest batch; with 1, each request sees what the previous ones added."""
 
     def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
-        """An answer for each of `requests`, in their order."""
+        """Synthesize one image per request, in order."""
 
 
 ImageFunction = Callable[[View, Camera, SceneContext], Tensor | Synthesis]
-"""Φ at its simplest: (nearest, target, context) -> an image [h, w, 3], or one with notes."""
+"""Simplest form of Φ: (nearest, target, context) -> image [h, w, 3] or `GeneratorOutput`."""
 
 
 @dataclass(frozen=True)
 class OneByOne:
-    """A plain function as a generator: one request at a time, with the margin."""
+    """A plain function as a generator, with padding and without batches."""
 
     function: ImageFunction
     takes_margin: bool = True
     at_once: int = 1
 
     def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
-        """What the function answers to each of `requests`."""
+        """Call the function once per request."""
         answers = [self.function(r.nearest, r.target, r.context) for r in requests]
         return [a if isinstance(a, Synthesis) else Synthesis(a) for a in answers]
 
 
 def as_generator(phi: Generator | ImageFunction) -> Generator:
-    """`phi` itself, or the plain function that it is as a generator."""
+    """Return `phi`, wrapped as a `Generator` if it is a plain function."""
     return phi if isinstance(phi, Generator) else OneByOne(phi)
 
 
@@ -95,19 +91,18 @@ def load_generator(
     device: str = "cpu",
     settings: GeneratorSettings | None = None,
 ) -> Generator:
-    """The generator called `name`.
+    """Load a generator by name.
 
     Args:
-        name: A name of the table.
-        seed: Of everything random in it; the same seed gives the same image.
-        photographs: True images of the targets, which only `oracle` looks at.
-        device: Where its network runs, if it has one: cpu or cuda.
-        settings: Of the class that the table has for it; None leaves all as it is. A network is
-            loaded once in a process.
+        name: Name of the generator.
+        seed: Random seed; the same seed gives the same image.
+        photographs: True images of the targets, used by `oracle` only.
+        device: Device of the network, cpu or cuda.
+        settings: Settings of this generator, or None for the defaults.
 
     Raises:
-        InputError: where there is none of that name, packages or weights are missing, or settings
-            are another generator's, or out of range.
+        InputError: The name is unknown, packages or weights are missing, or the settings do not
+            fit.
     """
     kind = settings_class(name)
     if not isinstance(settings, kind | None):
@@ -128,7 +123,6 @@ def load_generator(
 def _made(
     settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
 ) -> Generator:
-    """The generator that has such settings. Its module is imported only now."""
     match settings:
         case PEFieldSettings():
             from gscompleter.generators.diffusion.pe_field import load_pe_field

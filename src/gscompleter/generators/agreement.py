@@ -1,8 +1,4 @@
-"""Does a synthesized image agree with what the photographs show of the target?
-
-A model that paints the whole image anew shifts its colours, and may paint something else. The
-shift is measured and taken back; a painting of something else is told.
-"""
+"""Comparison of synthesized images with the photographs, and correction of colour shifts."""
 
 from __future__ import annotations
 
@@ -20,44 +16,40 @@ from gscompleter.generators.warp import Warped
 from gscompleter.interpolation import smoothed
 
 BLUR = 2
-"""Radius, in pixels, over which colours are averaged before they are compared: a painted edge may
-lie a pixel beside the photographed one."""
+"""Blur radius in pixels before colours are compared; edges may be a pixel off."""
 MAX_SHARE = 0.6
-"""Difference of colours, once the shift is taken back, from which an image counts as another scene:
-as a share of what a single colour would leave."""
+"""Largest residual of a consistent image, relative to that of a constant colour."""
 QUANTILE = 0.7
-"""Which pixel's difference counts, from the least to the largest. The median would be that of a
-blank wall where this fills half of what is seen."""
+"""Quantile of the residuals; higher than the median, which may be a blank wall."""
 LEAST = 0.03
-"""A difference that counts as none, however dull the scene. Colours are in [0, 1]."""
+"""Residual that is always accepted, for colours in [0, 1]."""
 MAX_GAIN = 1.6
-"""Largest factor of a channel, and its inverse the smallest, that counts as a colour shift."""
+"""Largest gain of a colour shift; its inverse is the smallest."""
 MAX_OFFSET = 0.25
-"""Largest number added to a channel that counts as a colour shift."""
+"""Largest offset of a colour shift."""
 MIN_PIXELS = 200
-"""Fewest observed pixels that say anything."""
+"""Fewest observed pixels for a comparison."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How an image compares with the photographs: `observed = gain * image + offset`."""
+    """Comparison of an image with the photographs: `observed = gain * image + offset`."""
 
     gain: Float[Tensor, "3"]
     offset: Float[Tensor, "3"]
     residual: float
-    """Difference of colours after the shift was taken back, a quantile over the observed pixels."""
+    """Quantile of the colour difference after the correction."""
     limit: float
-    """The largest one at which the image counts as one of the same scene."""
+    """Largest residual of a consistent image."""
     share: float
-    """Share of the image that was observed."""
     agrees: bool
-    """Whether it shows the same scene, as far as there is anything to compare."""
+    """True if the image is consistent with the photographs, or cannot be compared."""
     image: Float[Tensor, "h w 3"]
-    """The image with the shift taken back where it agrees, else as it was."""
+    """The image, corrected if it is consistent."""
 
     @property
     def shift(self) -> float:
-        """Largest change of a mid-grey by the colour shift."""
+        """Largest change of mid-grey by the correction."""
         return float((0.5 * self.gain + self.offset - 0.5).abs().max())
 
 
@@ -68,17 +60,10 @@ def checked(
     retries: int = 0,
     correct_color: bool = True,
 ) -> Synthesis:
-    """An image painted from a seed, its colours brought to those observed, and notes on it.
+    """Paint an image from a seed, compare it with the photographs and correct its colours.
 
-    Args:
-        paint: Seed -> image in [0, 1].
-        seed: The first to try.
-        observed: What the photographs show of the target.
-        retries: How many further seeds are tried while the image disagrees. The best one is kept.
-        correct_color: Whether a colour shift is taken back.
-
-    Raises:
-        InputError: where no seed gives finite colours.
+    While it is inconsistent, up to `retries` further seeds are tried and the best image is kept.
+    Raise InputError if no seed gives finite colours.
     """
     found: list[Agreement] = []
     for attempt in range(retries + 1):
@@ -89,8 +74,8 @@ def checked(
     best = min(found, key=lambda one: (not one.agrees, one.residual))
     if best.residual == float("inf"):
         raise InputError(
-            f"The generator painted no finite image ({len(found)} seed(s) tried); see that its "
-            "weights are sound, or choose another generator."
+            f"The generator painted no finite image ({len(found)} seed(s) tried); check that its "
+            "weights are correct, or choose another generator."
         )
     return Synthesis(best.image, notes_on(best, len(found)), not best.agrees)
 
@@ -101,8 +86,7 @@ def compare(
     known: Bool[Tensor, "h w"],
     correct_color: bool = True,
 ) -> Agreement:
-    """Measure the colour shift of `image` against `observed` where that is `known`, and take it
-    back if the image agrees and its colours are to be corrected."""
+    """Fit the colour shift of `image` to the `known` pixels and correct it if consistent."""
     ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
     share = known.float().mean().item()
     if not image.isfinite().all():
@@ -127,12 +111,12 @@ def compare(
 
 
 def quantile(values: Float[Tensor, "n"], share: float) -> float:
-    """The value below which `share` of all lie."""
+    """Return the value below which a fraction `share` of the values lies."""
     return values.kthvalue(1 + int(share * (len(values) - 1))).values.item()
 
 
 def notes_on(found: Agreement, tried: int) -> tuple[str, ...]:
-    """What a reader of the results should know of it."""
+    """Write notes on the comparison for a reader of the results."""
     if not found.agrees:
         seeds = "" if tried == 1 else f" (best of {tried} seeds)"
         if found.residual > found.limit:
@@ -141,8 +125,10 @@ def notes_on(found: Agreement, tried: int) -> tuple[str, ...]:
         else:
             worst = int(((found.gain - 1).abs() + found.offset.abs()).argmax())
             gain, offset = found.gain[worst].item(), found.offset[worst].item()
-            reason = f"a channel matches only as {gain:.2f} of itself {offset:+.2f}"
-            limit = "that is no shift of colours"
+            reason = (
+                f"a colour channel matches only with factor {gain:.2f} and offset {offset:+.2f}"
+            )
+            limit = "this is more than a colour shift"
         return (
             f"The synthesized image disagrees with the photographs: over the {found.share:.0%} of "
             f"it that they show, {reason}{seeds}, and {limit}.",
@@ -150,8 +136,8 @@ def notes_on(found: Agreement, tried: int) -> tuple[str, ...]:
     notes = []
     if found.shift > 0.5 / 255:
         notes.append(
-            "The colours of the synthesized image were brought to those of the photographs "
-            f"(mid-grey moved by {255 * found.shift:.1f} of 255)."
+            "The colours of the synthesized image were matched to those of the photographs "
+            f"(mid-grey changed by {255 * found.shift:.1f} of 255)."
         )
     if tried > 1:
         notes.append(f"{tried} seeds were tried before the synthesized image agreed.")

@@ -1,4 +1,4 @@
-"""Make photographs equally bright: one gain for each colour channel, from what they share."""
+"""Exposure gains that make photographs equally bright, per colour channel."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 MIN_PIXELS = 100
-"""Fewest pixels that two photographs must share for their gains to be compared."""
+"""Fewest shared pixels to compare two photographs."""
 DARKEST = 0.05
-"""Values below say nothing about a gain, for noise rules them."""
+"""Smallest usable value; darker ones are noise."""
 BRIGHTEST = 0.95
-"""Values above say nothing about a gain, for they may be clipped."""
+"""Largest usable value; brighter ones may be clipped."""
 MAX_GAIN = 2.0
-"""Largest gain, and its inverse the smallest, that a difference of exposure explains."""
+"""Largest plausible gain; its inverse is the smallest."""
 
 
 def gains(
@@ -23,16 +23,10 @@ def gains(
     visible: Sequence[Bool[Tensor, "h w"]],
     reference: int,
 ) -> list[Float[Tensor, "3"]]:
-    """Factors that bring each photograph to the exposure of the one numbered `reference`.
+    """Compute factors that match each photograph to the exposure of `reference`.
 
-    Args:
-        colours: What each photograph shows at the same surfaces.
-        visible: Where it shows them.
-        reference: Index of the photograph that stays as it is.
-
-    The median ratio over the shared surfaces does not mind reflections and wrong depths. A
-    photograph that shares too little with the reference is compared with one already brought to
-    its exposure, and left alone where there is none.
+    The pairs that share most `visible` pixels are matched first; gains without enough of them stay
+    1.
     """
     ones = torch.ones(3, dtype=colours[reference].dtype, device=colours[reference].device)
     found = {reference: ones}
@@ -50,7 +44,7 @@ def gains(
 
 
 def median_ratio(own: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
-    """Median of `other / own` for each channel, over well exposed values; 1 where these lack."""
+    """Compute the median of `other / own` per channel; 1 without enough exposed values."""
     ratios = torch.ones_like(own[0])
     for channel in range(3):
         a, b = own[:, channel], other[:, channel]

@@ -1,4 +1,4 @@
-"""A line through points of which some are wrong."""
+"""Robust fit of a line."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 ROUNDS = 5
-"""Fits of the line; each leaves out what disagrees with the one before."""
+"""Number of fits; each one leaves out the outliers of the previous one."""
 
 
 def robust_affine(
     x: Float[Tensor, "n c"], y: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
-    """`gain` and `offset` of each channel with `y = gain * x + offset`, by trimmed least squares.
+    """Fit `y = gain * x + offset` per channel by trimmed least squares, starting at gain 1.
 
-    It starts from a gain of 1, and `x` and `y` should be of the order of 1. Points off by more than
-    2.5 times the usual difference are left out of the next round. Where a channel hardly varies,
-    its gain cannot be told from its offset, and stays near 1.
+    Residuals above 2.5 standard deviations are dropped; the gain of a constant channel stays close
+    to 1.
     """
     gain = torch.ones_like(x[0])
     offset = (y - x).median(dim=0).values

@@ -1,4 +1,4 @@
-"""Continue colours smoothly beyond the border of what is known."""
+"""Smooth continuation of colours into unknown pixels."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch import Tensor
 from gscompleter.kernels.continuation import means, pyramid_of
 
 BLUR = 1.5
-"""Standard deviation, in pixels of its level, of the blur on every level of the pyramid."""
+"""Standard deviation of the blur of each pyramid level, in its pixels."""
 REACH = 0.7
-"""Standard deviation of what a pixel averages over, as a share of its distance from the known."""
+"""Standard deviation of the averaging, relative to the distance to known pixels."""
 
 
 def distance_to_known(known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Pixels to the nearest known pixel; 0 where known. Some pixel must be known."""
+    """Compute the distance to the nearest known pixel, in pixels; one must be known."""
     away = cv2.distanceTransform((~known).numpy().astype(np.uint8), cv2.DIST_L2, 5)
     return torch.from_numpy(away)
 
@@ -26,13 +26,7 @@ def distance_to_known(known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 def continued(
     values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w c"]:
-    """`values` where `weight` is positive, and weighted means of what lies around elsewhere.
-
-    A pixel averages over a neighbourhood that grows with its distance from what is known: just
-    beyond the border it continues the nearest values, far away it tends
-    to the mean. Averages grow with distance evenly in all directions, which a pyramid that fills
-    its blocks (`push_pull`) does not do.
-    """
+    """Fill pixels of zero `weight` with weighted means over a radius that grows inwards."""
     known = weight > 0
     if not known.any():
         return torch.zeros_like(values)
@@ -48,8 +42,7 @@ def continued(
 
 
 def sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarray, "_ _ c"]]:
-    """Sums over wider and wider neighbourhoods, each twice as wide as the one before, in images
-    half as large."""
+    """Build a pyramid of blurred sums; each level has half the size of the previous one."""
     sums = []
     while True:
         blurred = cv2.GaussianBlur(weighted, (0, 0), BLUR)
@@ -57,6 +50,6 @@ def sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarray, "_
         if min(weighted.shape[:2]) <= 8:
             return sums
         half = ((weighted.shape[1] + 1) // 2, (weighted.shape[0] + 1) // 2)
-        # Of odd sizes OpenCV averages four channels at most, so that each goes by itself.
+        # OpenCV averages at most four channels of odd sizes, so they are resized one by one.
         planes = [cv2.resize(p, half, interpolation=cv2.INTER_AREA) for p in cv2.split(blurred)]
         weighted = np.stack(planes, axis=-1)

@@ -1,4 +1,4 @@
-"""Carry all photographs into the target camera, through the depth of the scene."""
+"""Photographs warped to the target camera through the depth of the scene."""
 
 from __future__ import annotations
 
@@ -16,31 +16,29 @@ from gscompleter.masks import dilate
 from gscompleter.types import Camera, Render, SceneContext, View
 
 DEPTH_TOLERANCE = 0.03
-"""Difference between the depth of a point and the depth that a photograph sees in its direction,
-relative to the depth, at which the weight of the photograph has fallen to 1/e."""
+"""Relative depth error at which the weight of a photograph falls to 1/e."""
 SHARPNESS = 4.0
-"""Power of the weights: larger ones prefer the nearest photograph to the average."""
+"""Exponent of the weights; larger values prefer the nearest photograph."""
 SHOWN = 1.0
-"""Weight of a photograph, before that power, from which it shows a surface: as much as one at its
-depth that looks from a radian aside."""
+"""Smallest weight, before the exponent, of a photograph that observes a surface."""
 AROUND = 4
-"""Pixels around what moved in which the colour of the render is not believed: at its edges no depth
-is right."""
+"""Pixels around a dynamic mask without trust in the rendered colour."""
 
 
 @dataclass(frozen=True)
 class Warped:
-    """What is known of the target image."""
+    """The known part of the target image."""
 
     image: Float[Tensor, "h w 3"]
     known: Bool[Tensor, "h w"]
-    """True where the image shows the scene; elsewhere it means nothing."""
+    """True at pixels that show the scene; the others are undefined."""
     depth: Float[Tensor, "h w"]
-    """z-depth in the target camera, in scene units, where known."""
+    """z-depth in the target camera in scene units, valid if known."""
     gains: tuple[Float[Tensor, "3"], ...]
-    """Factor that each photograph was multiplied by to match the nearest one."""
+    """Exposure gain applied to each photograph to match the nearest one."""
 
     def to(self, device: torch.device | str) -> Warped:
+        """Return a copy on `device`."""
         return Warped(
             self.image.to(device),
             self.known.to(device),
@@ -50,27 +48,25 @@ class Warped:
 
 
 def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Warped:
-    """Colours of all photographs at the surfaces that the target sees.
+    """Blend the colours of all photographs at the surfaces that the target observes.
 
-    A photograph counts where the scene, seen from its camera, lies at the depth of the surface:
-    elsewhere something stands before it. What no photograph shows keeps the colour of the render,
-    where this is believed; where it is not, a hole remains unless a photograph shows the surface.
-    What only contradicted photographs show is not known, for it moved or something moved before it,
-    nor is what none shows around that.
-    All are brought to the exposure of `nearest`.
+    A photograph counts if the scene has the same depth from its camera, so that nothing occludes
+    the surface. Surfaces without a photograph keep the rendered colour if it is trusted. Dynamic
+    masks and their surroundings stay unknown unless another photograph shows them. All colours are
+    matched to the exposure of `nearest`.
     """
     scene = context.at_target
     known = ~context.holes
     points = unproject(scene.depth, target)
     colours, weights = [], []
-    in_doubt = torch.zeros_like(known)
+    dynamic = torch.zeros_like(known)
     for view, render in zip(context.views, context.at_views, strict=True):
         pixels, z = project(points, view.camera)
         visible = _visibility(pixels, z, view, render)
         shown = (visible * _closeness(points, target, view)) ** SHARPNESS
         colours.append(sample(view.image, pixels))
         weights.append(shown * _trusted(view, pixels))
-        in_doubt |= (shown > SHOWN**SHARPNESS) & _contradicted(view, pixels)
+        dynamic |= (shown > SHOWN**SHARPNESS) & _contradicted(view, pixels)
 
     baselines = [baseline_between(nearest.camera, view.camera) for view in context.views]
     reference = baselines.index(min(baselines))
@@ -85,17 +81,15 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
     image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
     if context.believed is not None:
         known = known | ((scene.alpha >= context.max_alpha) & (total > SHOWN**SHARPNESS))
-    known = known & ~(dilate(in_doubt, AROUND) & (total < SHOWN**SHARPNESS))
+    known = known & ~(dilate(dynamic, AROUND) & (total < SHOWN**SHARPNESS))
     return Warped(image.clamp(0, 1), known, scene.depth, tuple(factors))
 
 
 def with_unexplained(warped: Warped, target: Camera, context: SceneContext) -> Warped:
-    """`warped`, and in its holes what photographs show although the scene has a hole there too.
+    """Fill holes with photographed content that the scene lacks.
 
-    A scene may lack surfaces that were photographed: captured from too few sides, or trimmed. Their
-    depth is unknown, so they are carried over at the depth that continues what surrounds the hole.
-    Only photographs whose own view of the scene is empty in that direction take part: elsewhere
-    they show what stands before the hole. Something must be known.
+    Its depth is unknown, so the depth around the hole is continued. Only photographs whose own
+    render is empty in that direction count; others show an occluder. Some pixel must be known.
     """
     guess = depth_continued(warped).exp().to(warped.depth.device)
     points = unproject(guess, target)
@@ -120,10 +114,9 @@ def with_unexplained(warped: Warped, target: Camera, context: SceneContext) -> W
 
 
 def background_first(warped: Warped) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """The image and its log-depth, continued smoothly beyond what is known.
+    """Continue image and log-depth beyond the known pixels, preferring far pixels.
 
-    A hole beside an object is where the object hid what stands behind it, so the farther side of
-    its border counts more: with the square of its depth.
+    A hole beside an object usually shows the background, so the weight is the squared depth.
     """
     log_depth, weight, middle = _relative_depth(warped)
     layers = continued(torch.cat([warped.image.cpu(), log_depth], dim=-1), weight)
@@ -131,7 +124,7 @@ def background_first(warped: Warped) -> tuple[Float[Tensor, "h w 3"], Float[Tens
 
 
 def depth_continued(warped: Warped) -> Float[Tensor, "h w"]:
-    """The log-depth that `background_first` tells, alone."""
+    """Continue only the log-depth, as in `fill_background_first`."""
     log_depth, weight, middle = _relative_depth(warped)
     return continued(log_depth, weight)[..., 0] + middle
 
@@ -139,7 +132,7 @@ def depth_continued(warped: Warped) -> Float[Tensor, "h w"]:
 def _relative_depth(
     warped: Warped,
 ) -> tuple[Float[Tensor, "h w 1"], Float[Tensor, "h w"], Float[Tensor, ""]]:
-    """Log-depth relative to the middle one, how much it counts, and the middle one's logarithm."""
+    """Compute log-depth relative to the median, its weight and the log of the median."""
     known, depth = warped.known.cpu(), warped.depth.cpu()
     middle = depth[known].median()
     relative = (depth / middle).clamp(0.1, 10.0)
@@ -149,7 +142,7 @@ def _relative_depth(
 def _visibility(
     pixels: Float[Tensor, "h w 2"], z: Float[Tensor, "h w"], view: View, render: Render
 ) -> Float[Tensor, "h w"]:
-    """1 where the point at depth `z` is what the photograph shows at `pixels`, towards 0 else."""
+    """Compute how well depth `z` matches the surface at `pixels` of a view, in [0, 1]."""
     layers = torch.stack([render.depth, render.alpha], dim=-1)
     depth, alpha = sample(layers, pixels).unbind(-1)
     error = (z - depth).abs() / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
@@ -158,19 +151,19 @@ def _visibility(
 
 
 def _trusted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
-    """Where a photograph may be followed at `pixels`, and beside them."""
+    """Mark `pixels` whose whole neighbourhood in the photograph is trusted."""
     return sample((~view.trusted)[..., None].float(), pixels)[..., 0] == 0
 
 
 def _contradicted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
-    """Where others contradict a photograph at `pixels`, or beside them."""
+    """Mark `pixels` in or beside the dynamic mask of a photograph."""
     if view.contradicted is None:
         return torch.zeros_like(pixels[..., 0], dtype=torch.bool)
     return sample(view.contradicted[..., None].float(), pixels)[..., 0] > 0
 
 
 def _closeness(points: Float[Tensor, "h w 3"], target: Camera, view: View) -> Float[Tensor, "h w"]:
-    """1 where target and photograph look at a point along the same ray, less the more they turn."""
+    """Compute a weight that falls with the angle between the target's and view's rays."""
     to_target = torch.nn.functional.normalize(target.center - points, dim=-1)
     to_view = torch.nn.functional.normalize(view.camera.center - points, dim=-1)
     angle = torch.acos((to_target * to_view).sum(-1).clamp(-1, 1))

@@ -1,1 +1,1 @@
-"""Reading and writing: Gaussians, posed photographs, cameras, images and output folders."""
+"""Images, video, JSON, splats and output folders on the disk."""

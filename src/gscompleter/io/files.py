@@ -1,4 +1,4 @@
-"""Writing that either happens completely or leaves things as they were."""
+"""Atomic writes: a file or folder is written completely or left as it was."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from gscompleter.io.unfinished import (
 )
 
 SUMMARY = "summary.json"
-"""The file that says a folder is complete: it leaves first and arrives last."""
+"""File that marks a folder as complete: it is removed first and written last."""
 TARGETS = "targets.json"
-"""The file of a completion with the cameras that it was done for."""
+"""File of a completion with the target cameras."""
 CONTEXT, COMPLETED = "context.ply", "completed.ply"
 """The scene of a completion before and after."""
 
 _REPLACED = f"{MARK}replaced"
-"""Where a draft keeps what it replaces. Once it is there, the draft is complete."""
+"""Folder of a draft for replaced entries; it exists only once the draft is complete."""
 
 _REASONS = {
     errno.ENOSPC: "there is no space left; free some or choose another place",
@@ -52,17 +52,16 @@ _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 
 @contextlib.contextmanager
 def replacing(path: Path | str, first_stays: bool = False) -> Iterator[BinaryIO]:
-    """A file to write into that takes the name `path` once everything is on the disk.
+    """Open a temporary file that is renamed to `path` once it is completely on the disk.
 
-    It lies beside `path` under a temporary name until then, so that a reader never sees half a
-    file and an existing one survives every failure.
-
-    With `first_stays`, a file that another process made of that name meanwhile is left.
+    An existing file survives every failure. With `first_stays`, a file that another process wrote
+    at
+    `path` meanwhile is kept.
 
     Raises:
-        InputError: where the file cannot be written: no permission, no space, a folder.
+        InputError: The file cannot be written.
     """
-    # A symbolic link stays one: what it points to is replaced.
+    # The target of a symbolic link is replaced, not the link.
     target = Path(os.path.realpath(path))
     temporary: Path | None = None
     try:
@@ -86,9 +85,10 @@ def replacing(path: Path | str, first_stays: bool = False) -> Iterator[BinaryIO]
 
 
 def _linked(temporary: Path, target: Path) -> bool:
-    """Whether the file has the name `target` too, or another had it first.
+    """Link the file to `target`, unless another process wrote that first.
 
-    False where the file system has no hard links, and so no name that only one can take.
+    Returns:
+        False if the file system has no hard links.
     """
     try:
         os.link(temporary, target)
@@ -102,13 +102,10 @@ def _linked(temporary: Path, target: Path) -> bool:
 
 
 def check_output(path: Path | str, overwrite: bool = False) -> None:
-    """Make sure, before anything is computed, that a folder of results can be written.
-
-    Whether it can is found out by trying, and nothing of the attempt remains.
+    """Check, by trying, that a folder of results can be written.
 
     Raises:
-        InputError: where `path` is a file, is a folder with something in it while `overwrite`
-            is off, or cannot be created or written to.
+        InputError: `path` is a file, not empty while `overwrite` is off, or not writable.
     """
     with stops_deferred():
         _Draft(Path(path), overwrite).close()
@@ -116,18 +113,16 @@ def check_output(path: Path | str, overwrite: bool = False) -> None:
 
 @contextlib.contextmanager
 def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary folder to write results into, which become `path` all at once at the end.
+    """Open a temporary folder whose content becomes `path` at once at the end.
 
-    Where `path` does not exist, the folder is renamed to it; where it holds nothing but results
-    of the same names, the two folders change places in one step. Where that cannot be (a mount, a
-    working directory, other files in it), it stays the folder it is: the new entries replace
-    those of the same name by renames, the summary last, and everything else in it is left alone;
-    should the process be killed meanwhile, the next run finishes the renames. After any exception,
-    an interrupt included, `path` is as it was before, and so are its parents. An interrupt that
-    comes while the results are given their names waits until that is done.
+    A new `path` is made by a rename. One with only results of the same names is exchanged in one
+    step.
+    Otherwise (a mount, a working directory, other files in it) entries are renamed one by one, the
+    summary last, and other files stay; if the process is killed, the next run finishes the renames.
+    After any exception, `path` and its parents are as before. An interrupt waits for the renames.
 
     Raises:
-        InputError: as `check_output`, and where the disk is full.
+        InputError: As in `check_output`, or the disk is full.
     """
     draft: _Draft | None = None
     try:
@@ -139,7 +134,7 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
                 draft.publish()
                 draft.close()
         except InputError as error:
-            # The user asked for `path` and need not hear of the temporary name.
+            # The temporary name means nothing to the user.
             whole = str(error.args[0]).replace(str(draft.folder), str(path))
             raise type(error)(whole, error.argument) from error
         except OSError as error:
@@ -153,7 +148,7 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
 
 
 class _Draft:
-    """The unfinished content of an output folder, and the folders made to hold it."""
+    """The unfinished content of an output folder, and the parent folders created for it."""
 
     def __init__(self, path: Path, overwrite: bool) -> None:
         self.target = Path(os.path.realpath(path))
@@ -188,7 +183,7 @@ class _Draft:
                 parent.rmdir()
 
     def publish(self) -> None:
-        """Give everything its final name, or nothing."""
+        """Rename everything to its final name, or nothing."""
         try:
             if not self.exists:
                 os.rename(self.folder, self.target)
@@ -200,7 +195,7 @@ class _Draft:
             raise OutputError(_cannot_write(self.target, error)) from error
 
     def _changed_places(self) -> bool:
-        """Swap draft and target in one step, where nothing but results would go."""
+        """Exchange draft and target in one step, if only results would be lost."""
         if self.folder.parent != self.target.parent:
             return False
         others = set(os.listdir(self.target)) - set(os.listdir(self.folder))
@@ -213,18 +208,18 @@ class _Draft:
         return False
 
     def _move_inside(self) -> None:
-        """Into the target, where the next run looks for it should this one be killed."""
+        """Move the draft into the target, where the next run finds it if this one is killed."""
         inside = self.target / self.folder.name
         if inside != self.folder:
             os.rename(self.folder, inside)
             self.folder = inside
 
     def close(self) -> None:
-        """Remove what was not published, and the parents made for it where they are empty."""
+        """Remove unpublished content, and empty parents that were created for it."""
         if self.closed:
             return
         self.closed = True
-        # What could not be put back is all there is of it; the next run finishes the renames.
+        # Entries that could not be restored exist only here; the next run finishes the renames.
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             if not os.listdir(self.folder / _REPLACED):
                 os.rmdir(self.folder / _REPLACED)
@@ -235,7 +230,7 @@ class _Draft:
 
 
 def _finish_abandoned(target: Path) -> None:
-    """Finish the renames that a killed run had begun in `target`, and remove what else it left."""
+    """Finish the renames of a killed run in `target`, and remove its other leftovers."""
     with abandoned(target) as found:
         for draft in found:
             with contextlib.suppress(OSError):
@@ -245,7 +240,7 @@ def _finish_abandoned(target: Path) -> None:
 
 
 def _finish(draft: Path) -> None:
-    """Move everything in `draft` to the folder it lies in, or nothing; what it replaces is lost."""
+    """Move the content of `draft` to its parent folder, or nothing; replaced entries are lost."""
     target, replaced = draft.parent, draft / _REPLACED
     entries = set(os.listdir(draft)) - {_REPLACED}
     names = sorted(entries, key=lambda name: (name == SUMMARY, name))
@@ -257,7 +252,7 @@ def _finish(draft: Path) -> None:
 
 
 def _may_change_places(folder: Path) -> bool:
-    """Whether another folder can take the place of this one without anybody missing it."""
+    """Return True if another folder can take the place of this one unnoticed."""
     here = Path.cwd()
     return (
         hasattr(os, "geteuid")
@@ -269,7 +264,7 @@ def _may_change_places(folder: Path) -> bool:
 
 
 def _exchange(one: Path, other: Path) -> None:
-    """Let two entries of a file system change names in one step, as Linux can."""
+    """Exchange two entries of a file system in one step (Linux)."""
     here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of <fcntl.h> and <linux/fs.h>
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None or rename(here, bytes(one), here, bytes(other), exchange) != 0:
@@ -285,14 +280,14 @@ def _rename_all(moves: list[tuple[Path, Path]]) -> None:
             os.rename(*move)
     except BaseException:
         for source, destination in reversed(done):
-            # The last one may or may not have happened when an interrupt arrived.
+            # An interrupt may have come before or after the last rename.
             if not os.path.lexists(source):
                 os.rename(destination, source)
         raise
 
 
 def _check_free(path: Path, target: Path, overwrite: bool) -> None:
-    """Raise an InputError where `path` holds something that must not be written over."""
+    """Raise InputError if `path` contains something that must not be overwritten."""
     if os.path.lexists(target) and not target.is_dir():
         raise InputError(
             f"The output {quoted(path)} is a file, and a folder is needed; name another one."

@@ -1,4 +1,4 @@
-"""Reading JSON that somebody else wrote."""
+"""JSON written by others."""
 
 from __future__ import annotations
 
@@ -12,16 +12,13 @@ from gscompleter.reading import check_plain, read_bytes, read_head
 MAX_BYTES = 1 << 29
 """Longest file, in bytes."""
 MAX_DIGITS = 20
-"""Of an integer: those of 64 bits have no more. Longer ones fit into no array and no float."""
+"""Longest integer: 64 bits have no more digits."""
 
 
 def read_json(path: Path, advice: str) -> Any:
-    """The content of a JSON file, with or without a byte order mark.
+    """Read a JSON file, with or without a byte order mark.
 
-    Where it is no JSON, the error gives `advice` on what to do, as in "download it again".
-
-    Raises:
-        InputError: where it cannot be read, is no JSON, or holds an integer beyond 64 bits.
+    Errors end with `advice`, such as "download it again".
     """
     data = read_bytes(path, MAX_BYTES)
     try:
@@ -41,5 +38,5 @@ def _integer(digits: str) -> int:
 
 
 def begins_a_list(path: Path) -> bool:
-    """Whether a JSON file holds a list, by its first character."""
+    """Return True if the JSON file is a list, by its first character."""
     return read_head(path, 64).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")

@@ -1,10 +1,10 @@
-"""Our reader and writer of 3D Gaussian scenes in PLY files.
+"""Reader and writer of 3DGS .ply files.
 
-Written: the standard 3DGS layout (binary little-endian float32: x y z nx ny nz f_dc_* f_rest_*
-opacity scale_* rot_*), then `uchar generated`. Read: the same properties in any order, type and
-byte order, ASCII too, among other properties and elements. Inside the file scales are logarithms,
-opacities logits, and f_rest_* runs through all coefficients of red, then green, then blue. A
-comment marks antialiased Gaussians: ours is that of Brush, and those of Postshot are known too.
+Written is the standard layout (binary little-endian float32: x y z nx ny nz f_dc_* f_rest_*
+opacity scale_* rot_*), then `uchar generated`. Read are the same properties in any order, type
+and byte order, and ASCII. In the file scales are logarithms, opacities are logits, and f_rest_*
+has all coefficients of red, then green, then blue. A comment marks antialiased Gaussians: Brush's
+is written, Postshot's are read too.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
 _NUM_REST = (0, 9, 24, 45)
-"""f_rest_* properties of spherical harmonics of degree 0 to 3."""
+"""Number of properties f_rest_* for SH of degree 0 to 3."""
 
 _MAX_LOGIT = 30.0
-"""Opacities of 0 are written as this logit, negated; 1 as the largest finite one in float32."""
+"""Opacities of 0 are written as this logit, negated."""
 
 _MAX_SCALE = 1e38
-"""Larger scales are written as this one, so that what is read back is finite in float32."""
+"""Larger scales are clamped to this one, which is finite in float32."""
 
 MODE = "comment SplatRenderMode: mip"
-"""The line of a header that marks antialiased Gaussians."""
+"""Header line that marks antialiased Gaussians."""
 _MODE_LINE = re.compile(
     r"(?:comment|obj_info)\s+(?:SplatRenderMode|(?:postshot[._])?anti[-_ ]?alias(?:ed|ing)?)"
     r"\s*[:=\s]\s*(\w+)\s*",
@@ -66,8 +66,7 @@ _MODE_LINE = re.compile(
 _ANTIALIASED = ("mip", "antialiased", "1", "true")
 
 BLOCK = 8192
-"""Rows copied or written at a time: few enough to stay in the cache while one column follows
-another."""
+"""Rows processed at a time, so that all their columns stay in the cache."""
 
 
 @dataclass(frozen=True)
@@ -76,30 +75,31 @@ class Property:
 
     name: str
     kind: str
-    """numpy's name of the type, without byte order."""
+    """numpy name of the type, without byte order."""
     count_kind: str | None = None
-    """Type of the count, for a list property."""
+    """Type of the count of a list property."""
 
 
 @dataclass(frozen=True)
 class Element:
-    """One element: a table with a row for each of its members."""
+    """One element: a table."""
 
     name: str
     count: int
     properties: list[Property] = field(default_factory=list)
 
     def dtype(self, byte_order: str) -> np.dtype:
-        """One row of a binary file; the element must hold no lists."""
+        """Make the dtype of a row of a binary file without lists."""
         return np.dtype([(p.name, byte_order + p.kind) for p in self.properties])
 
     @property
     def has_lists(self) -> bool:
+        """True if a property is a list."""
         return any(p.count_kind is not None for p in self.properties)
 
 
 def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
-    """The format and the elements of a file, which is left at the first byte of the data."""
+    """Read format and elements; the file is left at the first byte of the data."""
     refuse_pointer(path)
     first = file.readline(512)
     if not first:
@@ -128,8 +128,8 @@ def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
                 raise ValueError
         except (IndexError, KeyError, ValueError) as error:
             raise InputError(
-                f"{path} has a broken header: '{quoted(' '.join(words))}' means nothing; "
-                "write it anew."
+                f"{path} has a broken header: the line '{quoted(' '.join(words))}' is invalid; "
+                "export it again."
             ) from error
     if file_format not in _BYTE_ORDERS:
         raise InputError(
@@ -140,10 +140,7 @@ def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
 
 
 def read_mode(file: BinaryIO) -> bool:
-    """Read from a header, which ends where the file stands, if the Gaussians are antialiased.
-
-    Of several comments that name the mode the last one counts.
-    """
+    """Read from the header, up to the current position, if the Gaussians are antialiased."""
     end = file.tell()
     file.seek(0)
     lines = file.read(end).decode("latin-1").splitlines()
@@ -166,7 +163,7 @@ def _property(words: list[str]) -> Property:
 def read_vertices(
     file: BinaryIO, file_format: str, ahead: list[Element], vertex: Element, path: Path
 ) -> np.ndarray:
-    """The rows of `vertex` as a structured array, what stands `ahead` of it skipped."""
+    """Read the rows of `vertex` as a structured array, skipping the elements `ahead`."""
     for element in ahead:
         _check_claim(file, element, file_format, path)
     if file_format == "ascii":
@@ -180,14 +177,14 @@ def read_vertices(
         raise _truncated(path, remaining // dtype.itemsize, vertex.count)
     if vertex.count == 0:
         return np.empty(0, dtype)
-    # Rows that are copied into columns at once need not be copied into memory before.
+    # Rows are copied into columns directly from the memory map.
     return np.asarray(np.memmap(file, dtype, "r", file.tell(), (vertex.count,)))
 
 
 def _check_claim(file: BinaryIO, element: Element, file_format: str, path: Path) -> None:
-    """Refuse an element of more rows than what is left of the file can hold."""
+    """Refuse an element with more rows than fit into the rest of the file."""
     sizes = [np.dtype(p.count_kind or p.kind).itemsize for p in element.properties]
-    # A number of an ASCII file takes a digit and what parts it from the next.
+    # A number of an ASCII file has at least a digit and a separator.
     least = 2 * max(len(sizes), 1) if file_format == "ascii" else sum(sizes)
     remaining = _bytes_left(file) + 1  # the last line may lack its end
     if element.count * least > remaining:
@@ -234,7 +231,7 @@ def _ascii_vertices(
             f"{path} holds rows that are not {width} numbers each; write it anew."
         ) from error
     vertices = np.empty(vertex.count, vertex.dtype("="))
-    # What a column cannot hold becomes infinite or odd, and values that count are looked at later.
+    # Values out of range become infinite or wrong; relevant ones are checked later.
     with np.errstate(over="ignore", invalid="ignore"):
         for column, prop in enumerate(vertex.properties):
             vertices[prop.name] = table[:, column]
@@ -249,30 +246,27 @@ def _truncated(path: Path, found: int, expected: int, what: str = "Gaussian") ->
 
 
 def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
-    """The Gaussians of a 3DGS .ply, of SH degree 0 to 3.
+    """Load the Gaussians of a 3DGS .ply of SH degree 0 to 3.
 
-    With `drop_nonfinite`, Gaussians that hold NaN or infinity, or a rotation of zeros, are left
-    out; else the file is refused. A logit of opacity may be infinite, which is how converters write
-    opacities of 1 and 0, and stands for these.
+    With `drop_nonfinite`, Gaussians with NaN, infinity or a zero quaternion are dropped; otherwise
+    the
+    file is refused. Infinite opacity logits are valid: converters write them for opacities of 1 and
+    0.
 
     Raises:
-        InputError: no such file, not a PLY, truncated, empty, not 3DGS, or with damaged values.
+        InputError: The file is missing, no 3DGS .ply, empty, truncated or has invalid values.
     """
     path = Path(path)
     return whole(_read(path), path, drop_nonfinite)
 
 
 def drawable_rows(path: Path) -> Bool[Tensor, "n"]:
-    """Which Gaussians of a 3DGS .ply `load_ply` keeps with `drop_nonfinite`.
-
-    Raises:
-        InputError: as `load_ply`, but for values.
-    """
+    """Mark the Gaussians of a 3DGS .ply that `load_ply` keeps with `drop_nonfinite`."""
     return drawable(_read(path))
 
 
 def _read(path: Path) -> Gaussians:
-    """All Gaussians of a file, whether or not they can be drawn."""
+    """Read all Gaussians of a file, non-finite ones included."""
     try:
         with open_file(path) as file:
             file_format, elements = read_header(file, path)
@@ -286,7 +280,7 @@ def _read(path: Path) -> Gaussians:
 
 
 def _gaussian_element(elements: list[Element], path: Path) -> Element:
-    """The vertex element, once it is known to hold Gaussians."""
+    """Find the vertex element and check that it contains Gaussians."""
     found = {element.name: element for element in elements}
     vertex = found.get("vertex")
     if vertex is None:
@@ -326,7 +320,7 @@ def _gaussian_element(elements: list[Element], path: Path) -> Element:
 def _gaussians(vertices: np.ndarray, vertex: Element, is_antialiased: bool) -> Gaussians:
     def columns(names: tuple[str, ...]) -> Float[Tensor, "n c"]:
         table = np.empty((len(vertices), len(names)), np.float32)
-        # A double beyond the range of float32 becomes infinite, and is counted as such.
+        # A double beyond the range of float32 becomes infinite, and is checked later.
         with np.errstate(over="ignore"):
             for rows in blocks(len(vertices)):
                 for column, name in enumerate(names):
@@ -356,12 +350,7 @@ def _gaussians(vertices: np.ndarray, vertex: Element, is_antialiased: bool) -> G
 
 
 def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
-    """`gaussians` of the file `path` where every value can be drawn.
-
-    Raises:
-        InputError: where some hold NaN, infinity or a rotation of zeros and `drop_nonfinite` is
-            off, or all do.
-    """
+    """Refuse non-finite Gaussians of the file `path`, or drop them if some are finite."""
     good = drawable(gaussians)
     bad = int((~good).sum())
     if bad == 0:
@@ -369,7 +358,7 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
     if not drop_nonfinite:
         raise InputError(
             f"{quoted(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a "
-            "rotation of zeros; mend it, or drop what is not finite.",
+            "rotation of zeros; repair it, or drop what is not finite.",
             "drop_nonfinite",
         )
     if bad == len(good):
@@ -380,31 +369,30 @@ def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
 
 
 def drawable(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    """Mark the Gaussians without NaN, infinity and rotations of zeros. An opacity is finite where
-    its logit is not."""
+    """Mark Gaussians without NaN, infinity (except in logits) and zero quaternions."""
     scales = gaussians.scales if gaussians.encoded is None else gaussians.encoded[:, :3]
     opacities, good = gaussians.opacities, (gaussians.quats != 0).any(1)
     tables = (gaussians.means, gaussians.quats, gaussians.scales, scales, gaussians.sh, opacities)
     for values in tables:
-        if not values.sum().isfinite():  # Looking at each of them takes ten times as long.
+        if not values.sum().isfinite():  # ten times faster than a test of each value
             good &= values.isfinite().reshape(len(values), -1).all(1)
     return good
 
 
 def note_infinite_opacities(gaussians: Gaussians) -> str | None:
-    """Say in a sentence how many logits of opacity were infinite; None where none was."""
+    """Describe the number of infinite opacity logits in a sentence, or return None."""
     logits = None if gaussians.encoded is None else gaussians.encoded[:, 3]
     if logits is None or logits.sum().isfinite():
         return None
     opaque, clear = int(logits.isposinf().sum()), int(logits.isneginf().sum())
     return (
-        f"Of {len(gaussians):,} Gaussians {opaque:,} have a logit of opacity of +infinity and "
-        f"{clear:,} of -infinity; they are taken as opaque and as transparent."
+        f"{opaque:,} of {len(gaussians):,} Gaussians have an opacity logit of +infinity and "
+        f"{clear:,} of -infinity; they are rendered as opaque and as transparent."
     )
 
 
 def blocks(count: int) -> Iterator[slice]:
-    """Rows 0 to `count`, `BLOCK` at a time."""
+    """Yield slices of `BLOCK_ROWS` rows from 0 to `count`."""
     return (slice(start, start + BLOCK) for start in range(0, count, BLOCK))
 
 
@@ -417,9 +405,9 @@ def _decoded_opacities(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
 
 
 def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
-    """Log-scales and logit opacities as they go into a file, always finite.
+    """Compute log-scales and logit opacities for a file, always finite.
 
-    Values that came from a file are used again wherever they still stand for what is in memory.
+    Values read from a file are reused where they still decode to the values in memory.
     """
     tiny = torch.finfo(torch.float32).tiny
     scales = gaussians.scales.double().clamp(tiny, _MAX_SCALE).log()
@@ -436,15 +424,14 @@ def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
 
 
 def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = None) -> None:
-    """Write a standard 3DGS .ply, with `uchar generated` behind the standard properties.
+    """Write a standard 3DGS .ply, with `uchar generated` after the standard properties.
 
-    Nothing is left under `path` unless all of it was written. `provenance` says whether to write
-    `generated`; by default, where anything was generated. Some readers (gsply 0.4 is one) take
-    every property for a float and misread rows that end in a byte; False gives them the plain
-    layout.
+    `provenance` decides if `generated` is written; the default is yes if anything was generated.
+    Some
+    readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
 
     Raises:
-        InputError: where the file cannot be written.
+        InputError: The file cannot be written; an existing one is kept.
     """
     if provenance is None:
         provenance = bool((gaussians.generated > 0).any())
@@ -463,7 +450,7 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
 
 
 def rows_of(gaussians: Gaussians, provenance: bool) -> np.ndarray:
-    """One row per Gaussian in the order of the standard layout, with `generated` or without."""
+    """Make one row per Gaussian in the standard layout, with or without `generated`."""
     num_rest = 3 * (gaussians.sh.shape[1] - 1)
     rest = tuple(f"f_rest_{i}" for i in range(num_rest))
     names = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)

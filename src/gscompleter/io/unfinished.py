@@ -1,7 +1,7 @@
-"""Files and folders that are not finished: nobody takes them for results, and none stays for ever.
+"""Unfinished files and folders, which are never taken for results.
 
-Whoever writes one holds a lock on it, which the kernel takes back when the process ends, however
-it ends. What nobody holds is a leftover of a process that was killed.
+The writer holds a lock, which the kernel releases when the process ends. An unlocked entry is a
+leftover of a killed process.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from typing import BinaryIO
 
 try:
     import fcntl
-except ImportError:  # not a POSIX system: there are no locks, and leftovers stay
+except ImportError:  # not POSIX: no locks, and leftovers stay
     fcntl = None  # type: ignore[assignment]
 
 MARK = ".gscompleter-"
-"""How the name of everything unfinished begins."""
+"""Prefix of the names of unfinished entries."""
 
 
 def create_file(folder: Path) -> tuple[Path, BinaryIO]:
-    """A new file in `folder`, locked until it is closed."""
+    """Create a file in `folder`, locked until it is closed."""
     while True:
         path = folder / _new_name()
         file = path.open("xb")
         if locked(file.fileno(), wait=True) is not False and os.fstat(file.fileno()).st_nlink:
             return path, file
-        file.close()  # it was cleaned up before it was locked
+        file.close()  # another process removed it before it was locked
 
 
 def create_folder(folder: Path) -> tuple[Path, int]:
-    """A new folder in `folder`, and the descriptor that locks it until it is closed."""
+    """Create a folder in `folder`; the returned descriptor locks it until it is closed."""
     while True:
         path = folder / _new_name()
         path.mkdir()
@@ -50,11 +50,7 @@ def create_folder(folder: Path) -> tuple[Path, int]:
 
 @contextlib.contextmanager
 def abandoned(folder: Path) -> Iterator[list[Path]]:
-    """What killed processes left in `folder`; nobody else handles it meanwhile.
-
-    Only what was made on this machine is listed: whether the locks of others are seen depends on
-    the file system.
-    """
+    """Lock and list the leftovers of killed processes of this machine in `folder`."""
     found: list[Path] = []
     with contextlib.ExitStack() as locks:
         for path in _made_here(folder):
@@ -67,14 +63,14 @@ def abandoned(folder: Path) -> Iterator[list[Path]]:
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove what killed processes left in `folder`, as far as we may."""
+    """Remove leftovers of killed processes in `folder`, as far as permitted."""
     with abandoned(folder) as found:
         for path in found:
             remove(path)
 
 
 def remove(path: Path) -> None:
-    """Remove a file or folder, as far as we may."""
+    """Remove a file or folder, as far as permitted."""
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     with contextlib.suppress(OSError):
@@ -96,7 +92,7 @@ def _new_name() -> str:
 
 
 def locked(descriptor: int, wait: bool) -> bool | None:
-    """Lock it; False where another holds it, None where the file system knows no locks."""
+    """Lock a descriptor; False if another process holds it, None if locks are unsupported."""
     if fcntl is None:
         return None
     try:

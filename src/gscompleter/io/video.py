@@ -1,4 +1,4 @@
-"""Films as people send them: H.264 in an mp4, written by the ffmpeg that imageio-ffmpeg brings."""
+"""H.264 videos in mp4, written by the ffmpeg of imageio-ffmpeg."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from jaxtyping import UInt8
 from gscompleter.errors import InputError, quoted
 
 QUALITY = 18
-"""The constant rate factor of x264: 0 loses nothing, and at 18 hardly anybody sees a difference."""
+"""Constant rate factor of x264: 0 is lossless, 18 is visually lossless."""
 SAME_BYTES = (
     *("-threads", "1", "-filter_threads", "1"),
     *("-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1"),
 )
-"""What lets ffmpeg write the same bytes whenever and wherever it runs."""
+"""Options for the same bytes on every run and machine."""
 COLOURS = (
     "-vf",
     "scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+bitexact+bicubic,"
     "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709",
 )
-"""Colours as players take those of films to be, and said in the file."""
+"""Options for the colour space that players assume, stored in the file."""
 FOR_PLAYERS = ("-pix_fmt", "yuv420p", "-movflags", "+faststart")
-"""What all players know, and the index first, so that a film begins before all of it is there."""
+"""Options for a pixel format that all players know, and for an index at the start."""
 
 
 def check_writer() -> None:
-    """Make sure, before anything is computed, that a film can be written.
+    """Check that a video can be written, before anything is computed.
 
     Raises:
-        InputError: where imageio-ffmpeg is missing, or has no ffmpeg for this machine.
+        InputError: imageio-ffmpeg is missing, or has no ffmpeg for this machine.
     """
     if find_spec("imageio_ffmpeg") is None:
         raise InputError(
@@ -46,11 +46,7 @@ def check_writer() -> None:
 
 
 def ffmpeg() -> str:
-    """The program.
-
-    Raises:
-        InputError: where imageio-ffmpeg has none for this machine.
-    """
+    """Find the path of ffmpeg."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
     try:
@@ -64,15 +60,9 @@ def ffmpeg() -> str:
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: int) -> None:
-    """Write frames of one size, both sides even, into an .mp4 in a folder that nobody reads yet.
+    """Write frames of one size, both sides even, as an mp4 with `rate` frames per second.
 
-    Args:
-        path: The file.
-        frames: One after the other; they may be drawn while they are written.
-        rate: Frames per second.
-
-    Raises:
-        InputError: where ffmpeg fails, with what it says.
+    The frames may be rendered while they are written. The file is not atomic.
     """
     iterator = iter(frames)
     first = next(iterator)
@@ -82,23 +72,23 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: 
         send(process, first)
         for frame in iterator:
             send(process, frame)
-        _, said = process.communicate()
-    finally:  # it is done, or somebody stops us
+        _, messages = process.communicate()
+    finally:  # also on an interrupt
         process.kill()
         process.wait()
     if process.returncode != 0:
-        raise InputError(f"ffmpeg could not write {quoted(path)}: {quoted(said.decode(), 200)}")
+        raise InputError(f"ffmpeg could not write {quoted(path)}: {quoted(messages.decode(), 200)}")
 
 
 def send(process: subprocess.Popen[bytes], frame: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Give a frame to ffmpeg. Where it has ended, its exit code says so afterwards."""
+    """Write a frame to ffmpeg; if it has ended, its exit code is checked later."""
     assert process.stdin is not None
     with suppress(BrokenPipeError):
         process.stdin.write(np.ascontiguousarray(frame).data)
 
 
 def command(path: Path, width: int, height: int, rate: int) -> list[str]:
-    """What ffmpeg is told: frames come through its standard input, eight bits a channel."""
+    """Build the command line of ffmpeg for 8-bit RGB frames from standard input."""
     return [
         *(ffmpeg(), "-v", "error", "-y", "-nostdin"),
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate)),

@@ -1,12 +1,8 @@
-"""Compiled loops (numba) on plain arrays. They know nothing of the types of the package.
+"""Compiled loops (numba) on plain arrays, independent of the types of the package.
 
-Each file holds its kernels together with the helpers they inline: the compilation cache notices
-edits of the file itself only.
-
-Of the liberties of fast mathematics they take one, `contract`. Were sums free to be reordered
-(`reassoc`), a kernel that runs in parallel would round otherwise in the process that compiles it
-than in those that find it in the cache, and the same command would not give the same bytes. On the
-CPUs tried, that freedom saved no time.
+The cache notices edits of one file only, so each file holds all that its kernels inline. Fast
+mathematics is limited to `contract`: reordered sums (`reassoc`) would round differently in the
+process that compiles a kernel and in those that load it from the cache.
 """
 
 from contextlib import contextmanager
@@ -16,24 +12,19 @@ from numba.np import linalg
 
 @contextmanager
 def _without_blas():
-    """To learn whether there is BLAS, numba imports SciPy's linear algebra before its first kernel:
-    a third of the time that it takes to load.
-
-    No kernel of ours asks for BLAS, and those of others find it all the same, since they import it
-    as they are compiled. Where numba goes about it otherwise, nothing changes.
-    """
-    asked = getattr(linalg, "ensure_blas", None)
+    """Skip numba's search for BLAS, which imports SciPy: a third of its load time."""
+    ensure_blas = getattr(linalg, "ensure_blas", None)
 
     def refuse():
-        raise ImportError("there is nothing to be found out")
+        raise ImportError("BLAS is not needed")
 
-    if asked is not None:
+    if ensure_blas is not None:
         linalg.ensure_blas = refuse
     try:
         yield
     finally:
-        if asked is not None:
-            linalg.ensure_blas = asked
+        if ensure_blas is not None:
+            linalg.ensure_blas = ensure_blas
 
 
 with _without_blas():

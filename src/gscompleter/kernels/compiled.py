@@ -1,4 +1,4 @@
-"""What lies compiled in numba's cache: a mark stands beside it for each part that was rehearsed."""
+"""Markers in numba's cache for the parts whose kernels are compiled."""
 
 import hashlib
 import sys
@@ -11,17 +11,17 @@ from gscompleter.kernels import variation
 
 
 def is_compiled(part):
-    """Whether the kernels of a part lie compiled for this machine, as they are now."""
+    """Return True if the current kernels of a part are compiled for this machine."""
     return _mark(part).is_file()
 
 
 def note_compiled(part):
-    """Remember that they do."""
+    """Mark the kernels of a part as compiled."""
     _mark(part).touch()
 
 
 def cache_folder():
-    """Where numba keeps what it compiled."""
+    """Return the folder of numba's cache."""
     return Path(variation.advance.stats.cache_path)
 
 
@@ -30,7 +30,6 @@ def _mark(part):
 
 
 def _state():
-    """A word that changes where numba compiles anew: with a source, a version or the processor."""
     sources = sorted(Path(__file__).parent.glob("*.py"))
     stamps = [(s.name, s.stat().st_mtime_ns, s.stat().st_size) for s in sources]
     machine = (get_host_cpu_name(), get_host_cpu_features().flatten())

@@ -1,4 +1,4 @@
-"""Means over neighbourhoods of a pyramid, at pixels of the full image."""
+"""Interpolation of single pixels from a pyramid of neighbourhood means."""
 
 from typing import NamedTuple
 
@@ -8,24 +8,24 @@ from numba import njit
 from gscompleter.kernels.sharing import share
 
 LEAST_WEIGHT = np.float32(1e-6)
-"""Of a neighbourhood; where it holds less, the next wider one stands in."""
+"""Smallest weight of a neighbourhood; below it the next wider one is used."""
 
 
 class Pyramid(NamedTuple):
-    """Weighted sums over wider and wider neighbourhoods, level after level."""
+    """Weighted sums over neighbourhoods that widen from level to level."""
 
     sums: np.ndarray
-    """float32 [n, c]: the pixels of all levels, row after row; the last channel is the weight."""
+    """float32 [n, c]: the pixels of all levels, row by row; the last channel is the weight."""
     starts: np.ndarray
-    """Where each level begins in it [levels]."""
+    """Index in `sums` of the first pixel of each level [levels]."""
     sizes: np.ndarray
-    """Height and width of each level [levels, 2]; the first is as large as the image."""
+    """Height and width of each level [levels, 2]; the first is the size of the image."""
     everywhere: np.ndarray
-    """float32 [c - 1]: the mean of all, where even the widest neighbourhood holds no weight."""
+    """Mean of the image [c - 1], for pixels without weight on any level."""
 
 
 def pyramid_of(levels):
-    """The pyramid of `levels`, float32 [h, w, c] each."""
+    """Build the pyramid of `levels`, float32 [h, w, c] each."""
     sizes = np.array([level.shape[:2] for level in levels])
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]])
     sums = np.concatenate([level.reshape(-1, level.shape[2]) for level in levels])
@@ -34,10 +34,7 @@ def pyramid_of(levels):
 
 
 def means(pyramid, pixels, level):
-    """What surrounds `pixels` (y, x) [p, 2], each in neighbourhoods of its own `level` [p].
-
-    A level that is no whole number is a mixture of the two it lies between. Returns [p, c - 1].
-    """
+    """Compute means [p, c - 1] around `pixels` (y, x) [p, 2], at fractional levels `level` [p]."""
     found = np.empty((len(pixels), len(pyramid.everywhere)), np.float32)
     share(_means, len(pixels), pyramid, pixels, level, found)
     return found
@@ -45,7 +42,6 @@ def means(pyramid, pixels, level):
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _means(begin, end, pyramid, pixels, level, found):
-    """Fill in the pixels from `begin` to `end`."""
     count = len(pyramid.everywhere)
     wider, sums = np.empty(count, np.float32), np.empty(count + 1, np.float32)
     for p in range(begin, end):
@@ -60,7 +56,6 @@ def _means(begin, end, pyramid, pixels, level, found):
 
 @njit(cache=True, fastmath={"contract"})
 def _mean(pyramid, y, x, number, sums, mean):
-    """Write the mean around a pixel on level `number`, or on the first above it that has one."""
     count = len(pyramid.everywhere)
     for level in range(number, len(pyramid.starts)):
         _sample(pyramid, y, x, level, sums)
@@ -74,7 +69,7 @@ def _mean(pyramid, y, x, number, sums, mean):
 
 @njit(cache=True, fastmath={"contract"})
 def _sample(pyramid, y, x, level, sums):
-    """Write the sums of a level at a pixel of the image, between four pixels of the level."""
+    """Write the sums of a level at a pixel of the image, interpolated bilinearly."""
     start, h, w = pyramid.starts[level], pyramid.sizes[level, 0], pyramid.sizes[level, 1]
     top, down = _between(y, h, pyramid.sizes[0, 0])
     left, along = _between(x, w, pyramid.sizes[0, 1])
@@ -91,7 +86,6 @@ def _sample(pyramid, y, x, level, sums):
 
 @njit(cache=True, inline="always")
 def _between(place, count, of):
-    """The pixel of `count` before a pixel's centre of `of`, and how far beyond its own it lies."""
     exact = min(max((place + 0.5) * count / of - 0.5, 0.0), count - 1.0)
     first = int(exact)
     return first, np.float32(exact - first)

@@ -1,8 +1,4 @@
-"""What photographs show of the Gaussians of a scene, and how far that supports them.
-
-Evidence lies photograph by photograph. It is read a block of Gaussians at a time: what is known of
-a block stays in the cache, and LLVM finds vectors in loops over it.
-"""
+"""Trust in Gaussians, from how far photographs agree with their render, block by block."""
 
 import math
 from typing import NamedTuple
@@ -13,12 +9,11 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 BLOCK = 256
-"""Gaussians of a block."""
+"""Gaussians per block."""
 LEAST = np.float32(1e-6)
-"""What a photograph from the opposite direction says, so that it still says something where no
-other does."""
+"""Smallest angular weight: opposite photographs count if there are no others."""
 NONE = np.float32(1e-20)
-"""What is divided by instead of 0."""
+"""Smallest divisor."""
 
 # Abramowitz and Stegun 4.4.46: acos(x) = sqrt(1 - x) p(x) from 0 to 1, to 2e-8.
 _A0, _A1, _A2, _A3 = map(np.float32, (1.5707963050, -0.2145988016, 0.0889789874, -0.0501743046))
@@ -30,19 +25,18 @@ _LOG2_E, _PI = np.float32(1.4426950408889634), np.float32(math.pi)
 
 
 class Place(NamedTuple):
-    """Where a camera stands, float32."""
+    """The position and viewing direction of a camera, float32."""
 
     center: np.ndarray
-    """In the world [3]."""
+    """Camera centre in the world [3]."""
     forward: np.ndarray
     """Unit viewing direction [3]."""
     focal: np.float32
-    """fx fy, in squared pixels."""
+    """Product of fx and fy, in squared pixels."""
 
 
 @intrinsic
 def _float_of(typing, bits):
-    """The float32 of these bits."""
     return types.float32(
         types.int32
     ), lambda context, builder, signature, arguments: builder.bitcast(arguments[0], ir.FloatType())
@@ -50,7 +44,6 @@ def _float_of(typing, bits):
 
 @njit(cache=True, fastmath={"contract"})
 def _acos(x):
-    """The arccosine, to 1e-7 radians; beyond 1 it is that of 1."""
     one = np.float32(1)
     away = min(abs(x), one)
     series = _A3 + away * (_A4 + away * (_A5 + away * (_A6 + away * _A7)))
@@ -61,7 +54,7 @@ def _acos(x):
 
 @njit(cache=True, fastmath={"contract"})
 def _exp_of_negative(x):
-    """exp(-x) for x >= 0; everything beyond 80 is as good as 0."""
+    """Compute exp(-x) for x >= 0; beyond 80 it is practically 0."""
     power = max(-_LOG2_E * x, np.float32(-120))
     whole = np.int32(power)
     rest = power - np.float32(whole)
@@ -71,7 +64,7 @@ def _exp_of_negative(x):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _pixel_area(means, i, place):
-    """The area that a pixel covers at Gaussian i, in squared scene units."""
+    """Compute the area of a pixel at the depth of Gaussian i, in squared scene units."""
     center, forward = place.center, place.forward
     z = (means[i, 0] - center[0]) * forward[0]
     z += (means[i, 1] - center[1]) * forward[1]
@@ -82,10 +75,9 @@ def _pixel_area(means, i, place):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def tell(begin, end, sums, means, place, areas, agreement):
-    """What one photograph shows of the Gaussians begin..end, and how far it agrees.
+    """Compute the visible area of the Gaussians begin..end in a photograph, and its agreement.
 
-    sums [n, 3] float32: of compositing weights, and of these times agreement. place: Place.
-    areas [n], agreement [n] float32 are written.
+    sums [n, 3] float32: compositing weights, and their products with agreement, summed over pixels.
     """
     for i in range(begin, end):
         areas[i] = sums[i, 0] * _pixel_area(means, i, place)
@@ -94,7 +86,7 @@ def tell(begin, end, sums, means, place, areas, agreement):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _listen(x, y, z, rays, center, turn, areas, agreement, heard):
-    """Add what a photograph at `center` says of a block to what is `heard`."""
+    """Add the weighted agreement of the photograph at `center` to the sums of a block."""
     one = np.float32(1)
     ray_x, ray_y, ray_z = rays
     agreeing, weights, largest = heard
@@ -111,21 +103,20 @@ def _listen(x, y, z, rays, center, turn, areas, agreement, heard):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def support(begin, end, centers, areas, agreement, means, sums, place, max_turn, enough, values):
-    """How far photographs support the Gaussians begin..end as a camera sees them.
+    """Compute the trust of the Gaussians begin..end as seen from a camera; 1 if it sees nothing.
 
     centers [k, 3], areas [k, n], agreement [k, n] float32: see `gscompleter.types.Evidence`.
-    means [n, 3] float32. sums [n] float32: of the compositing weights at the camera.
-    place: Place of the camera. max_turn: radians at which what is said has fallen to 1/e.
-    enough: share of what the camera sees that a photograph has to show.
-    values [n] float32 is written; 1 where the camera sees nothing.
+    sums [n] float32: compositing weights at the camera. place: its `CameraPose`.
+    max_turn: angle at which the weight of a photograph has fallen to 1/e, in radians.
+    enough: share of the area seen by the camera that a photograph has to see for full trust.
     """
     one, turn = np.float32(1), np.float32(1) / max_turn
     known = np.empty((6, BLOCK), np.float32)
     x, y, z, ray_x, ray_y, ray_z = known
-    agreeing, weights, largest = heard = np.empty((3, BLOCK), np.float32)
+    agreeing, weights, largest = totals = np.empty((3, BLOCK), np.float32)
     for start in range(begin, end, BLOCK):
         count = min(BLOCK, end - start)
-        heard[:] = 0
+        totals[:] = 0
         for j in range(count):
             x[j], y[j], z[j] = means[start + j, 0], means[start + j, 1], means[start + j, 2]
             dx, dy, dz = x[j] - place.center[0], y[j] - place.center[1], z[j] - place.center[2]
@@ -133,9 +124,9 @@ def support(begin, end, centers, areas, agreement, means, sums, place, max_turn,
             ray_x[j], ray_y[j], ray_z[j] = dx * inverse, dy * inverse, dz * inverse
         for k in range(len(centers)):
             center = centers[k, 0], centers[k, 1], centers[k, 2]
-            said = areas[k, start : start + count], agreement[k, start : start + count]
+            shown = areas[k, start : start + count], agreement[k, start : start + count]
             _listen(
-                x, y, z, (ray_x, ray_y, ray_z), center, turn, *said, (agreeing, weights, largest)
+                x, y, z, (ray_x, ray_y, ray_z), center, turn, *shown, (agreeing, weights, largest)
             )
         for j in range(count):
             i = start + j

@@ -1,8 +1,4 @@
-"""The lists of the tiles: which splats touch them, front to back, and what is summed along them.
-
-Like those of `rasterizer`, every kernel works on a range (begin, end) of its elements and writes to
-its own part of the outputs.
-"""
+"""Splat lists of the tiles, front to back, and sums of gradients over their entries."""
 
 import numpy as np
 from llvmlite import ir
@@ -12,7 +8,7 @@ from numba.extending import intrinsic
 from gscompleter.kernels.rasterizer import DEPTH, NUM_SPLAT_COLUMNS, TILE
 
 TILE_SHIFT = 4
-"""Logarithm of `TILE`: pixels shifted right by so many bits are tiles."""
+"""Binary logarithm of `TILE`."""
 
 
 # ---- From splats to lists ------------------------------------------------------------------------
@@ -20,7 +16,7 @@ TILE_SHIFT = 4
 
 @intrinsic
 def _bits_of(typing, value):
-    """The bits of a float32 as an unsigned integer; for positive numbers they sort alike."""
+    """Reinterpret a float32 as uint32; positive numbers keep their order."""
     return types.uint32(
         types.float32
     ), lambda context, builder, signature, arguments: builder.bitcast(arguments[0], ir.IntType(32))
@@ -28,10 +24,9 @@ def _bits_of(typing, value):
 
 @njit(cache=True, nogil=True)
 def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
-    """Count how many of the splats begin..end touch each tile.
+    """Add to `counts` [tiles] int32 how many of the splats begin..end touch each tile.
 
-    depth_limits [tiles] float32: behind it, nothing is seen in the tile.
-    counts [tiles] int32 is added to.
+    depth_limits [tiles] float32: depth behind which nothing is visible in a tile.
     """
     for i in range(begin, end):
         for tile_y in range(boxes[i, 2] >> TILE_SHIFT, (boxes[i, 3] + TILE - 1) >> TILE_SHIFT):
@@ -43,8 +38,7 @@ def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
 
 @njit(cache=True, nogil=True)
 def places_of(counts):
-    """Turn counts into places: `counts` [chunks, tiles] becomes where each chunk's part of each
-    list starts; returns where the lists start [tiles + 1] int64."""
+    """Turn counts [chunks, tiles] into offsets in place, and return the starts of the lists."""
     chunks, tiles = counts.shape
     tile_start = np.empty(tiles + 1, np.int64)
     place = 0
@@ -60,11 +54,10 @@ def places_of(counts):
 
 @njit(cache=True, nogil=True)
 def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entries, keys):
-    """Enter the splats begin..end into the lists of the tiles they touch.
+    """Enter the splats begin..end into the lists of the tiles they touch; see `count_entries`.
 
-    The first arguments are those of `count_entries`.
-    places [tiles] int32: where the next entry of each tile goes; counted up.
-    entries [e] int32 receives the index of the splat, and keys [e] uint32 the bits of its depth.
+    places [tiles] int32: next free entry of each tile; counted up.
+    entries, keys [e]: receive the index of the splat, int32, and the bits of its depth, uint32.
     """
     for i in range(begin, end):
         for tile_y in range(boxes[i, 2] >> TILE_SHIFT, (boxes[i, 3] + TILE - 1) >> TILE_SHIFT):
@@ -78,11 +71,7 @@ def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entri
 
 @njit(cache=True, nogil=True)
 def sort_lists(begin, end, tile_start, entries, keys):
-    """Sort the lists of the tiles begin..end front to back; of equals the first stays first.
-
-    A radix sort of the depths' bits, 8 at a time, without those in which all are alike. The near
-    plane keeps depths positive. A list and its keys fit into the cache, all together do not.
-    """
+    """Sort the lists of the tiles begin..end front to back, by a stable radix sort of depths."""
     largest = 0
     for tile in range(begin, end):
         largest = max(largest, tile_start[tile + 1] - tile_start[tile])
@@ -119,11 +108,9 @@ def sort_lists(begin, end, tile_start, entries, keys):
 
 @njit(cache=True, nogil=True)
 def number_slots(entries, count):
-    """Number the entries [e] int32 splat by splat, so that the gradients of each of the splats
-    0..count lie together whatever tiles they come from.
+    """Assign slots to the entries [e] so that the gradients of a splat are adjacent.
 
-    Returns the number of each entry [e] int32, and where those of each splat start [count + 1]
-    int64.
+    Returns the slot of each entry [e] int32, and the first slot of each splat [count + 1] int64.
     """
     slot_start = np.zeros(count + 1, np.int64)
     for place in range(len(entries)):
@@ -142,8 +129,7 @@ def number_slots(entries, count):
 
 @njit(cache=True, nogil=True)
 def number_by_use(entries, count):
-    """The splats 0..count that are named by `entries` [e] int32, in the order in which they are
-    named first [m] int32, and the entries as places in that order [e] int32."""
+    """Renumber `entries` by the first use of splats; return the used splats in order, and them."""
     numbers = np.full(count, -1, np.int32)
     order, renamed = np.empty(count, np.int32), np.empty_like(entries)
     used = 0
@@ -159,10 +145,7 @@ def number_by_use(entries, count):
 
 @njit(cache=True, nogil=True)
 def take_splats(begin, end, rows, splats, opacities, boxes, taken):
-    """Copy splats of these rows to the places begin..end; the caller gives what holds them.
-
-    rows [m] int32. taken: splats [m, 9], opacities [m] and boxes [m, 4] to write.
-    """
+    """Copy the splats of `rows` to the places begin..end of the arrays in `taken`."""
     to_splats, to_opacities, to_boxes = taken
     for place in range(begin, end):
         i = rows[place]
@@ -175,11 +158,9 @@ def take_splats(begin, end, rows, splats, opacities, boxes, taken):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def sum_entries(begin, end, slot_start, gradients, written, totals):
-    """Sums of the gradients of the entries of each of the Gaussians begin..end.
+    """Sum the gradients of the entries of each of the Gaussians begin..end into `totals` [n, c].
 
-    gradients [slots, c] float32, where written [slots]: the slots from slot_start[i] to
-        slot_start[i + 1] belong to Gaussian i.
-    totals [n, c] float32 is written.
+    gradients [slots, c] float32 count if written [slots], from slot_start[i] to slot_start[i + 1].
     """
     for i in range(begin, end):
         for column in range(gradients.shape[1]):
@@ -192,10 +173,9 @@ def sum_entries(begin, end, slot_start, gradients, written, totals):
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def sum_by_name(begin, end, entries, rows, gradients, written, totals):
-    """Sums of the gradients of all entries that name each of the splats begin..end.
+    """Add the gradients of the entries of splats begin..end to those of their Gaussians.
 
-    entries [e] int32: the splat of each entry. gradients [e, c] float32, where written [e].
-    rows [splats] int32: the Gaussian of each splat. totals [n, c] float32 is added to.
+    gradients [e, c] float32 count if written [e]. rows [splats]: Gaussian of each splat.
     """
     for place in range(len(entries)):
         i = entries[place]

@@ -1,7 +1,6 @@
-"""Nearest-neighbour fields of patches over several images, and the vote that turns them to pixels.
+"""Nearest-neighbour fields of patches over several images, and the vote for pixel colours.
 
-Every pixel reads the field of the previous round only and draws its own random numbers from a
-hash, so that the result does not depend on the number of threads.
+Pixels read the field of the last round and hash random numbers: any thread count gives one result.
 """
 
 from typing import NamedTuple
@@ -12,74 +11,71 @@ from numba import njit
 from gscompleter.kernels.sharing import share
 
 RADIUS = 3
-"""Patches are squares of 2 * radius + 1 pixels. Known when kernels are compiled, so that the rows
-of a patch are compared side by side."""
+"""Radius of a patch of 2 * radius + 1 pixels; a compile-time constant for vectorised rows."""
 SIDE = 2 * RADIUS + 1
-"""Pixels of a side of a patch."""
+"""Side of a patch, in pixels."""
 LANES = 24
-"""Numbers that a row of a patch is read as: three colours for each of its pixels and of the one
-beside them, which does not count, for whole registers are faster."""
+"""Values per row of a patch: 3 per pixel, with one pixel of padding to fill whole registers."""
 
 
 class Matched(NamedTuple):
-    """What is matched with what."""
+    """The image to complete, and the sources of its patches."""
 
     image: np.ndarray
-    """float32 [h + 2 RADIUS, w + 2 RADIUS + 1, 3]: what is being completed, `framed`."""
+    """float32 [h + 2 RADIUS, w + 2 RADIUS + 1, 3]: the image, padded by `pad_border`."""
     weight: np.ndarray
-    """float32, of the same shape: how much each of its numbers counts."""
+    """float32, same shape: weight of each value."""
     total: np.ndarray
-    """float32 [q]: sum of the weights of the pixels of each query's patch."""
+    """float32 [q]: sum of the pixel weights of each query's patch."""
     queries: np.ndarray
     """Pixels (y, x) whose patches are matched [q, 2]."""
     query_at: np.ndarray
-    """For each pixel the index of its query, or -1 [h, w]."""
+    """Index of the query of each pixel, or -1 [h, w]."""
     expected: np.ndarray
-    """float32 [q]: logarithm of the depth that each query should have."""
+    """float32 [q]: logarithm of the expected depth of each query."""
     sources: np.ndarray
-    """float32 [s, H, W + 1, 3]: images that patches are taken from, `with_column_beside`."""
+    """float32 [s, H, W + 1, 3]: source images, padded by `pad_column`."""
     usable: np.ndarray
-    """bool [s, H, W]: the centres that a patch may have there."""
+    """bool [s, H, W]: True for valid patch centres."""
     log_depth: np.ndarray
-    """float32 [s, H, W]: logarithm of the depths there."""
+    """float32 [s, H, W]: logarithm of the source depths."""
 
 
 class Costs(NamedTuple):
-    """What a match costs, besides its difference."""
+    """Costs of a match in addition to its difference."""
 
     max_bias: np.float32
     """Largest shift of a colour channel between two patches."""
     bias_penalty: np.float32
-    """Cost of such a shift, squared."""
+    """Cost of a squared shift of 1."""
     depth_penalty: np.float32
-    """Largest cost of a source that lies before the expected depth."""
+    """Largest cost of a source in front of the expected depth."""
     distance_penalty: np.float32
     """Largest cost of a source far away in the image."""
     diagonal: np.float32
-    """Pixels that are far away."""
+    """Distance of the largest cost, in pixels."""
 
 
 @njit(cache=True, inline="always")
 def _hash(value):
-    """A well mixed 64-bit number (the finaliser of splitmix64)."""
+    """Mix the bits of a 64-bit number (the finaliser of splitmix64)."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return value ^ (value >> np.uint64(31))
 
 
 def framed(image):
-    """`image` [h, w, 3] with a border of zeros, wide enough for the patches around its corners."""
+    """Pad `image` [h, w, 3] with zeros for the patches around its corners."""
     return np.pad(image, ((RADIUS, RADIUS), (RADIUS, RADIUS + 1), (0, 0)))
 
 
 def with_column_beside(images):
-    """Images [s, H, W, 3] and a column of zeros to the right of each, as kernels read them."""
+    """Pad images [s, H, W, 3] with a column of zeros on the right, as kernels read them."""
     return np.pad(images, ((0, 0), (0, 0), (0, 1), (0, 0)))
 
 
 @njit(cache=True, inline="always")
 def _copy(image, y, x, patch):
-    """Copy the rows of the patch around pixel (y, x) of a framed image."""
     numbers = image.reshape(-1)
     stride = np.uintp(3 * image.shape[1])
     start = np.uintp(y) * stride + np.uintp(3 * x)
@@ -90,15 +86,11 @@ def _copy(image, y, x, patch):
 
 @njit(cache=True, inline="always")
 def _patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, bias):
-    """Mean squared difference of `patch` and the one around (s, sy, sx), after the best small shift
-    of each colour channel.
-
-    The shift is written to `bias`; `sums` [2, LANES] is room for sums down the columns.
-    """
+    """Compute the mean squared difference of `patch` and (s, sy, sx) after the best shift."""
     max_bias, bias_penalty = costs.max_bias, costs.bias_penalty
     numbers = sources.reshape(-1)
     H, W = sources.shape[1:3]
-    # Unsigned, so that no index is looked at for whether it counts from the end.
+    # Unsigned, so that no index is checked for negative values.
     stride = np.uintp(3 * W)
     start = np.uintp(3 * ((s * H + sy - RADIUS) * W + sx - RADIUS))
     for lane in range(LANES):
@@ -131,7 +123,6 @@ def _patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, bias):
 
 @njit(cache=True, fastmath={"contract"})
 def _prior(costs, nearer, dy, dx):
-    """What a source costs for lying before the expected depth, and for being far away."""
     distance = np.float32(np.sqrt(float(dy**2 + dx**2)))
     nearer = max(nearer, np.float32(0))
     return costs.depth_penalty * min(nearer * nearer, np.float32(1)) + (
@@ -142,15 +133,9 @@ def _prior(costs, nearer, dy, dx):
 def search(matched, costs, field, rounds, max_reach, seed):
     """Improve the nearest source patch of every query, by propagation and random search.
 
-    Args:
-        matched, costs: What is matched, and what matches cost.
-        field: Matches (source, y, x) [q, 3]; all of them usable. Written to.
-        rounds: Passes of propagation and random search.
-        max_reach: Pixels within which the random search begins; it shrinks from there.
-        seed: Of the random search.
-
-    Returns:
-        The cost of every match [q] and its shift of colour [q, 3].
+    field: matches (source, y, x) [q, 3], all of them usable; updated in place.
+    max_reach: radius of the random search at its start, in pixels.
+    Returns the cost of every match [q] and its shift of colour [q, 3].
     """
     count = len(matched.queries)
     cost, shift = np.full(count, np.inf, np.float32), np.zeros((count, 3), np.float32)
@@ -162,8 +147,7 @@ def search(matched, costs, field, rounds, max_reach, seed):
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _improve(begin, end, matched, costs, number, max_reach, seed, before, field, cost, shift):
-    """Pass `number` over the queries from `begin` to `end`; `before` is the field of the one
-    before."""
+    """Run pass `number` over the queries begin..end; `before` is the previous field."""
     usable, query_at = matched.usable, matched.query_at
     num_sources, H, W = usable.shape
     h, w = query_at.shape
@@ -182,7 +166,7 @@ def _improve(begin, end, matched, costs, number, max_reach, seed, before, field,
         reach = max_reach
         for trial in range(-1 if number == 0 else 0, 24):
             if trial < 0:
-                # Nothing has told yet what the match costs that it begins with.
+                # The cost of the initial match is not known yet.
                 s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
             elif trial < 8:
                 # Neighbours one and four pixels away propose their own offset.
@@ -232,29 +216,22 @@ def _improve(begin, end, matched, costs, number, max_reach, seed, before, field,
 
 
 def vote(query_at, vote_weight, sources, field, shift):
-    """Weighted mean of what all patches over a pixel say about it.
+    """Compute the weighted mean colour of all patches over each pixel, and the total weight.
 
-    Args:
-        query_at: For each pixel the index of its query, or -1 [h, w].
-        vote_weight: float32 [q]: how much the patch of each query counts.
-        sources: float32 [s, H, W + 1, 3], as of `Matched`.
-        field, shift: The match of each query, and what is added to its colours.
-
-    Returns:
-        Colours [h, w, 3] and the sum of their weights [h, w]; 0 where no patch says anything.
+    query_at [h, w]: query of each pixel, or -1. vote_weight [q]: weight of its patch.
+    field, shift: match of each query, and the shift added to its colours.
     """
     h, w = query_at.shape
     # Wider than the image, so that patches over its sides need not be cut.
-    colours = np.zeros((h, w + 2 * RADIUS, 3), np.float32)
+    colors = np.zeros((h, w + 2 * RADIUS, 3), np.float32)
     totals = np.zeros((h, w + 2 * RADIUS), np.float32)
-    share(_vote, h, query_at, vote_weight, sources, field, shift, colours, totals)
+    share(_vote, h, query_at, vote_weight, sources, field, shift, colors, totals)
     inner = np.s_[:, RADIUS:-RADIUS]
-    return colours[inner] / np.maximum(totals[inner], 1e-12)[..., None], totals[inner]
+    return colors[inner] / np.maximum(totals[inner], 1e-12)[..., None], totals[inner]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _vote(begin, end, query_at, vote_weight, sources, field, shift, colours, totals):
-    """Sum up what is said of the rows from `begin` to `end`, one query after the other."""
     h, w = query_at.shape
     for y in range(max(begin - RADIUS, 0), min(end + RADIUS, h)):
         for x in range(w):
@@ -264,9 +241,9 @@ def _vote(begin, end, query_at, vote_weight, sources, field, shift, colours, tot
             a = vote_weight[q]
             s, sy, sx = field[q, 0], field[q, 1], field[q, 2]
             for dy in range(max(-RADIUS, begin - y), min(RADIUS, end - 1 - y) + 1):
-                said, sums = sources[s, sy + dy], colours[y + dy]
+                source_row, sums = sources[s, sy + dy], colours[y + dy]
                 for column in range(SIDE):
                     for c in range(3):
-                        colour = said[sx - RADIUS + column, c] + shift[q, c]
-                        sums[x + column, c] += a * colour
+                        color = source_row[sx - RADIUS + column, c] + shift[q, c]
+                        sums[x + column, c] += a * color
                     totals[y + dy, x + column] += a

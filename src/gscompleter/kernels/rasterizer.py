@@ -1,23 +1,18 @@
 """Compiled tile rasteriser of 3D Gaussians, forward and backward, for CPUs.
 
-The image is cut into tiles of 16 × 16 pixels. Gaussians are projected to splats and entered into
-the lists of the tiles that they touch, front to back (`kernels/lists.py`). A tile walks its list; a
-splat touches the rows of its bounding box; a row of 16 pixels is one vector.
-LLVM does not find these vectors by itself, so the loop over the rows is written in its own language
-(the intrinsics below); it turns them into whatever the processor has.
+Gaussians are projected to splats and entered into the lists of the 16 × 16 tiles that they touch,
+front to back (`kernels/lists.py`). A row of a tile is one vector; LLVM does not find these vectors
+itself, so the loops over rows are intrinsics in its intermediate language.
 
-Two lists are walked at once, merged by depth: `context`, which is frozen and gets no gradient, and
-`new`, which does. Drawing a single scene leaves the context empty. Where new splats keep their
-place and change but their looks, the context is folded into their pixels once (`Fragments`).
+Two lists are merged by depth: the frozen `context`, and `new`, which gets gradients. If only the
+appearance of new splats changes, the context is baked into their pixels once (`Fragments`).
 
-Every kernel works on a range (begin, end) of its elements, or on the fragments of one, writes to
-its own part of the outputs and releases the interpreter lock: the caller shares ranges among
-threads, and the result does not depend on how.
+Kernels work on a range (begin, end) of elements or on fragments, write to their own outputs and
+release the interpreter lock. Results do not depend on how ranges are split among threads.
 
 A splat's falloff is `alpha = opacity * exp(-(s² + t²))` with whitened coordinates
-`s = u dx + v dy`, `t = w dy` of the offset (dx, dy) from its centre. `U = [[u, v], [0, w]]` obeys
-`UᵀU = ½ Σ⁻¹` for the 2D covariance Σ. Unlike the quadratic form of Σ⁻¹ it does not cancel for thin
-oblique splats.
+`s = u dx + v dy`, `t = w dy` of the offset (dx, dy) from its centre, and `U = [[u, v], [0, w]]`,
+`UᵀU = ½ Σ⁻¹` for the 2D covariance Σ. Unlike Σ⁻¹ it does not cancel for thin oblique splats.
 """
 
 import math
@@ -30,10 +25,10 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 TILE = 16
-"""Side of a tile in pixels, and the number of pixels that one vector holds."""
+"""Side of a tile in pixels, and the number of lanes of a vector."""
 
 FIRST_ROWS = 1 << 14
-"""Rows of weights that there is room for at first, as many as a tile full of small splats has."""
+"""Initial number of rows for weights, enough for a tile full of small splats."""
 
 BLUR = np.float32(0.3)
 TANGENT_MARGIN = np.float32(0.15)
@@ -41,25 +36,23 @@ MIN_ALPHA = np.float32(1 / 255)
 MAX_ALPHA = np.float32(0.999)
 MIN_TRANSMITTANCE = np.float32(1e-4)
 SOLID = np.float32(0.5)
-"""Alpha above which a frozen splat is not folded with others. Where a pixel is closed among what is
-folded, its colour is off by at most `MIN_TRANSMITTANCE / SOLID`."""
+"""Alpha above which frozen splats are not baked; bounds colour errors by
+`MIN_TRANSMITTANCE / SOLID`."""
 
 X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
 """Columns of the splats."""
 NUM_SPLAT_COLUMNS = 9
 
 SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
-"""Columns of the gradients of an entry; green and blue follow red. SUM is the sum over pixels of
-`q = alpha dL/dalpha`, and the next five those of q times s, t, s², s t and t²."""
+"""Gradient columns: sums of q = alpha dL/dalpha times 1, s, t, s², s t, t²; depth; colours."""
 NUM_GRADIENT_COLUMNS = 10
 
 OF_ALL, OF_OPACITY, OF_DEPTH, OF_COLOUR = range(4)
-"""Which gradients are wanted: all of them, or SUM, SUM_DEPTH or those of the three colours alone,
-which are then the only columns."""
+"""Gradients to compute: all columns, or only SUM, SUM_DEPTH or the three colours."""
 
 
 class Pinhole(NamedTuple):
-    """A camera, as the kernels want it."""
+    """A camera in the form that kernels read."""
 
     rotation: tuple[np.float32, ...]
     """Camera from world, nine numbers row by row."""
@@ -68,13 +61,13 @@ class Pinhole(NamedTuple):
     intrinsics: np.ndarray
     """fx, fy, cx, cy in pixels [4], float32."""
     near: np.float32
-    """Smallest z that is drawn."""
+    """Smallest z that is rendered."""
     width: int
     height: int
 
 
 class GaussianArrays(NamedTuple):
-    """Gaussians, or their gradients, all float32. See `gscompleter.types.Gaussians`."""
+    """Gaussians, or their gradients, all float32; see `gscompleter.types.Gaussians`."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -84,38 +77,35 @@ class GaussianArrays(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """Splats and, for each tile, the list of those that touch it, front to back."""
+    """Splats, and for each tile the list of those that touch it, front to back."""
 
     splats: np.ndarray
     """[n, 9] float32, columns X to BLUE."""
     opacities: np.ndarray
-    """[n] float32."""
     boxes: np.ndarray
-    """Pixels that a splat may touch, x from, x to, y from, y to (excluded) [n, 4] int16, or int32
-    in an image that is larger."""
+    """Pixels that a splat may touch: x from, x to, y from, y to (excluded) [n, 4], int16 or
+    int32."""
     tile_start: np.ndarray
-    """Where the list of each tile starts [tiles + 1] int64."""
+    """Start of the list of each tile [tiles + 1] int64."""
     entries: np.ndarray
     """Index of the splat [entries] int32."""
 
 
 class Frame(NamedTuple):
-    """An image, and what the backward pass needs of how it came about."""
+    """A rendered image, and the state that the backward pass needs."""
 
     image: np.ndarray
-    """[h, w, 3] float32."""
     depth: np.ndarray
-    """z-depth [h, w] float32, 0 where nothing is seen."""
+    """z-depth [h, w] float32, 0 for empty pixels."""
     alpha: np.ndarray
-    """[h, w] float32."""
     transmittance: np.ndarray
-    """What passes behind the last contribution [h, w] float32."""
+    """Transmittance behind the last contribution [h, w] float32."""
     last: np.ndarray
     """Position of the last contribution in the merged list of its tile, or -1 [h, w] int32."""
     used: np.ndarray
-    """How much of the two lists was walked until the tile was full [tiles, 2] int32."""
+    """Entries of both lists that were composited until the tile was full [tiles, 2] int32."""
     full: np.ndarray
-    """Whether no pixel of the tile lets anything more pass [tiles] bool."""
+    """True for tiles without any transmittance left [tiles] bool."""
 
 
 # ---- Vectors of 16 pixels in LLVM's intermediate representation ------------------------------
@@ -153,11 +143,7 @@ class _Lanes:
         return _Lanes(self.builder, self.builder.fsub(self._value_of(other), self.value))
 
     def times(self, factor, plus):
-        """self * factor + plus, rounded once where the processor can do that.
-
-        The rounding is asked for here and not left to the optimiser, so that the backward pass
-        arrives at the very alphas of the forward pass.
-        """
+        """Compute self * factor + plus with a single rounding, the same in both passes."""
         multiply_add = cgutils.get_or_insert_function(
             self.builder.module,
             ir.FunctionType(_FLOATS, [_FLOATS, _FLOATS, _FLOATS]),
@@ -167,7 +153,7 @@ class _Lanes:
         return _Lanes(self.builder, self.builder.call(multiply_add, arguments))
 
     def compare(self, relation, other):
-        """Mask of the lanes where the relation holds; it never holds for NaN."""
+        """Compare lane by lane; False for NaN."""
         return self.builder.fcmp_ordered(relation, self.value, self._value_of(other))
 
     def where(self, mask, otherwise):
@@ -176,10 +162,7 @@ class _Lanes:
 
 
 def _sums_of_lanes(builder, vectors):
-    """One vector whose lane k is the sum of the lanes of the k-th of up to sixteen vectors.
-
-    Two vectors are added into one, half of whose lanes stand for each, until one is left.
-    """
+    """Sum the lanes of each of up to sixteen vectors into one lane of the result."""
     values = [vector.value for vector in vectors]
     undefined = ir.Constant(_FLOATS, ir.Undefined)
     width = TILE
@@ -210,7 +193,7 @@ def _broadcast(builder, scalar, vector_type=_FLOATS):
 
 
 def _exp_of_negative(values):
-    """exp(-values) for values >= 0; everything beyond 80 is as good as 0."""
+    """Compute exp(-values) for values >= 0; beyond 80 it is practically 0."""
     builder = values.builder
     power = values * -_LOG2_E
     power = power.where(power.compare(">", -120.0), -120.0)
@@ -226,7 +209,7 @@ def _exp_of_negative(values):
 
 
 class _Rows:
-    """Rows of a tile's arrays, each row some vectors one after the other."""
+    """Rows of a tile's arrays, each of them several vectors."""
 
     def __init__(self, context, builder, array_type, array, vector_type, vectors_per_row):
         self.builder, self.vector_type = builder, vector_type
@@ -247,7 +230,7 @@ class _Rows:
 
 
 class _Splat:
-    """A splat and the tile it is drawn to, as the intrinsics receive them."""
+    """A splat relative to its tile, as the intrinsics receive it."""
 
     def __init__(self, builder, x, y, u, v, w, opacity, red, green, blue, depth):
         self.builder = builder
@@ -261,7 +244,7 @@ class _Splat:
         self.opacity = _Lanes(builder, _broadcast(builder, opacity))
 
     def falloff(self, row):
-        """dy of the row, and of its pixels alpha before it is capped, capped, and its mask."""
+        """Return dy of a row, and alpha before and after capping, and its mask."""
         builder = self.builder
         dy = builder.fsub(builder.sitofp(row, _FLOAT), self.y)
         s = self.u_dx + _Lanes(builder, _broadcast(builder, builder.fmul(self.v, dy)))
@@ -273,7 +256,7 @@ class _Splat:
 
 
 def _for_each_row(builder, rows, position, row_limit, body):
-    """Run `body(row)` for the rows in question for which `position` lies within `row_limit`."""
+    """Run `body(row)` for the rows whose limit is not below `position`."""
     begin, end = rows
     with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
         limit = builder.load(builder.gep(row_limit, [loop.index]))
@@ -282,11 +265,7 @@ def _for_each_row(builder, rows, position, row_limit, body):
 
 
 def _blend(splat, state, row):
-    """Composite a splat over a row: its weights, where it is visible, and what still lets pass.
-
-    state: `_Rows` of the transmittance and the sums of as many of red, green, blue and depth as
-        it holds.
-    """
+    """Composite a splat over a row; return its weights, and masks of visible and passing lanes."""
     builder = splat.builder
     _, _, alpha, visible = splat.falloff(row)
     alpha = alpha.where(visible, 0.0)
@@ -303,7 +282,7 @@ def _blend(splat, state, row):
 
 
 def _close_if_full(builder, passing, limits, row, filled):
-    """Set the limit of a row to -1 where nothing passes it any more, and count it."""
+    """Set the limit of a row to -1 and count it once it has no transmittance left."""
     any_passing = builder.bitcast(passing, ir.IntType(TILE))
     none = builder.icmp_unsigned("==", any_passing, ir.Constant(ir.IntType(TILE), 0))
     with builder.if_then(none, likely=False):
@@ -313,14 +292,12 @@ def _close_if_full(builder, passing, limits, row, filled):
 
 @intrinsic
 def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
-    """Composite a splat over the rows begin..end of a tile; returns how many of them it filled.
+    """Composite a splat over the rows begin..end of a tile; return how many it filled.
 
-    state: [16, 5, 16] float32, per row the transmittance and the sums of red, green, blue and
-        depth. A pixel that lets nothing more pass carries its transmittance with a minus.
-    last: [16, 16] int32, position of the last contribution.
-    row_limit: [16] int32, set to -1 where a row is full.
-    splat: x and y relative to the centre of the tile's first pixel, u, v, w, opacity, red, green,
-        blue and depth.
+    state [16, 5, 16]: per row the transmittance, negative in full pixels, and sums of colour and
+    depth.
+    last [16, 16] int32: position of the last contribution. row_limit [16] int32: -1 in full rows.
+    splat: x and y relative to the first pixel centre, u, v, w, opacity, red, green, blue and depth.
     """
     signature = types.int64(types.int64, types.int64, types.int32, state, last, row_limit, splat)
 
@@ -333,13 +310,13 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
         positions = _broadcast(builder, position, _INTS)
         filled = cgutils.alloca_once_value(builder, ir.Constant(_LONG, 0))
 
-        def draw(row):
+        def composite_row(row):
             _, visible, passing = _blend(splat, state, row)
             contributes = builder.and_(visible, passing)
             last.store(row, 0, builder.select(contributes, positions, last.load(row, 0)))
             _close_if_full(builder, passing, limits, row, filled)
 
-        _for_each_row(builder, (begin, end), position, limits, draw)
+        _for_each_row(builder, (begin, end), position, limits, composite_row)
         return builder.load(filled)
 
     return signature, generate
@@ -347,11 +324,7 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
 
 @intrinsic
 def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
-    """Composite a splat over the rows begin..end of a tile, and keep its weights.
-
-    state: [16, 4, 16] float32, without the depth.
-    kept: [rows, 16] float32; the weights of row `begin` go to its row `place`, and so on.
-    """
+    """Composite a splat, without depth, over rows and store its weights in `kept` at `place`."""
     signature = types.int64(types.int64, types.int64, types.int64, state, row_limit, kept, splat)
 
     def generate(context, builder, signature, arguments):
@@ -365,12 +338,12 @@ def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
             row, at = loop.index, builder.add(place, builder.sub(loop.index, begin))
             limit = builder.load(builder.gep(limits, [row]))
             is_open = builder.icmp_signed(">=", limit, ir.Constant(_INT, 0))
-            with builder.if_else(is_open) as (drawn, left_out):
-                with drawn:
+            with builder.if_else(is_open) as (open_row, full_row):
+                with open_row:
                     weight, _, passing = _blend(splat, state, row)
                     kept.store(at, 0, weight.value)
                     _close_if_full(builder, passing, limits, row, filled)
-                with left_out:
+                with full_row:
                     kept.store(at, 0, _constant(0.0))
         return builder.load(filled)
 
@@ -379,13 +352,7 @@ def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
 
 @intrinsic
 def _spread_rows(typing, begin, end, place, state, kept, sums):
-    """Sum the weights that were kept of a splat, times what lies in the image, over its rows.
-
-    state: [16, 4, 16] float32, whose rows hold red, green and blue from the second vector on.
-    kept, place: as `_weigh_rows` left them.
-    sums: [16] float32, the first four of which receive the sums of weight times red, green and
-        blue, and of the weight.
-    """
+    """Sum kept weights times the colours in `state` [16, 4, 16], and kept weights, to `sums`."""
     signature = types.void(types.int64, types.int64, types.int64, state, kept, sums)
 
     def generate(context, builder, signature, arguments):
@@ -414,11 +381,7 @@ def _spread_rows(typing, begin, end, place, state, kept, sums):
 
 @intrinsic
 def _fall_off(typing, row, falloffs, splat):
-    """Write the alphas of a splat in a row of its tile before they are capped, of pixels that it is
-    visible in, and of the others 0.
-
-    falloffs: [16] float32.
-    """
+    """Write the uncapped alphas of a splat in a row to `falloffs` [16]; 0 if invisible."""
     signature = types.void(types.int64, falloffs, splat)
 
     def generate(context, builder, signature, arguments):
@@ -433,22 +396,16 @@ def _fall_off(typing, row, falloffs, splat):
 
 
 def _undraw(wanted):
-    """An intrinsic that takes a splat off a tile again, back to front.
-
-    `wanted` names what it sums up for the gradients: "nothing", "opacity", "depth", "colour" or
-    "all".
-    """
+    """Make an intrinsic that reverts a splat, with sums for the `wanted` gradients."""
 
     @intrinsic
     def undraw_rows(typing, begin, end, position, state, last, row_limit, sums, splat):
-        """Walk back over the rows begin..end of a splat.
+        """Revert the rows begin..end of a splat, back to front.
 
-        state: [16, 7, 16] float32, per row the transmittance behind the splat, the sum behind it
-            of weight times gradient, and dL/d of red, green, blue, depth sum and alpha.
-        last, row_limit: as filled by the forward pass; a row's limit is the largest of its last.
-        sums: [16] float32, the first ten of which receive the sums over the pixels of q, q dx,
-            q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha) and of weight times dL/d depth, red,
-            green and blue.
+        state [16, 7, 16]: per row the transmittance and the sum of weight times gradient behind the
+        splat, and dL/d of red, green, blue, depth sum and alpha. sums [16] receives the sums of q,
+        q dx, q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha), and of weight times dL/d depth,
+        red, green and blue.
         """
         signature = types.void(
             types.int64, types.int64, types.int32, state, last, row_limit, sums, splat
@@ -467,43 +424,43 @@ def _undraw(wanted):
                 for _ in range(count)
             ]
 
-            def undraw(row):
+            def revert(row):
                 dy, raw, alpha, visible = splat.falloff(row)
                 reached = builder.icmp_signed("<=", positions, last.load(row, 0))
                 contributes = builder.and_(visible, reached)
                 alpha = alpha.where(contributes, 0.0)
-                slopes = [_Lanes(builder, state.load(row, index)) for index in range(2, 7)]
+                gradients = [_Lanes(builder, state.load(row, index)) for index in range(2, 7)]
                 behind = _Lanes(builder, state.load(row, 1))
 
                 opening = 1.0 / (1.0 - alpha)
                 before = _Lanes(builder, state.load(row, 0)) * opening
                 weight = alpha * before
-                value = slopes[4]
-                for channel, slope in zip(splat.channels, slopes[:4], strict=True):
-                    value = channel.times(slope, plus=value)
+                value = gradients[4]
+                for channel, gradient in zip(splat.channels, gradients[:4], strict=True):
+                    value = channel.times(gradient, plus=value)
                 state.store(row, 0, before.value)
                 state.store(row, 1, weight.times(value, plus=behind).value)
                 if wanted == "nothing":
                     return
 
                 if wanted == "colour":
-                    for total, slope in zip(totals, slopes[:3], strict=True):
-                        value = weight.times(slope, plus=_Lanes(builder, builder.load(total)))
+                    for total, gradient in zip(totals, gradients[:3], strict=True):
+                        value = weight.times(gradient, plus=_Lanes(builder, builder.load(total)))
                         builder.store(value.value, total)
                     return
 
                 q = (before * value - behind * opening) * alpha
                 q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
-                terms = [weight * slopes[3]] if wanted == "depth" else [q]
+                terms = [weight * gradients[3]] if wanted == "depth" else [q]
                 if wanted == "all":
                     dys = _Lanes(builder, _broadcast(builder, dy))
                     terms += [q * dys, q * dys * dys]
-                    terms += [weight * slopes[index] for index in (3, 0, 1, 2)]
+                    terms += [weight * gradients[index] for index in (3, 0, 1, 2)]
                 for total, term in zip(totals, terms, strict=True):
                     value = _Lanes(builder, builder.load(total)) + term
                     builder.store(value.value, total)
 
-            _for_each_row(builder, (begin, end), position, limits, undraw)
+            _for_each_row(builder, (begin, end), position, limits, revert)
 
             columns = [_Lanes(builder, builder.load(total)) for total in totals]
             if wanted == "all":
@@ -561,7 +518,6 @@ def _applied(a, x, y, z):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _unit(quats, i):
-    """Quaternion i brought to length 1, and the factor that did it."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     factor = np.float32(1) / math.sqrt(w * w + x * x + y * y + z * z)
     return w * factor, x * factor, y * factor, z * factor, factor
@@ -585,7 +541,7 @@ def _rotation(w, x, y, z):
 
 @njit(cache=True, fastmath={"contract"})
 def _rotation_backward(w, x, y, z, d):
-    """Gradient of the unit quaternion from that of its rotation matrix."""
+    """Compute the gradient of a unit quaternion from that of its rotation matrix."""
     two = np.float32(2)
     return (
         two * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
@@ -612,7 +568,7 @@ def _scaled_columns(a, x, y, z):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _tangent_limits(pinhole):
-    """Least and largest x/z, and the same of y/z, that the Jacobian is evaluated at."""
+    """Compute the range of x/z and of y/z at which the Jacobian is evaluated."""
     fx, fy, cx, cy = pinhole.intrinsics
     width, height = np.float32(pinhole.width), np.float32(pinhole.height)
     margin_x, margin_y = TANGENT_MARGIN * width, TANGENT_MARGIN * height
@@ -626,7 +582,7 @@ def _tangent_limits(pinhole):
 
 @njit(cache=True, fastmath={"contract"})
 def _flattened(axes, jacobian):
-    """The Gaussian's axes (columns, in the camera) seen in the image: a 2 × 3 matrix, by rows.
+    """Project the axes of a Gaussian (columns, in the camera) to a 2 × 3 matrix, by rows.
 
     jacobian: d pixel x / dx, d pixel x / dz, d pixel y / dy, d pixel y / dz.
     """
@@ -654,7 +610,7 @@ _C3XX = np.float32(1.445305721320277)
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _direction(center, means, i):
-    """Unit vector from the camera centre to the mean, and their inverse distance."""
+    """Compute the unit vector from the camera centre to the mean, and the inverse distance."""
     x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
     inverse = np.float32(1) / math.sqrt(x * x + y * y + z * z)
     return x * inverse, y * inverse, z * inverse, inverse
@@ -662,7 +618,7 @@ def _direction(center, means, i):
 
 @njit(cache=True, fastmath={"contract"})
 def _evaluate_basis(x, y, z, basis):
-    """Fill `basis`, of length 1, 4, 9 or 16, for a unit direction."""
+    """Evaluate 1, 4, 9 or 16 basis functions at a unit direction."""
     two, three, four = np.float32(2), np.float32(3), np.float32(4)
     xx, yy, zz = x * x, y * y, z * z
     basis[0] = _C0
@@ -686,7 +642,7 @@ def _evaluate_basis(x, y, z, basis):
 
 @njit(cache=True, fastmath={"contract"})
 def _basis_slope(x, y, z, g):
-    """Gradient with respect to the direction of the sum of g[k] times basis function k."""
+    """Compute the gradient in the direction of the sum of g[k] times basis function k."""
     two, three, four = np.float32(2), np.float32(3), np.float32(4)
     six, eight = np.float32(6), np.float32(8)
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
@@ -716,12 +672,10 @@ def _basis_slope(x, y, z, g):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def project(begin, end, gaussians, pinhole, splats, boxes, factors):
-    """Project the Gaussians begin..end; those that cannot be seen get an empty box.
+    """Project the Gaussians begin..end to `splats` and `boxes`, empty if invisible.
 
-    gaussians: GaussianArrays of n. splats [n, 9] float32 and boxes [n, 4] are written. The
-    box encloses the pixels where the alpha of a splat of this opacity reaches 1/255.
-    factors: [n] float32 for antialiased Gaussians, written: what their opacities are multiplied
-        by here. None for others, which are compiled on their own.
+    A box encloses the pixels in which alpha reaches 1/255 at the given opacity. factors [n]
+    receives the factors on the opacities of antialiased Gaussians, and is None for classic ones.
     """
     means, quats, scales, opacities, sh = gaussians
     view, center, near = pinhole.rotation, pinhole.center, pinhole.near
@@ -741,14 +695,16 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
             continue
         inverse_z = one / z
         tan_x, tan_y = x * inverse_z, y * inverse_z
-        slope_x, slope_y = fx * inverse_z, fy * inverse_z
+        jacobian_x, jacobian_y = fx * inverse_z, fy * inverse_z
         clamped_x = min(max(tan_x, least_x), largest_x)
         clamped_y = min(max(tan_y, least_y), largest_y)
         qw, qx, qy, qz, _ = _unit(quats, i)
         axes = _scaled_columns(
             _product(view, _rotation(qw, qx, qy, qz)), scales[i, 0], scales[i, 1], scales[i, 2]
         )
-        flat = _flattened(axes, (slope_x, -slope_x * clamped_x, slope_y, -slope_y * clamped_y))
+        flat = _flattened(
+            axes, (jacobian_x, -jacobian_x * clamped_x, jacobian_y, -jacobian_y * clamped_y)
+        )
 
         # The determinant of F Fᵀ + blur is summed from squares: nothing cancels, however thin
         # the splat is. In double precision nothing overflows either.
@@ -791,10 +747,10 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
         direction_x, direction_y, direction_z, _ = _direction(center, means, i)
         _evaluate_basis(direction_x, direction_y, direction_z, basis)
         for channel in range(3):
-            colour = half
+            color = half
             for k in range(len(basis)):
-                colour += basis[k] * sh[i, k, channel]
-            splats[i, RED + channel] = max(colour, zero)
+                color += basis[k] * sh[i, k, channel]
+            splats[i, RED + channel] = max(color, zero)
 
 
 # ---- Two lists, merged by depth ------------------------------------------------------------------
@@ -802,7 +758,7 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
 
 @njit(cache=True)
 def _depth_at(splats, entries, place, begin, end, beyond):
-    """Depth of an entry, or `beyond` where the place lies outside of begin..end."""
+    """Return the depth of an entry, or `beyond` for places outside begin..end."""
     if place < begin or place >= end:
         return beyond
     return splats[entries[place], DEPTH]
@@ -810,14 +766,10 @@ def _depth_at(splats, entries, place, begin, end, beyond):
 
 @njit(cache=True, nogil=True)
 def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth_limits):
-    """Merge the lists of the tiles begin..end of two layers, as far as they were walked.
+    """Merge the lists of the tiles begin..end of two layers, as far as they were composited.
 
-    What was not reached without anything in front of it is not reached with something in front.
-
-    context, new: Layer. used [tiles, 2] int32, full [tiles] bool: as `composite` left them.
-    tile_start [tiles + 1] int64: where the merged lists start.
-    entries [e] int32 is written; the splats of `new` are numbered after those of the context.
-    depth_limits [tiles] float32 is written: the z-depth behind which a tile shows nothing.
+    Splats of `new` are numbered after those of the context. depth_limits [tiles] receives the
+    z-depth behind which a tile shows nothing.
     """
     c_splats, _, _, c_start, c_entries = context
     n_splats, _, _, n_start, n_entries = new
@@ -854,7 +806,7 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
 
 @njit(cache=True)
 def _aligned(size):
-    """An array of float32 that starts at a cache line, so that no vector straddles two."""
+    """Allocate float32 values from a cache line on, so that no vector straddles two."""
     buffer = np.empty(size + TILE, np.float32)
     start = (-buffer.ctypes.data % 64) // 4
     return buffer[start : start + size]
@@ -862,7 +814,7 @@ def _aligned(size):
 
 @njit(cache=True, fastmath={"contract"})
 def _placed(splats, opacities, boxes, i, left, top):
-    """Rows of the tile at (left, top) that splat i touches, and the splat relative to the tile."""
+    """Return the rows of the tile at (left, top) that splat i touches, and the relative splat."""
     half = np.float32(0.5)
     return (
         max(np.int64(boxes[i, 2]) - top, 0),
@@ -884,10 +836,7 @@ def _placed(splats, opacities, boxes, i, left, top):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def composite(begin, end, tiles, context, new, frame):
-    """Draw tiles[begin:end] of two layers merged by depth; of equals the context is in front.
-
-    context, new: Layer. frame: Frame, of which these tiles are written.
-    """
+    """Composite tiles[begin:end] of two layers into `frame`, the context first at equal depth."""
     # Taking an array out of a tuple counts references, which must not happen in the loops.
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -948,7 +897,6 @@ def composite(begin, end, tiles, context, new, frame):
 
 @njit(cache=True, nogil=True)
 def _with_room(kept, used):
-    """`kept`, or what is `used` of it with twice as many rows where a tile's more do not fit."""
     if used + TILE <= len(kept):
         return kept
     wider = _aligned(2 * kept.size).reshape((2 * len(kept), TILE))
@@ -961,17 +909,10 @@ def _with_room(kept, used):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, written):
-    """Draw tiles[begin:end] and give what the image lacks back to the new layer's entries.
+    """Composite tiles[begin:end] and backproject the residual to the entries of `new`.
 
-    The weights of a splat in the pixels of a tile stay in the cache until the image of the tile is
-    finished: nothing is computed twice.
-
-    context, new: Layer.
-    photograph: [h, w, 3] float32, that the image should be.
-    slots [e] int32: slot of each entry of `new`.
-    sums [slots, 4] float32: over the pixels of the tile, of the entry's weight times what the
-        photograph has more than the image in red, green and blue, and of the weight.
-    written [slots] bool: set for the slots, and only those, that are drawn.
+    A splat's weights stay in the cache until the image of its tile is finished.
+    sums [slots, 4]: over the tile, weight times (photograph - image) per colour, and weight.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -997,7 +938,7 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
         n, n_begin, n_end = n_start[tile], n_start[tile], n_start[tile + 1]
         c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
         n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
-        place = np.int64(0)  # with a plain 0, what takes it is compiled once more
+        place = np.int64(0)  # with a plain 0, its callees are compiled twice
         while open_rows > 0 and (c < c_end or n < n_end):
             kept = _with_room(kept, place)
             if c_depth <= n_depth:
@@ -1006,7 +947,7 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
                 )
                 c += 1
                 c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
-                # The next one overwrites what is kept of it.
+                # The next splat overwrites its weights.
                 open_rows -= _weigh_rows(first, stop, place, state, row_limit, kept, splat)
                 continue
             first, stop, splat = _placed(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
@@ -1037,14 +978,10 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
 def composite_backward(
     begin, end, tiles, context, new, frame, slopes, slots, wanted, gradients, written
 ):
-    """Walk tiles[begin:end] back to front and sum up the gradients of the new layer's entries.
+    """Traverse tiles[begin:end] back to front and sum the gradients of the entries of `new`.
 
-    slopes: gradients of the frame's image [h, w, 3], depth [h, w] and alpha [h, w].
-    slots [e] int32: slot of each entry of `new`.
-    wanted: OF_ALL, OF_OPACITY, OF_DEPTH or OF_COLOUR.
-    gradients [slots, 10] float32, columns SUM to SUM_RED + 2; [slots, 1] or, of colours, [slots, 3]
-        where less is wanted.
-    written [slots] bool: set for the slots, and only those, that receive a gradient.
+    d_frame: gradients of image, depth and alpha. slots [e] int32: slot of each entry of `new`.
+    gradients [slots, columns] and written [slots] are set for visited entries only.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -1131,8 +1068,10 @@ def composite_backward(
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _compensation_backward(flat, q):
-    """Gradient of the flattened axes (see `_flattened`) from that of the logarithm of the factor
-    `sqrt(P / D)`, P being the squared area that they span and D the determinant with the blur."""
+    """Compute the gradient of the flattened axes from that of log sqrt(P / D).
+
+    P is the squared area that they span, D the determinant with the blur.
+    """
     a0, a1, a2 = np.float64(flat[0]), np.float64(flat[1]), np.float64(flat[2])
     b0, b1, b2 = np.float64(flat[3]), np.float64(flat[4]), np.float64(flat[5])
     c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
@@ -1154,13 +1093,7 @@ def _compensation_backward(flat, q):
 def project_backward(
     begin, end, gaussians, pinhole, factors, splats, slot_start, gradients, written, slopes
 ):
-    """Gradients of the Gaussians begin..end from those of their entries in the tiles.
-
-    gaussians, pinhole, factors, splats: as in `project`.
-    gradients [slots, 10] float32, where written [slots]: the slots from slot_start[i] to
-        slot_start[i + 1] belong to Gaussian i.
-    slopes: GaussianArrays of gradients, written where one arrives.
-    """
+    """Write gradients of the Gaussians begin..end to `d_gaussians` from those of entries."""
     means, quats, scales, opacities, sh = gaussians
     d_means, d_quats, d_scales, d_opacities, d_sh = slopes
     view, center = pinhole.rotation, pinhole.center
@@ -1189,10 +1122,10 @@ def project_backward(
         d_basis[:] = 0
         for channel in range(3):
             if splats[i, RED + channel] > 0:
-                d_colour = sums[SUM_RED + channel]
+                d_color = sums[SUM_RED + channel]
                 for k in range(len(basis)):
-                    d_sh[i, k, channel] = d_colour * basis[k]
-                    d_basis[k] += d_colour * sh[i, k, channel]
+                    d_sh[i, k, channel] = d_color * basis[k]
+                    d_basis[k] += d_color * sh[i, k, channel]
         d_dx, d_dy, d_dz = _basis_slope(direction_x, direction_y, direction_z, d_basis)
         radial = direction_x * d_dx + direction_y * d_dy + direction_z * d_dz
 
@@ -1201,13 +1134,13 @@ def project_backward(
         )
         inverse_z = one / z
         tan_x, tan_y = x * inverse_z, y * inverse_z
-        slope_x, slope_y = fx * inverse_z, fy * inverse_z
+        jacobian_x, jacobian_y = fx * inverse_z, fy * inverse_z
         clamped_x = min(max(tan_x, least_x), largest_x)
         clamped_y = min(max(tan_y, least_y), largest_y)
         qw, qx, qy, qz, unit_factor = _unit(quats, i)
         rotation = _product(view, _rotation(qw, qx, qy, qz))
         axes = _scaled_columns(rotation, scales[i, 0], scales[i, 1], scales[i, 2])
-        jacobian = (slope_x, -slope_x * clamped_x, slope_y, -slope_y * clamped_y)
+        jacobian = (jacobian_x, -jacobian_x * clamped_x, jacobian_y, -jacobian_y * clamped_y)
         flat = _flattened(axes, jacobian)
 
         # dL/dΣ = 2 Uᵀ Q U with Q = [[ss, st], [st, tt]], and Σ = F Fᵀ: dL/dF = 4 Uᵀ Q (U F).
@@ -1267,9 +1200,9 @@ def project_backward(
         d_tan_x = two * fx * u * sums[SUM_S]
         d_tan_y = two * fy * (v * sums[SUM_S] + w * sums[SUM_T])
         if clamped_x == tan_x:
-            d_tan_x -= d_xz * slope_x
+            d_tan_x -= d_xz * jacobian_x
         if clamped_y == tan_y:
-            d_tan_y -= d_yz * slope_y
+            d_tan_y -= d_yz * jacobian_y
         d_z = sums[SUM_DEPTH] - (d_xx * xx + d_xz * xz + d_yy * yy + d_yz * yz) * inverse_z
         d_z -= (d_tan_x * tan_x + d_tan_y * tan_y) * inverse_z
         d_x, d_y, d_z = _applied(from_view, d_tan_x * inverse_z, d_tan_y * inverse_z, d_z)
@@ -1282,43 +1215,39 @@ def project_backward(
 
 
 class Fragments(NamedTuple):
-    """The pixels of new splats, tile by tile, pixel by pixel, and in each front to back.
+    """Fragments of new splats, ordered by tile, pixel and depth.
 
-    All that is frozen between two fragments of a pixel is folded into one transmittance and one
-    colour; mostly it is nothing. Frozen splats that are `SOLID` have fragments of their own where
-    anything new is before them, so that a pixel is closed at the very splat at which `composite`
-    closes it.
+    Frozen content between two fragments of a pixel is baked into one layer. `SOLID` frozen splats
+    behind anything new are fragments themselves, so that pixels end at the same splat as in
+    `composite`.
     """
 
     tiles: np.ndarray
-    """The tiles that have any, and maybe others [t] int64."""
+    """Tiles that may have fragments [t] int64."""
     entry_start: np.ndarray
-    """Where the entries of each of these start [t + 1] int64."""
+    """Start of the entries of each of them [t + 1] int64."""
     names: np.ndarray
-    """Which new splat each entry is, or the complement of which of `solid` [e] int32."""
+    """New splat of each entry, or the complement of an index into `solid` [e] int32."""
     slots: np.ndarray
-    """Where the gradient of each entry goes; -1 for a frozen one [e] int32."""
+    """Slot of the gradient of each entry; -1 if frozen [e] int32."""
     pixel_start: np.ndarray
-    """Where the fragments of each pixel start, row by row, and the end [t, TILE² + 1] int64."""
+    """Start of the fragments of each pixel, row by row [t, TILE² + 1] int64."""
     entries: np.ndarray
-    """Which entry of its tile each fragment is of; behind the entries of a tile its folds are
-    counted [f] int32."""
+    """Entry of each fragment in its tile; baked layers are numbered after them [f] int32."""
     falloffs: np.ndarray
-    """Its alpha at opacity 1, of a frozen one its alpha, of a fold nothing [f] float32."""
+    """Alpha at opacity 1, alpha of frozen ones, unused for baked layers [f] float32."""
     fold_start: np.ndarray
-    """Where the folds of each tile start [t + 1] int64."""
+    """Start of the baked layers of each tile [t + 1] int64."""
     folds: np.ndarray
-    """Transmittance, and colour, of what is folded [g, 4] float32."""
+    """Transmittance and colour of the baked layers [g, 4] float32."""
     solid: np.ndarray
-    """Colours of the frozen splats that have entries [s, 3] float32."""
+    """Colours of the frozen splats with entries [s, 3] float32."""
     behind: np.ndarray
-    """Colour of what is folded behind the last fragment of each pixel [h, w, 3] float32."""
+    """Colour baked behind the last fragment of each pixel [h, w, 3] float32."""
 
 
 @njit(cache=True, fastmath={"contract"})
 def _within(boxes, i, left, top):
-    """Columns and rows that splat i may touch of the tile at (left, top): x from, x to, y from,
-    y to (excluded)."""
     return (
         max(np.int64(boxes[i, 0]) - left, 0),
         min(np.int64(boxes[i, 1]) - left, TILE),
@@ -1329,7 +1258,7 @@ def _within(boxes, i, left, top):
 
 @njit(cache=True)
 def _most_fragments(tile, left, top, context, new):
-    """The most entries and fragments that a tile can have."""
+    """Bound the number of entries and fragments of a tile."""
     _, c_opacities, c_boxes, c_start, c_entries = context
     _, _, n_boxes, n_start, n_entries = new
     entries = fragments = 0
@@ -1347,8 +1276,7 @@ def _most_fragments(tile, left, top, context, new):
 
 @njit(cache=True, fastmath={"contract"})
 def _covered(pixel, alpha, red, green, blue):
-    """A pixel (its transmittance, which gets a minus where nothing more passes, and its colour)
-    with a splat behind what it shows."""
+    """Composite a splat behind a pixel, whose transmittance becomes negative if it is full."""
     transmittance = pixel[0]
     after = transmittance * (np.float32(1) - alpha)
     if after <= MIN_TRANSMITTANCE:
@@ -1361,9 +1289,7 @@ def _covered(pixel, alpha, red, green, blue):
 def _by_pixel(
     pixels, entries, falloffs, count, first_fold, behind, begin, starts, to_entries, to_falloffs
 ):
-    """Write the `count` fragments of a tile from `begin` on, those of a pixel together and in their
-    order; starts [TILE² + 1] tells where. Folds, from `first_fold` on, are counted from `behind`.
-    """
+    """Sort the fragments of a tile by pixel, stably, and number baked layers from `behind`."""
     starts[:] = 0
     for k in range(count):
         starts[pixels[k]] += 1
@@ -1377,27 +1303,24 @@ def _by_pixel(
             entry, falloffs[k] = behind + ~entry - first_fold, 0
         to_entries[place], to_falloffs[place] = entry, falloffs[k]
         starts[pixels[k]] = place + 1
-    for pixel in range(TILE * TILE, 0, -1):  # Each has come to where the next one starts.
+    for pixel in range(TILE * TILE, 0, -1):  # Each is at the start of the next one.
         starts[pixel] = starts[pixel - 1]
     starts[0] = begin
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
-    """The Fragments of tiles[begin:end] of two layers, where what is frozen is folded.
+    """Find the Fragments of tiles[begin:end] of two layers, and bake the context between them.
 
-    context, new: Layer; the opacities of `new` are those of opaque Gaussians.
-    new_slots [entries] int32: their slots.
-    where [h, w] bool: the pixels that are to have fragments. behind [h, w, 3] float32 is written
-        in these tiles.
+    new has the opacities of opaque Gaussians; new_slots [entries] int32 are its slots.
+    where [h, w] bool: pixels that get fragments. behind [h, w, 3] float32 is written.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     height, width, _ = behind.shape
     tiles_x = (width + TILE - 1) // TILE
     state = _aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
-    # What `state` was at the last fragment of each pixel, and in bits of a row whether anything new
-    # was before
+    # `state` at the last fragment of each pixel, and one bit per pixel with a new fragment before
     known = np.empty((TILE, 4, TILE), np.float32)
     veiled, falloffs_of_row = np.empty(TILE, np.uint32), np.empty(TILE, np.float32)
     last = np.empty((TILE, TILE), np.int32)
@@ -1412,7 +1335,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
         bounds = _most_fragments(tile, left, top, context, new)
         most_entries, most = most_entries + bounds[0], most + bounds[1]
         most_at_once = max(most_at_once, bounds[1])
-    # Only what is written of them takes memory.
+    # Pages that are never written take no memory.
     pixels = np.empty(2 * most_at_once, np.uint8)
     at_entries = np.empty(2 * most_at_once, np.int32)
     at_falloffs = np.empty(2 * most_at_once, np.float32)
@@ -1429,7 +1352,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         rows, columns = min(TILE, height - top), min(TILE, width - left)
         state[:] = 0
-        # Pixels that nobody asks for are full from the start.
+        # Pixels outside the mask are full from the start.
         state[:, 0] = -1
         row_limit[:] = -1
         open_rows = 0
@@ -1488,7 +1411,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
                     if own:
                         veiled[row] |= 1 << column
                         pixel = np.uint8(row * TILE + column)
-                        # Whatever is frozen lets less pass.
+                        # Frozen splats have lowered the transmittance.
                         if state[row, 0, column] != known[row, 0, column]:
                             inverse = one / known[row, 0, column]
                             folds[fold, 0] = state[row, 0, column] * inverse
@@ -1548,42 +1471,36 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
 
 @njit(cache=True)
 def _looks(fragments, index, opacities, colours):
-    """Opacity and colour of each entry of a tile, of a frozen one 1 and its colour, and behind them
-    the folds [entries + folds, 4]; and the number of entries."""
+    """Gather opacity and colour of each entry of a tile and its baked layers, and count entries."""
     first, first_fold = fragments.entry_start[index], fragments.fold_start[index]
     count = fragments.entry_start[index + 1] - first
     folds = fragments.fold_start[index + 1] - first_fold
-    looks = np.empty((count + folds, 4), np.float32)
+    appearance = np.empty((count + folds, 4), np.float32)
     for k in range(count):
         name = fragments.names[first + k]
         if name >= 0:
-            looks[k, 0] = opacities[name]
+            appearance[k, 0] = opacities[name]
             for channel in range(3):
-                looks[k, 1 + channel] = colours[name, channel]
+                appearance[k, 1 + channel] = colours[name, channel]
         else:
-            looks[k, 0] = np.float32(1)
+            appearance[k, 0] = np.float32(1)
             for channel in range(3):
-                looks[k, 1 + channel] = fragments.solid[~name, channel]
+                appearance[k, 1 + channel] = fragments.solid[~name, channel]
     for k in range(folds):
         for column in range(4):
-            looks[count + k, column] = fragments.folds[first_fold + k, column]
-    return looks, count
+            appearance[count + k, column] = fragments.folds[first_fold + k, column]
+    return appearance, count
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def draw_fragments(fragments, opacities, colours, image):
-    """Draw the pixels that have fragments.
-
-    Whether one is a fold is no branch: processors cannot foretell it.
-
-    opacities [n], colours [n, 3] float32: of the new splats. image [h, w, 3] float32 is written.
-    """
+    """Render the pixels that have fragments into `image`, without branching on baked layers."""
     tiles, _, _, _, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
     zero, one = np.float32(0), np.float32(1)
     for index in range(len(tiles)):
         left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
-        looks, count = _looks(fragments, index, opacities, colours)
+        appearance, count = _looks(fragments, index, opacities, colours)
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
             if begin == end:
@@ -1592,17 +1509,17 @@ def draw_fragments(fragments, opacities, colours, image):
             transmittance, red, green, blue = one, zero, zero, zero
             for place in range(begin, end):
                 entry = entries[place]
-                own, look = entry < count, looks[entry, 0]
-                raw = look * falloffs[place]
+                own, factor = entry < count, appearance[entry, 0]
+                raw = factor * falloffs[place]
                 alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
-                after = transmittance * (one - alpha if own else look)
+                after = transmittance * (one - alpha if own else factor)
                 if own and after <= MIN_TRANSMITTANCE:
                     transmittance = zero
                     break
                 weight, transmittance = transmittance * (alpha if own else one), after
-                red += weight * looks[entry, 1]
-                green += weight * looks[entry, 2]
-                blue += weight * looks[entry, 3]
+                red += weight * appearance[entry, 1]
+                green += weight * appearance[entry, 2]
+                blue += weight * appearance[entry, 3]
             image[y, x, 0] = red + transmittance * behind[y, x, 0]
             image[y, x, 1] = green + transmittance * behind[y, x, 1]
             image[y, x, 2] = blue + transmittance * behind[y, x, 2]
@@ -1610,11 +1527,9 @@ def draw_fragments(fragments, opacities, colours, image):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def compare_fragments(fragments, image, wanted, weights, slopes, errors):
-    """Compare the pixels that have fragments with what is wanted there.
+    """Compute squared errors and gradients of the pixels that have fragments.
 
-    image, wanted [h, w, 3], weights [h, w] float32. slopes [h, w, 3] float32, those of the error in
-        the image, are written. errors [h * w / TILE²] float64: for each tile the sum of weights
-        times squared differences of all channels is written.
+    d_image [h, w, 3] float32 is written, and errors [tiles] float64: summed over all channels.
     """
     tiles, starts = fragments.tiles, fragments.pixel_start
     tiles_x = (image.shape[1] + TILE - 1) // TILE
@@ -1636,21 +1551,18 @@ def compare_fragments(fragments, image, wanted, weights, slopes, errors):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradients, written):
-    """Gradients of the new entries from those of the image [h, w, 3].
+    """Compute the gradients of the entries from those of the image, front to back.
 
-    It walks front to back like `draw_fragments`, whose arguments and image it takes: what is behind
-    a fragment is the image less what is before.
-
-    gradients [slots, 4] float32: of opacity, red, green and blue. written [slots] bool: set for the
-        slots, and only those, that receive a gradient.
+    Content behind a fragment is the image less what precedes it. gradients [slots, 4]: opacity,
+    colour.
     """
     tiles, entry_start, _, slots, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
     zero, one = np.float32(0), np.float32(1)
     for index in range(len(tiles)):
         left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
-        looks, count = _looks(fragments, index, opacities, colours)
-        slopes = np.zeros(looks.shape, np.float32)  # Those of folds are not asked for.
+        appearance, count = _looks(fragments, index, opacities, colours)
+        d_appearance = np.zeros(appearance.shape, np.float32)  # Those of baked layers are not used.
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
             if begin == end:
@@ -1659,26 +1571,26 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
             d_red, d_green, d_blue = d_image[y, x, 0], d_image[y, x, 1], d_image[y, x, 2]
             if d_red == zero and d_green == zero and d_blue == zero:
                 continue
-            # Colour times slope of what is behind
+            # Colour times gradient of the content behind
             rest = d_red * image[y, x, 0] + d_green * image[y, x, 1] + d_blue * image[y, x, 2]
             transmittance = one
             for place in range(begin, end):
                 entry = entries[place]
-                own, look = entry < count, looks[entry, 0]
-                raw = look * falloffs[place]
+                own, factor = entry < count, appearance[entry, 0]
+                raw = factor * falloffs[place]
                 alpha = min(raw, MAX_ALPHA) if raw >= MIN_ALPHA else zero
-                after = transmittance * (one - alpha if own else look)
+                after = transmittance * (one - alpha if own else factor)
                 if own and after <= MIN_TRANSMITTANCE:
                     break
                 weight = transmittance * (alpha if own else one)
-                value = looks[entry, 1] * d_red + looks[entry, 2] * d_green
-                value += looks[entry, 3] * d_blue
+                value = appearance[entry, 1] * d_red + appearance[entry, 2] * d_green
+                value += appearance[entry, 3] * d_blue
                 rest -= weight * value
-                slopes[entry, 1] += weight * d_red
-                slopes[entry, 2] += weight * d_green
-                slopes[entry, 3] += weight * d_blue
+                d_appearance[entry, 1] += weight * d_red
+                d_appearance[entry, 2] += weight * d_green
+                d_appearance[entry, 3] += weight * d_blue
                 more = falloffs[place] * (transmittance * value - rest / (one - alpha))
-                slopes[entry, 0] += more if alpha == raw else zero
+                d_appearance[entry, 0] += more if alpha == raw else zero
                 transmittance = after
         first = entry_start[index]
         for k in range(count):
@@ -1686,15 +1598,12 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
             if slot >= 0:
                 written[slot] = True
                 for column in range(4):
-                    gradients[slot, column] = slopes[k, column]
+                    gradients[slot, column] = d_appearance[k, column]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def shade(begin, end, rows, center, means, sh, colours):
-    """Colours of the Gaussians rows[begin:end] as seen from `center`, from 0 up.
-
-    means [n, 3], sh [n, k, 3]. colours [n, 3] float32 is written.
-    """
+    """Compute the colours of the Gaussians rows[begin:end] as seen from `center`, from 0 up."""
     basis = np.empty(sh.shape[1], np.float32)
     half, zero = np.float32(0.5), np.float32(0)
     for index in range(begin, end):
@@ -1702,25 +1611,21 @@ def shade(begin, end, rows, center, means, sh, colours):
         x, y, z, _ = _direction(center, means, i)
         _evaluate_basis(x, y, z, basis)
         for channel in range(3):
-            colour = half
+            color = half
             for k in range(len(basis)):
-                colour += basis[k] * sh[i, k, channel]
-            colours[i, channel] = max(colour, zero)
+                color += basis[k] * sh[i, k, channel]
+            colours[i, channel] = max(color, zero)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def shade_backward(begin, end, rows, center, means, colours, d_colours, d_sh):
-    """Gradients of spherical harmonics from those of colours, of the Gaussians rows[begin:end].
-
-    colours [n, 3]: as `shade` left them; what is cut off at 0 has no gradient. d_sh [n, k, 3]
-    float32 is written.
-    """
+    """Compute gradients of the harmonics rows[begin:end]; colours cut off at 0 have none."""
     basis = np.empty(d_sh.shape[1], np.float32)
     for index in range(begin, end):
         i = rows[index]
         x, y, z, _ = _direction(center, means, i)
         _evaluate_basis(x, y, z, basis)
         for channel in range(3):
-            slope = d_colours[i, channel] if colours[i, channel] > 0 else np.float32(0)
+            gradient = d_colours[i, channel] if colours[i, channel] > 0 else np.float32(0)
             for k in range(len(basis)):
-                d_sh[i, k, channel] = slope * basis[k]
+                d_sh[i, k, channel] = gradient * basis[k]

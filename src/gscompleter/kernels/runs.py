@@ -1,8 +1,4 @@
-"""Runs of Gaussians that lie so close to each other that one may stand for all of a run.
-
-Every kernel works on a range (begin, end) of its elements and writes to its own part of the
-outputs.
-"""
+"""Runs of adjacent Gaussians, each replaced by a single one."""
 
 import math
 
@@ -10,25 +6,22 @@ import numpy as np
 from numba import njit
 
 BLOCK = 4096
-"""Gaussians, one after the other, that are cut into runs by themselves."""
+"""Consecutive Gaussians that are cut into runs independently of the others."""
 OPAQUE = np.float32(0.9999)
-"""Opacity beyond which nothing gets more opaque; the logarithm of what is let through is finite."""
+"""Largest opacity, which keeps the logarithm of the transmittance finite."""
 MOST_FULL = np.float32(4.6)
-"""Thickness beyond which something hardly gets wider: its opacity is 0.99."""
+"""Optical thickness (at opacity 0.99) beyond which a Gaussian hardly gets wider."""
 NONE = np.float32(1e-30)
-"""What is divided by instead of 0."""
+"""Smallest divisor."""
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def begin_runs(begin, end, means, scales, generated, centers, focals, reach, largest, begins):
-    """Whether each Gaussian of the blocks begin..end begins a run.
+    """Write to `begins` [n] which Gaussians of the blocks begin..end start a run.
 
-    A run goes on as long as what follows is of one provenance with its first Gaussian and lies
-    within `reach` pixels of it, and no standard deviation exceeds `largest` pixels: of the camera
-    in which a pixel covers least there.
-
-    means [n, 3], scales [n, 3] float32, generated [n] uint8, centers [k, 3], focals [k]
-        float32. begins [n] bool is written.
+    It continues while the next Gaussian has the provenance of the first, lies within `reach` pixels
+    of it, and has no standard deviation above `largest` pixels, for the smallest pixel of all
+    cameras.
     """
     for block in range(begin, end):
         pixel, x, y, z = np.float32(-1), np.float32(0), np.float32(0), np.float32(0)
@@ -48,7 +41,7 @@ def begin_runs(begin, end, means, scales, generated, centers, focals, reach, lar
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _pixel(x, y, z, centers, focals):
-    """What the smallest pixel of all cameras covers at a point, in scene units."""
+    """Compute the smallest pixel of all cameras at a point, in scene units."""
     smallest = np.float32(np.inf)
     for k in range(len(centers)):
         dx, dy, dz = x - centers[k, 0], y - centers[k, 1], z - centers[k, 2]
@@ -58,26 +51,24 @@ def _pixel(x, y, z, centers, focals):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _cross_section(scales, i):
-    """Of Gaussian i, from its broad side."""
     a, b, c = scales[i, 0], scales[i, 1], scales[i, 2]
     return max(a * b, b * c, c * a)
 
 
 @njit(cache=True, fastmath={"contract"})
 def _thickness(opacity):
-    """The t of which exp(-t) is let through."""
+    """Compute the optical thickness t of an opacity: exp(-t) is the transmittance."""
     return -math.log(np.float32(1) - min(opacity, OPAQUE))
 
 
 @njit(cache=True)
 def _fullness(thickness):
-    """The area of 1 - exp(-thickness g), as a share of that of a Gaussian g of the same peak."""
+    """Compute the area of 1 - exp(-thickness g) relative to a Gaussian g of the same peak."""
     return np.float32(1) + np.float32(0.25) * min(thickness, MOST_FULL)
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _rotation(quats, i):
-    """The rotated axes of Gaussian i as columns [3][3]."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     inverse = np.float32(1) / math.sqrt(max(w * w + x * x + y * y + z * z, NONE))
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
@@ -91,8 +82,7 @@ def _rotation(quats, i):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _share_out(first, last, scales, opacities, shares):
-    """How much each Gaussian of first..last is of them, by what it lets through and covers; which
-    is most, and what all of them are together."""
+    """Write shares of first..last in thickness times cross-section; return largest and total."""
     total, most = np.float32(0), first
     for i in range(first, last):
         shares[i] = _thickness(opacities[i]) * _cross_section(scales, i)
@@ -107,7 +97,6 @@ def _share_out(first, last, scales, opacities, shares):
 
 @njit(cache=True, fastmath={"contract"})
 def _mean(first, last, shares, values, mean):
-    """Write the mean of values[first:last] by shares; it is told from the first of them."""
     for column in range(len(mean)):
         begun = values[first, column]
         away = np.float32(0)
@@ -118,7 +107,6 @@ def _mean(first, last, shares, values, mean):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _variance(first, last, shares, means, quats, scales, mean, axis):
-    """Of Gaussians first..last together about `mean` along a unit `axis`."""
     ax, ay, az = axis
     variance = np.float32(0)
     for i in range(first, last):
@@ -134,15 +122,11 @@ def _variance(first, last, shares, means, quats, scales, mean, axis):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def stand_for(begin, end, start, given, shares, found):
-    """One Gaussian for each of the runs begin..end, and the share of each Gaussian in its run.
+    """Merge each of the runs begin..end into one Gaussian.
 
-    It lets through what all of them let through together, lies where they lie in the mean, has the
-    mean of their colours, and their spread along the axes of the one that counts most. What is
-    thicker is wider, too: 1 - exp(-t g) falls more slowly than g.
-
-    start [m + 1] int64: where each run starts, and the end.
-    given: GaussianArrays of n, with sh [n, 3 k].
-    shares [n] float32, and found, the same as `given` of m, are written.
+    It has their joint transmittance, mean position and mean colour, and their variances along the
+    axes of the largest. Thicker ones are made wider, since 1 - exp(-t g) falls off more slowly than
+    g.
     """
     means, quats, scales, opacities, sh = given
     to_means, to_quats, to_scales, to_opacities, to_sh = found

@@ -1,8 +1,7 @@
-"""Kernels on several threads: each call works on a range of its elements, and writes only there.
+"""Kernels on several threads: each call works on a range of elements and writes only there.
 
-They are threads of our own and not those of numba: its OpenMP layer spins where cores are scarce
-and meddles with torch's, its other layer does not bear two callers at once, and a kernel that it
-makes parallel takes two to five times as long to compile.
+Numba's own threads spin on few cores, interfere with torch's or support one caller only, and its
+parallel kernels take two to five times as long to compile.
 """
 
 import os
@@ -15,14 +14,14 @@ from itertools import pairwise
 import numba
 
 PIECES_PER_THREAD = 4
-"""Pieces take unequally long; more of them than threads even that out."""
+"""Number of pieces per thread, which balances pieces of different cost."""
 
 
 class _Thread(threading.local):
-    """What is known of the thread that asks."""
+    """State of the calling thread."""
 
     alone = False
-    """Whether the kernels that it calls are not shared."""
+    """True if its kernels run on it alone."""
 
 
 _thread = _Thread()
@@ -33,30 +32,26 @@ def _stay_alone():
 
 
 def sharing(threads):
-    """How many threads share a kernel that is called here, and is to have so many."""
+    """Return how many threads a kernel called here uses, if `threads` are available."""
     return 1 if _thread.alone else threads or numba.config.NUMBA_NUM_THREADS
 
 
 def share(kernel, count, *arguments, threads=None):
-    """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time.
+    """Run `kernel(begin, end, *arguments)` over range(count) on several threads.
 
-    The result depends neither on the pieces nor on the threads, which are NUMBA_NUM_THREADS if left
-    out: as many as there are usable cores where that is not set.
+    `threads` defaults to NUMBA_NUM_THREADS; the result does not depend on it.
     """
     threads = sharing(threads)
     run(kernel, [(*piece, *arguments) for piece in pieces_of(count, threads)], threads)
 
 
 def pieces_of(count, threads):
-    """range(count) cut into pieces that `threads` take in turns."""
+    """Split range(count) into pieces for `threads` threads."""
     return ranges(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
 
 
 def run(kernel, calls, threads=None):
-    """What a kernel, which releases the interpreter lock, returns of each of `calls`.
-
-    Who asks works, too, and does not wait for threads that others keep busy.
-    """
+    """Run a kernel for each of `calls`, on this thread and idle ones, and return the results."""
     threads = sharing(threads)
     if threads == 1 or len(calls) == 1:
         return [kernel(*arguments) for arguments in calls]
@@ -78,10 +73,7 @@ def run(kernel, calls, threads=None):
 
 
 def side_by_side(function, *arguments):
-    """What `function` makes of each of the arguments, like `map`, several at a time.
-
-    It may call kernels itself: the threads that it runs on are not those that share them.
-    """
+    """Map `function`, which may call kernels, over the arguments on several threads."""
     threads = numba.config.NUMBA_NUM_THREADS
     if threads == 1:
         return list(map(function, *arguments))
@@ -90,8 +82,7 @@ def side_by_side(function, *arguments):
 
 
 def many_at_once(function, *arguments):
-    """The same one after the other, for many that are small: the kernels that `function` calls stay
-    on its thread, where they need not wait for each other."""
+    """Map `function` lazily over small tasks, each with its kernels on a single thread."""
     threads = numba.config.NUMBA_NUM_THREADS
     if threads == 1:
         yield from map(function, *arguments)
@@ -102,10 +93,9 @@ def many_at_once(function, *arguments):
 
 @contextmanager
 def meanwhile(function, *arguments):
-    """Let `function` work on a thread of its own beside what goes on inside, which gets a function
-    that waits for its result; on one thread it works only then.
+    """Run `function`, which may call kernels, on a thread beside the `with` block.
 
-    It may call kernels itself. What goes on inside does not end before it does.
+    The block gets a function that waits for the result. With one thread, `function` runs only then.
     """
     if numba.config.NUMBA_NUM_THREADS == 1:
         yield lambda: function(*arguments)
@@ -115,7 +105,7 @@ def meanwhile(function, *arguments):
 
 
 def ranges(count, pieces):
-    """range(count) cut into at most `pieces` contiguous pieces of about equal length."""
+    """Split range(count) into at most `pieces` contiguous ranges of about equal length."""
     pieces = max(1, min(pieces, count))
     bounds = [count * piece // pieces for piece in range(pieces + 1)]
     return list(pairwise(bounds))
@@ -123,5 +113,5 @@ def ranges(count, pieces):
 
 @lru_cache(maxsize=8)
 def thread_pool(threads, process):
-    """Threads that wait for work. A forked process inherits none and asks for its own."""
+    """Return the thread pool of a process; a forked one makes its own."""
     return ThreadPoolExecutor(threads, thread_name_prefix="gscompleter")

@@ -1,8 +1,7 @@
-"""Plane-sweep stereo: matching costs, semi-global aggregation, and what neighbouring views say.
+"""Plane-sweep stereo: matching costs, semi-global aggregation, and consistency checks.
 
-Pixels have their centres at +0.5. A 3 x 4 `transform` [A | b] carries a pixel (x, y, 1) of one view
-at inverse depth w to the homogeneous pixel A (x, y, 1) + b w of another, whose third entry is the
-ratio of the two z-depths.
+Pixel centres are at +0.5. A 3 x 4 `transform` [A | b] maps pixel (x, y, 1) of one view at inverse
+depth w to the homogeneous pixel A (x, y, 1) + b w of another; its third entry is the depth ratio.
 """
 
 from typing import NamedTuple
@@ -13,33 +12,31 @@ from numba import njit
 from gscompleter.kernels.sharing import run, share
 
 UNSEEN = 255
-"""Cost of a plane at which the pixel falls outside of the other image."""
+"""Cost of a plane at which the pixel falls outside the other image."""
 TILE_ROWS, TILE_COLUMNS = 16, 64
-"""Pixels that are matched together: so few that what is known of them stays in the cache."""
+"""Size of a tile, which is matched at once, within the cache."""
 FAR = np.int16(16000)
-"""Cost of what cannot be, half of what 16 bits hold."""
+"""Infeasible cost, half of the largest int16."""
 PATHS = 8
-"""Of semi-global aggregation."""
+"""Number of paths of semi-global aggregation."""
 
 
 class Bands(NamedTuple):
     """The planes that each tile of an image is matched at.
 
-    Costs lie one after the other: tile by tile, in a tile row by row, in a row pixel by pixel, and
-    of a pixel plane by plane.
+    Costs are ordered by tile, then row, pixel and plane.
     """
 
     low: np.ndarray
-    """The first plane of each tile [rows, columns] int32."""
+    """First plane of each tile [rows, columns] int32."""
     high: np.ndarray
-    """The one behind the last [rows, columns] int32."""
+    """One past the last plane of each tile [rows, columns] int32."""
     start: np.ndarray
-    """Where the costs of each tile begin, row by row, and the end of all [tiles + 1] int64."""
+    """Offset of the costs of each tile, row by row, and the end [tiles + 1] int64."""
 
 
 @njit(cache=True, inline="always")
 def _first_cost(bands, y, x, width):
-    """Where the costs of pixel (y, x) begin, in an image of that width."""
     row, column = y // TILE_ROWS, x // TILE_COLUMNS
     left = column * TILE_COLUMNS
     wide = min(TILE_COLUMNS, width - left)
@@ -50,14 +47,14 @@ def _first_cost(bands, y, x, width):
 
 @njit(cache=True, fastmath={"contract"}, inline="always")
 def _clip(value, low, high):
-    """The nearest number from low to high; of NaN low, for what comes out becomes an index."""
+    """Clip to [low, high]; NaN becomes low, since the result is used as an index."""
     value = value if value > low else low
     return value if value < high else high
 
 
 @njit(cache=True, fastmath={"contract"})
 def _box_sums(values, sums, column, rows, width, radius):
-    """Sums over (2 radius + 1)^2 windows of `values` [rows + 2 radius, width + 2 radius]."""
+    """Sum `values` over (2 radius + 1)^2 windows."""
     for x in range(width + 2 * radius):
         column[x] = np.float32(0)
     for y in range(2 * radius):
@@ -66,7 +63,7 @@ def _box_sums(values, sums, column, rows, width, radius):
     for y in range(rows):
         for x in range(width + 2 * radius):
             column[x] += values[y + 2 * radius, x]
-        # One pass over the row for each column of the window: a pass becomes vectors.
+        # One pass over the row per column of the window, since a pass is vectorised.
         for x in range(width):
             sums[y, x] = column[x]
         for dx in range(1, 2 * radius + 1):
@@ -77,23 +74,15 @@ def _box_sums(values, sums, column, rows, width, radius):
 
 
 def matching_costs(reference, source, transform, inverse_depths, bands, radius, noise, detail):
-    """Dissimilarity of every reference pixel to the source at the planes of its tile.
+    """Compute matching costs 0..254 of the reference pixels at the planes of their tiles.
 
-    The windows' normalised cross-correlation over all three colours, which a change of exposure
-    does not touch, mixed with the difference of the two pixels from their windows' means, which
-    is sharper at edges.
+    Normalised cross-correlation of windows over all colours, which ignores exposure, is mixed with
+    the difference of the two pixels from their windows' means, which is sharper at edges. Planes
+    outside the source cost UNSEEN.
 
-    Args:
-        reference, source: Images [h, w, 3] and [H, W, 3].
-        transform: From reference to source [3, 4].
-        inverse_depths: Of the planes [d].
-        bands: Which of the planes.
-        radius: Of the windows, in pixels.
-        noise: Standard deviation of the images' noise: weaker texture correlates with nothing.
-        detail: Share of the second term.
-
-    Returns:
-        Costs in 0 .. 254, UNSEEN where a plane leaves the source, in the order of `bands`.
+    transform [3, 4]: from reference to source. radius: of the windows, in pixels.
+    noise: standard deviation of image noise; weaker texture does not correlate.
+    detail: share of the second term.
     """
     costs = np.empty(bands.start[-1], np.uint8)
     settings = (radius, noise, detail)
@@ -104,11 +93,7 @@ def matching_costs(reference, source, transform, inverse_depths, bands, radius, 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy", inline="always")
 def _compare(y, own, own_mean, other, other_mean, other_square, cross, line):
-    """Of row y, from sums over windows: sums of squared deviations and their products, in place,
-    and in line[0] how much the pixels' own deviations differ.
-
-    A pass for each of them: several at once have too many arrays for LLVM to tell apart.
-    """
+    """Turn window sums into deviations and products in place; line[0] gets pixel differences."""
     cols = cross.shape[1]
     radius = (own.shape[2] - cols) // 2
     area = np.float32((2 * radius + 1) ** 2)
@@ -130,7 +115,6 @@ def _compare(y, own, own_mean, other, other_mean, other_square, cross, line):
 def _match_tiles(
     begin, end, reference, source, transform, inverse_depths, bands, radius, noise, detail, costs
 ):
-    """Fill in the costs of the tiles from `begin` to `end`."""
     h, w = reference.shape[:2]
     H, W = source.shape[:2]
     columns = bands.low.shape[1]
@@ -196,7 +180,7 @@ def _match_tiles(
                     line[1, x] = _clip(sy, np.float32(0), np.float32(H - 1))
                 for x in range(wide):
                     sx, sy = line[0, x], line[1, x]
-                    # `_clip` has made numbers from 0 to W - 1 and H - 1 of them, whatever came in.
+                    # `_clip` ensures 0..W - 1 and 0..H - 1 for any input.
                     ix = np.uint32(min(np.int32(sx), W - 2))
                     iy = np.uint32(min(np.int32(sy), H - 2))
                     ax, ay = sx - np.float32(ix), sy - np.float32(iy)
@@ -246,7 +230,7 @@ def _match_tiles(
 
 @njit(cache=True, fastmath={"contract"}, inline="always")
 def _step(cost, before, lowest, after, total, small, large):
-    """One step of a path: returns the lowest cost at the new pixel."""
+    """Advance a path by one pixel and return its lowest cost there."""
     planes = cost.shape[0]
     ceiling = np.int16(lowest + large)
     best = FAR
@@ -265,7 +249,7 @@ def _step(cost, before, lowest, after, total, small, large):
 
 @njit(cache=True, inline="always")
 def _aligned(before, band_before, band, scratch):
-    """The costs at a pixel of another band, by the planes of this one; FAR where it has none."""
+    """Realign the costs of another tile's band to the planes of this one; others are FAR."""
     if band_before[0] == band[0] and band_before[1] == band[1]:
         return before
     for plane in range(band[0] - 1, band[1] + 1):
@@ -276,7 +260,7 @@ def _aligned(before, band_before, band, scratch):
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, total):
-    """Four of the eight paths: along the row, and from the three neighbours of the row before."""
+    """Aggregate four of the eight paths: along the row, and from the row before."""
     h, w = large_y.shape[0] + 1, large_x.shape[1] + 1
     widest = 2
     for width in (bands.high - bands.low).flat:
@@ -324,21 +308,13 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
 
 
 def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
-    """Costs aggregated along eight paths (Hirschmüller 2008).
+    """Aggregate costs along eight paths (Hirschmüller 2008), in the order of `bands`.
 
-    Args:
-        costs: 0 .. 254, in the order of `bands`.
-        bands: The planes of each tile. Where a path enters another tile, planes that were not
-            looked at there are reached by a jump.
-        large_x, large_y, large_d, large_u: Penalty of a jump between a pixel and its right
-            neighbour [h, w - 1], the one below [h - 1, w], the one below to the right
-            [h - 1, w - 1], and between (y, x + 1) and (y + 1, x) [h - 1, w - 1].
-        small: Penalty of a step by one plane.
-
-    Penalties are whole numbers in int16, and none is above 3000: so many paths still add up.
-
-    Returns:
-        The sum over the `PATHS` paths, int16, in the order of `bands`.
+    Planes missing in the previous tile are reached by a jump.
+    small: penalty of a step by one plane.
+    large_x [h, w - 1], large_y [h - 1, w], large_d and large_u [h - 1, w - 1]: penalties of a jump
+    between a pixel and its right, lower and lower right neighbour, and along the other diagonal;
+    int16, at most 3000, so that sums do not overflow.
     """
     # Each half has its own sum, so that two threads can work and order does not matter.
     totals = np.zeros((2, len(costs)), np.int16)
@@ -350,17 +326,9 @@ def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
 
 
 def winners(totals, bands, h, w):
-    """The best plane of every pixel, to a fraction, and how much the second best costs more.
+    """Select the best plane of every pixel, with fraction, and its margin over the second best.
 
-    The second best is the cheapest plane that is no neighbour of the best.
-
-    Args:
-        totals: Sums over the paths, in the order of `bands`.
-        bands: The planes of each tile.
-        h, w: Size of the image.
-
-    Returns:
-        Plane indices [h, w] and margins [h, w] as a mean per path, in the unit of the costs.
+    The second best is not adjacent to the best. Margins are in units of a cost, per path.
     """
     index = np.empty((h, w), np.float32)
     margin = np.empty((h, w), np.float32)
@@ -370,7 +338,6 @@ def winners(totals, bands, h, w):
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _choose(begin, end, totals, bands, index, margin):
-    """Fill in the rows from `begin` to `end`."""
     w = index.shape[1]
     for y in range(begin, end):
         for x in range(w):
@@ -389,7 +356,7 @@ def _choose(begin, end, totals, bands, index, margin):
             margin[y, x] = np.float32(second - total[best]) / np.float32(PATHS)
             at = np.float32(bands.low[row, column] + best)
             if 0 < best < planes - 1:
-                # Two lines of equal and opposite slope: less drawn to whole planes than a parabola.
+                # Two lines of opposite gradient: less biased towards whole planes than a parabola.
                 before = total[best - 1] - total[best]
                 after = total[best + 1] - total[best]
                 steeper = max(before, after)
@@ -399,15 +366,10 @@ def _choose(begin, end, totals, bands, index, margin):
 
 
 def reproject(depth, other, b_from_a, a_from_b):
-    """Carry every pixel to another view and back by the two views' inverse depths.
+    """Project every pixel of view a to view b and back, by their inverse depths.
 
-    Args:
-        depth, other: Inverse depths of view a [h, w] and of view b [H, W].
-        b_from_a, a_from_b: Transforms between the pixels of the two [3, 4].
-
-    Returns:
-        How far from itself each pixel comes back, in pixels, negative where it falls outside of
-        the other image [h, w]; and its z-depth in the other view over the other's own [h, w].
+    Returns the distance between each pixel and its image, in pixels, or -1 if it falls outside b,
+    and its z-depth in b relative to b's own.
     """
     error = np.full(depth.shape, np.float32(-1), np.float32)
     ratio = np.ones(depth.shape, np.float32)
@@ -417,7 +379,6 @@ def reproject(depth, other, b_from_a, a_from_b):
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
-    """Fill in the rows from `begin` to `end`."""
     w = depth.shape[1]
     H, W = other.shape
     for y in range(begin, end):
@@ -432,7 +393,7 @@ def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
             sy /= q2
             if not (sx >= 0 and sx < W and sy >= 0 and sy < H):
                 continue
-            # The corners around may lie on two surfaces: the one that agrees best counts.
+            # The corners may lie on two surfaces; the one that agrees best counts.
             best = np.float32(1e9)
             expected = own / q2
             value = other[int(sy), int(sx)]
@@ -455,12 +416,9 @@ def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
 
 
 def background(values, known):
-    """For each unknown pixel the second lowest of the known values met first in eight directions.
+    """Fill unknown pixels with the second lowest known value in eight directions.
 
-    Inverse depths are low far away, and one direction may slip past a thin object in front.
-
-    Returns:
-        `values`, filled [h, w]; where fewer than two directions meet anything they stay.
+    Low inverse depths are far away, and one ray may miss a thin object in front.
     """
     filled = values.copy()
     share(_fill, len(values), values, known, filled)
@@ -469,7 +427,6 @@ def background(values, known):
 
 @njit(cache=True, nogil=True)
 def _fill(begin, end, values, known, filled):
-    """Fill in the rows from `begin` to `end`."""
     h, w = values.shape
     for y in range(begin, end):
         for x in range(w):

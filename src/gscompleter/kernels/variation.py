@@ -1,4 +1,4 @@
-"""Total generalized variation of second order: surfaces that are plane wherever they can be."""
+"""Total generalized variation of second order: surfaces as planar as the data allow."""
 
 import numpy as np
 from numba import njit
@@ -7,34 +7,26 @@ from gscompleter.kernels.sharing import ranges, run, sharing
 
 PRIMAL_STEP, SLOPE_STEP = np.float32(0.25), np.float32(0.2)
 DUAL_STEP, SLOPE_DUAL_STEP = np.float32(1 / 3), np.float32(0.5)
-"""Steps of the four variables: inverse row sums of the operator, as in Pock and Chambolle 2011."""
+"""Steps of the four variables: inverse row sums of the operator (Pock and Chambolle 2011)."""
 AT_ONCE = 10
-"""Iterations that go down the image together, each a row behind the one before: their rows stay in
-the cache."""
+"""Iterations per pass over the image, each one row behind the last, with rows in the cache."""
 LEAST_ROWS = 4 * AT_ONCE
-"""Of a band that a thread has for itself. What two bands leave between them takes half of as many,
-and is no more than is worth a thread."""
+"""Smallest number of rows in the band of a thread; the seams take up to half as many."""
 
 
 def fit(heights, slopes, data, weight, across, down, bend, tolerance, iterations, threads=None):
-    """Heights u and slopes v that minimise, by the first-order primal-dual algorithm,
+    """Fit heights u and their gradients v by the first-order primal-dual algorithm.
 
-        sum weight * huber(u - data) + across |u_x - v_x| + down |u_y - v_y| + bend |grad v|
+        min sum weight * huber(u - data) + across |u_x - v_x| + down |u_y - v_y| + bend |grad v|
 
-    over all pixels: an image of least bending in which a step, where it must be, costs its height.
+    Each thread has a band of rows. An iteration reads one row beyond those it writes, so each
+    covers fewer rows of the band than the one before; the seams follow. The result is the same to
+    the bit.
 
-    Each thread has a band of rows. An iteration reads a row beyond those that it writes, so that
-    in a band each goes less far than the one before; what is left at the seams comes afterwards.
-    Every row meets what it would meet in one band, and the result is the same to the bit.
-
-    Args:
-        heights, slopes: Where to begin [h, w] and [2, h, w] (x, y); written to.
-        data, weight: Measured heights and how much each counts [h, w]; 0 where nothing was.
-        across, down: Cost of a step to the right and to the pixel below [h, w].
-        bend: Cost of a change of slope.
-        tolerance: Deviation from `data` under which the loss is quadratic.
-        iterations: How many.
-        threads: How many share it; as `share` has it.
+    heights [h, w], gradients [2, h, w] (x, y): initial values, updated in place.
+    data, weight [h, w]: measured heights and their weights; 0 without measurement.
+    across, down [h, w]: cost of a step to the right and to the pixel below.
+    bend: cost of a change of gradient. tolerance: deviation from `data` of quadratic loss.
     """
     h, w = heights.shape
     forces = np.zeros((2, h, w), np.float32), np.zeros((4, h, w), np.float32)
@@ -72,13 +64,11 @@ def advance(
     bend,
     tolerance,
 ):
-    """Iterations on a range of rows, whose ends move by a step each time. Those of more than
-    `AT_ONCE` iterations may not move.
+    """Run iterations on a range of rows whose ends move by a step each time.
 
-    A row needs no more of an iteration than the next row has: the forces of row y read heights of
-    y and y + 1, and the heights of y read forces of y - 1 and y. So an end that moves away from
-    the neighbour leaves it the last forces that it needs, and one that moves to the neighbour
-    finds them.
+    Ends may not move in more than `ITERATIONS_PER_PASS` iterations. An end that moves away leaves
+    its neighbour all the dual variables that it needs, and one that moves towards it finds the
+    same.
     """
     for begin in range(0, iterations, AT_ONCE):
         count = min(AT_ONCE, iterations - begin)
@@ -105,7 +95,6 @@ def advance(
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _raise_duals(y, ahead, slopes_ahead, steps, bends, across, down, bend):
-    """One step of the forces of row y, which reads this row and the next."""
     h, w = ahead.shape
     one = np.float32(1)
     for x in range(w):
@@ -130,8 +119,6 @@ def _raise_duals(y, ahead, slopes_ahead, steps, bends, across, down, bend):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _lower_primals(y, heights, slopes, ahead, slopes_ahead, steps, bends, data, weight, tolerance):
-    """One step of the heights and slopes of row y, which reads the forces of this row and the one
-    before."""
     two, none = np.float32(2), np.float32(0)
     for x in range(heights.shape[1]):
         push = steps[0, y, x] + steps[1, y, x]

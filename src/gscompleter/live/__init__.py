@@ -1,1 +1,1 @@
-"""A scene that is completed while somebody looks at it, camera after camera."""
+"""Interactive completion in the browser, camera after camera."""

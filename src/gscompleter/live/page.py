@@ -1,4 +1,4 @@
-"""The page of a session: what a browser shows of it, and what its buttons ask for."""
+"""The page of a live session: the scene in the browser, and its buttons."""
 
 from __future__ import annotations
 
@@ -28,53 +28,44 @@ from gscompleter.stages.candidates import spacing, upward
 from gscompleter.types import Camera, Completion, Gaussians, TargetCompletion, View
 
 FRUSTUM, SHARE_OF_STEP = 0.1, 0.2
-"""Largest length of the pyramid that shows a camera, in units of the page, and what share of the
-distance between cameras it takes at most."""
+"""Largest length of a camera pyramid, in page units and as a fraction of camera spacing."""
 CLEARANCE = 6.0
-"""How many of these lengths away photographs are shown: one nearby would hide the scene."""
+"""Photographs nearer than this many pyramid lengths are hidden; they would cover the scene."""
 GREY, GREEN = (150, 150, 150), (80, 220, 120)
-"""Colours of the cameras of photographs, and of those that the scene was completed for."""
 NOTICE = 4.0
-"""Seconds that a refusal stays on the page."""
 
-WELCOME = "Fly to where something is missing, and complete it."
-BUSY = "Something is being done already; press again when it is."
-NO_HOLE = "No camera was found that has much to gain."
+WELCOME = "Fly to a hole in the scene, then press “Complete what I see”."
+BUSY = "The last request is still running; press the button again when it is done."
+NO_HOLE = "No large hole is left around the photographs."
 FLYING = (
-    "Drag to turn, drag with the right button to shift, scroll to come closer, W A S D Q E to fly. "
-    "A click on a photograph goes to where it was taken."
+    "Drag to rotate, drag with the right button to move, scroll to zoom, fly with W A S D Q E. "
+    "Click a photograph to go to its camera."
 )
 
 Job = Callable[[viser.ClientHandle, Pose], str]
-"""What a button asks for: whose browser it is, and what that shows. It returns a sentence."""
+"""Action of a button: takes the browser and its camera, returns a sentence for the page."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What a page is about, and what it cannot do by itself."""
+    """Everything a page needs besides its address."""
 
     session: Session
-    """Where it begins."""
     photographs: Sequence[View]
-    """Small ones, with their cameras in the frame of the result."""
+    """Small images, with their cameras in the frame of the result."""
     find: Callable[[Completion], Camera | None]
-    """The camera that the scene is most worth completing for, if any."""
+    """Returns the camera with the most to gain, or None."""
     save: Callable[[Session], str]
-    """Writes what was done; returns a sentence."""
 
 
 class Page:
-    """A session in the browsers that are open.
+    """A session in all browsers that have the page open.
 
-    Their requests arrive in threads of the server. All that computes is done where `work` is
-    called, one request after the other; who asks meanwhile is refused.
+    Requests arrive in threads of the server. `handle_requests` runs them one at a time; a request
+    that arrives meanwhile is refused.
     """
 
     def __init__(self, subject: Subject, host: str, port: int) -> None:
-        """
-        Raises:
-            InputError: where nothing can be served at `host` and `port` (0: any that is free).
-        """
         self.subject, self.session = subject, subject.session
         self.server = serving(host, port)
         self._first = subject.session.begun.views[0].camera
@@ -88,7 +79,7 @@ class Page:
         self._open()
 
     def work(self) -> None:
-        """Do what is asked for, until the process is interrupted."""
+        """Run requests until the process is interrupted."""
         while True:
             request = self._requests.get()
             try:
@@ -97,12 +88,12 @@ class Page:
                 self._busy.release()
 
     def close(self) -> None:
-        """Serve nothing any more."""
+        """Stop the server."""
         with redirect_stdout(StringIO()):
             self.server.stop()
 
     def complete(self, client: viser.ClientHandle, seen: Pose) -> str:
-        """Complete the scene for what a browser shows."""
+        """Complete the scene for the camera of a browser."""
         start = time.perf_counter()
         camera = camera_of(seen, self._first.height, self._first.width, self._unit)
         before = self.session
@@ -112,29 +103,29 @@ class Page:
         return outcome(result, time.perf_counter() - start)
 
     def find(self, client: viser.ClientHandle, seen: Pose) -> str:
-        """Take a browser to the camera that the scene is most worth completing for."""
-        self.say("Looking for a hole …")
+        """Move a browser to the camera with the most to gain."""
+        self.say("Searching for a hole …")
         camera = self.subject.find(self.session.now)
         if camera is None:
             return NO_HOLE
         self._jump(client, pose_of(camera, self._unit))
-        return "Here something is missing."
+        return "The scene has a hole here; press “Complete what I see”."
 
     def undo(self, client: viser.ClientHandle, seen: Pose) -> str:
-        """Take the last step back."""
+        """Undo the last step."""
         before = self.session
         self.session = undone(before)
         self._draw(before)
         left = len(self.session.steps)
-        return f"Undone. {left} of what was completed {'is' if left == 1 else 'are'} left."
+        return f"Undone: {left} {'completion is' if left == 1 else 'completions are'} left."
 
     def save(self, client: viser.ClientHandle, seen: Pose) -> str:
-        """Write what was done."""
+        """Write the completed scene."""
         self.say("Saving …")
         return self.subject.save(self.session)
 
     def say(self, text: str) -> None:
-        """Show a sentence on the page, and below it what other lines say."""
+        """Show a text on the page, its first line in bold."""
         first, *others = (html.escape(line) for line in text.splitlines())
         self._status.content = (
             '<div role="status" style="padding: 0.5em 1em">'
@@ -142,7 +133,6 @@ class Page:
         )
 
     def _open(self) -> None:
-        """Show everything for the first time."""
         scene, gui = self.server.scene, self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("gscompleter live")
@@ -170,38 +160,36 @@ class Page:
         gui.add_markdown(FLYING)
 
     def _ask(self, job: Job, event: viser.GuiEvent[Any]) -> None:
-        """Put a request to where it is done, or refuse it."""
+        """Queue a request, or refuse it while another runs."""
         client = event.client
-        if client is None:  # it has closed its page meanwhile
+        if client is None:  # The browser has closed the page.
             return
         seen = Pose(client.camera.wxyz, client.camera.position, client.camera.fov)
         if self._busy.acquire(blocking=False):
             self._requests.put(partial(job, client, seen))
         else:
-            client.add_notification("One thing at a time", BUSY, auto_close_seconds=NOTICE)
+            client.add_notification("Still busy", BUSY, auto_close_seconds=NOTICE)
 
     def _stand_at(self, pose: Pose) -> None:
-        """Let browsers begin at a pose."""
         rotation = viser.transforms.SO3(pose.wxyz).as_matrix()
         start = self.server.initial_camera
         start.position, start.fov = pose.position, pose.fov
         start.look_at, start.up = pose.position + DISTANCE * rotation[:, 2], -rotation[:, 1]
 
     def _jump(self, client: viser.ClientHandle, pose: Pose) -> None:
-        """Take a browser to a pose."""
         self._make_way(pose)
         with client.atomic():
             client.camera.position, client.camera.wxyz = pose.position, pose.wxyz
             client.camera.fov = pose.fov
 
     def _make_way(self, pose: Pose) -> None:
-        """Hide the photographs that stand near a pose, and show all others."""
+        """Hide the photographs near a pose and show all others."""
         for frustum in self._photographs:
             apart = np.linalg.norm(frustum.position - pose.position)
             frustum.visible = bool(apart > CLEARANCE * self._length)
 
     def _draw(self, before: Session) -> None:
-        """Show the session as it stands where it differs from one `before`."""
+        """Show all parts of the session that differ from `before`."""
         with self.server.atomic():
             now = self.session.now
             if before.now.num_kept != now.num_kept:
@@ -216,7 +204,6 @@ class Page:
             ]
 
     def _show_generated(self) -> None:
-        """Show what was generated as the page is told to."""
         with self._drawing:
             added, look = self.session.now.added, self._look.value
             if self._generated is not None:
@@ -252,7 +239,6 @@ class Page:
     def _frustum(
         self, name: str, camera: Camera, color: tuple[int, int, int], view: View | None = None
     ) -> Any:
-        """The pyramid that shows a camera, with its photograph."""
         pose = pose_of(camera, self._unit)
         image = None if view is None else (255 * view.image.clamp(0, 1)).byte().cpu().numpy()
         return self.server.scene.add_camera_frustum(
@@ -270,34 +256,34 @@ class Page:
 
 
 def frustum_length(photographs: Sequence[View], unit: float) -> float:
-    """How long the pyramids are that show cameras, in units of the page."""
+    """Compute the length of camera pyramids, in page units."""
     apart = spacing([view.camera for view in photographs]) * unit
     return min(FRUSTUM, SHARE_OF_STEP * apart) if apart > 0 else FRUSTUM
 
 
 def answer(request: Callable[[], str]) -> str:
-    """What came of a request, in a sentence, whatever it was."""
+    """Run a request and return its sentence, or the sentence of its error."""
     try:
         return request()
     except InputError as error:
         return str(error)
-    # The page stays, and the scene as it was.
+    # The page stays open and the scene unchanged.
     except Exception as error:
         traceback.print_exc()
-        return f"That went wrong ({type(error).__name__}: {error}); the scene is as it was."
+        return f"That failed ({type(error).__name__}: {error}); the scene is unchanged."
 
 
 def stages_at(stage: str) -> str:
-    """What is said when a stage begins: that it does, and where it stands among all."""
+    """Format the progress line with the current stage in brackets."""
     return "Completing …\n" + " → ".join(f"[{s}]" if s == stage else s for s in STAGES)
 
 
 def outcome(result: TargetCompletion, seconds: float) -> str:
-    """What came of a completion: a sentence, and a line for each note."""
+    """Describe a completion: one sentence, then one line per note."""
     if not len(result.added):
         return "\n".join(result.notes or (NOTHING_ADDED,))
-    said = (
-        f"Completed in {seconds:.1f} s: {100 * result.hole_fraction:.1f} % of the image was a "
-        f"hole, and {len(result.added):,} Gaussians were added."
+    text = (
+        f"Completed in {seconds:.1f} s: {len(result.added):,} Gaussians are added in a hole of "
+        f"{100 * result.hole_fraction:.1f} % of the image."
     )
-    return "\n".join((said, *result.notes))
+    return "\n".join((text, *result.notes))

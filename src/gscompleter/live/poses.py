@@ -1,7 +1,7 @@
-"""Cameras as the page has them, and as the library does.
+"""Conversion between cameras of the page and cameras of the scene.
 
-Both have OpenCV axes. The page has a unit of its own, in which what the photographs see is a few
-units away, since its controls and clipping planes expect that.
+Both have OpenCV axes. Page units are scaled so that the photographed surfaces are a few units away,
+as the controls and clipping planes of the page expect.
 """
 
 from __future__ import annotations
@@ -17,38 +17,37 @@ from gscompleter.geometry import quats_from, rotations_from
 from gscompleter.types import Camera
 
 DISTANCE = 3.0
-"""How far away, in units of the page, the middle of the depth range is."""
+"""Distance of the middle of the depth range, in page units."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a camera of the page stands, and how much it sees."""
+    """Position, rotation and field of view of a page camera."""
 
     wxyz: Float[np.ndarray, "4"]
-    """Its rotation to the world, as a quaternion."""
+    """Rotation to the world, as a quaternion."""
     position: Float[np.ndarray, "3"]
-    """Its centre, in units of the page."""
+    """Camera centre, in page units."""
     fov: float
-    """Angle between the upper and the lower border of its image, in radians."""
+    """Vertical field of view, in radians."""
 
 
 def unit_of(camera: Camera) -> float:
-    """Units of the page in a unit of the scene; `camera` has the depth range of the scene."""
+    """Compute page units per scene unit from a camera with a depth range."""
     assert camera.near is not None
     assert camera.far is not None
     return DISTANCE / math.sqrt(camera.near * camera.far)
 
 
 def pose_of(camera: Camera, unit: float) -> Pose:
-    """A camera of the scene as the page has it."""
+    """Convert a scene camera to a page pose."""
     c2w = camera.c2w.detach().cpu().double()
     fov = 2 * math.atan(camera.height / 2 / camera.K[1, 1].item())
     return Pose(quats_from(c2w[:3, :3]).numpy(), c2w[:3, 3].numpy() * unit, fov)
 
 
 def camera_of(pose: Pose, height: int, width: int, unit: float) -> Camera:
-    """A camera of the page as the scene has it: an image of `height` x `width` pixels that shows
-    all that the page shows between its upper and its lower border."""
+    """Convert a page pose to a scene camera with the same vertical field of view."""
     c2w = torch.eye(4, dtype=torch.float64)
     c2w[:3, :3] = rotations_from(torch.from_numpy(np.asarray(pose.wxyz, dtype=np.float64)))
     c2w[:3, 3] = torch.from_numpy(np.asarray(pose.position, dtype=np.float64)) / unit

@@ -1,5 +1,4 @@
-"""What is done to a scene camera after camera: every step gives a new session, so that undo is to
-go on from the former."""
+"""Immutable sessions: every step returns a new session, so undo returns to the one before."""
 
 from __future__ import annotations
 
@@ -22,24 +21,24 @@ from gscompleter.types import Camera, Completion, TargetCompletion
 
 @dataclass(frozen=True)
 class Place:
-    """Between the frame of the photographs, in which cameras are written, and that of the result.
+    """Conversion of cameras between the frames of the photographs and of the result.
 
-    A camera goes through a file before it is completed, so that the file names the very camera.
+    Cameras go through a file before they are used, so that the saved file gives the very same
+    result.
     """
 
     frame: Float[np.ndarray, "4 4"]
-    """From the frame of the photographs to that of the result."""
+    """Similarity from the frame of the photographs to that of the result."""
     origin: Float[np.ndarray, "3"]
-    """Where the coordinates of the photographs are counted from, in their frame."""
+    """Local origin of the coordinates, in the frame of the photographs."""
     resolution: Resolution = None
-    """Height and width that are worked at, or the most pixels of the longer side."""
 
     def told(self, camera: Camera) -> Camera:
-        """A camera of the result in the frame of the photographs, in float64."""
+        """Convert a camera to the frame of the photographs, in float64."""
         return moved_exactly(camera, np.linalg.inv(self.frame))
 
     def read(self, told: Camera) -> Camera:
-        """The camera of the result that a file with `told` names."""
+        """Convert a camera to the frame of the result, by way of a file."""
         with TemporaryDirectory() as folder:
             path = Path(folder) / TARGETS
             write_cameras(path, [told])
@@ -49,16 +48,16 @@ class Place:
 
 @dataclass(frozen=True)
 class Step:
-    """A camera that the scene was completed for, and the scene with what that added."""
+    """A completed target camera and the scene after it."""
 
     told: Camera
-    """In the frame of the photographs, as it is written."""
+    """Target camera in the frame of the photographs, as it is saved."""
     completion: Completion
 
 
 @dataclass(frozen=True)
 class Session:
-    """A scene as it began, and all that was done to it and not undone."""
+    """A scene with all steps that are not undone."""
 
     completer: GSCompleter
     place: Place
@@ -67,17 +66,14 @@ class Session:
 
     @property
     def now(self) -> Completion:
-        """The scene as it stands."""
+        """The completion after the last step."""
         return self.steps[-1].completion if self.steps else self.begun
 
 
 def completed(session: Session, camera: Camera) -> tuple[Session, TargetCompletion]:
-    """The session once the scene is completed for a camera of the result, and what happened there.
+    """Complete the scene for a camera in the frame of the result.
 
-    A camera to which nothing is added leaves the session as it is.
-
-    Raises:
-        InputError: as `GSCompleter.advance`, and where the camera cannot be written.
+    Returns the same session if nothing was added.
     """
     told = session.place.told(camera)
     target = session.place.read(told).to(session.now.views[0].image.device)
@@ -89,11 +85,7 @@ def completed(session: Session, camera: Camera) -> tuple[Session, TargetCompleti
 
 
 def undone(session: Session) -> Session:
-    """The session without its last step.
-
-    Raises:
-        InputError: where there is none.
-    """
+    """Remove the last step."""
     if not session.steps:
         raise InputError("There is nothing to undo; complete something first.")
     return replace(session, steps=session.steps[:-1])

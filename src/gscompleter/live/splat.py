@@ -1,4 +1,4 @@
-"""Gaussians as the page draws them: of one colour from everywhere."""
+"""Gaussians in the form that the page renders: without view-dependent colour."""
 
 from __future__ import annotations
 
@@ -12,28 +12,25 @@ from gscompleter.geometry import rotations_from
 from gscompleter.types import SH_C0, Gaussians
 
 TINT = (1.0, 0.45, 0.9)
-"""What colours are multiplied by where Gaussians are tinted."""
 
 
 @dataclass(frozen=True)
 class Splat:
-    """n Gaussians in a unit of their own, in which half of them are larger than 1.
+    """Gaussians in a unit of their own: the median of their largest scales.
 
-    The page has covariances in float16, whose smallest step would swallow those of a scene in
-    kilometres.
+    The page keeps covariances in float16, in which those of a scene in kilometres would vanish.
     """
 
     centers: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
     rgbs: Float[np.ndarray, "n 3"]
-    """Colours in [0, 1]."""
     opacities: Float[np.ndarray, "n 1"]
     size: float
-    """Their unit, in units of the scene."""
+    """Length of the unit, in scene units."""
 
 
 def splat_of(gaussians: Gaussians, tinted: bool = False) -> Splat:
-    """What the page is given to draw `gaussians`, which are one or more."""
+    """Convert one or more Gaussians for the page."""
     gaussians = gaussians.to("cpu")
     size = gaussians.scales.amax(dim=1).median().item()
     axes = rotations_from(gaussians.quats) * (gaussians.scales / size)[:, None, :]

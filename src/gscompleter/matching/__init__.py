@@ -1,1 +1,1 @@
-"""Matched photographs: features, and what they tell of the scene before any model runs."""
+"""Feature matches between photographs, and the depth range they imply."""

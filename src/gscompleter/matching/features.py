@@ -1,4 +1,4 @@
-"""Matched features of two views (SIFT, Lowe 2004)."""
+"""SIFT features (Lowe 2004) and their matches."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from jaxtyping import Float
 from gscompleter.matching.stereo_image import StereoImage
 
 Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
-"""Pixels (the top-left pixel's centre is (0.5, 0.5)) and descriptors."""
+"""Pixels (the centre of the top-left one is (0.5, 0.5)) and descriptors."""
 Pixels = Float[np.ndarray, "m 2"]
 
 
 KEPT = 32
-"""Images whose features are remembered: a photograph is matched again for every target."""
+"""Images whose features are cached, because each target matches them again."""
 
 
 def features_of(view: StereoImage) -> Features:
+    """Detect the features of a view outside its ignored pixels."""
     grey = cv2.cvtColor((view.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
     pixels, descriptors = _features_in(grey.tobytes(), grey.shape)
     if view.ignored is None:
@@ -40,7 +41,7 @@ def _features_in(grey: bytes, size: tuple[int, int]) -> Features:
 
 
 def matches(a: Features, b: Features) -> tuple[Pixels, Pixels]:
-    """Pixels of mutual nearest neighbours that are clearly nearer than the second."""
+    """Match mutual nearest neighbours that pass the ratio test."""
     if len(a[0]) < 2 or len(b[0]) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
     squares = (a[1] ** 2).sum(1)[:, None] + (b[1] ** 2).sum(1)[None] - 2 * a[1] @ b[1].T

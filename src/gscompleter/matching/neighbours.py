@@ -1,9 +1,7 @@
-"""Which photographs each photograph is matched with: those that tell most of its depth.
+"""Selection of the photographs that each photograph is matched with.
 
-Schönberger et al. (ECCV 2016) choose by features that two images share and by the angle at which
-their rays meet: without an angle there is no depth, and across a wide one surfaces look different.
-Only photographs taken from near and in a like direction are asked, so that the time grows with the
-number of photographs and not with its square.
+Pairs are scored by shared features and triangulation angle (Schönberger et al., ECCV 2016). Only
+photographs with a similar position and direction are compared, for linear time.
 """
 
 from __future__ import annotations
@@ -20,17 +18,17 @@ from gscompleter.matching.stereo_image import StereoImage
 from gscompleter.matching.triangulation import inverse_depths
 
 COUNT = 2
-"""Photographs that each one is matched with."""
+"""Number of neighbours per photograph."""
 CANDIDATES = 6
-"""Photographs close to each one whose features are compared with its own."""
+"""Number of photographs per photograph whose features are compared."""
 TURN = 15.0
-"""Degrees between two viewing directions that make them as unlike as standing two steps apart."""
+"""Rotation in degrees that counts as much as two steps between cameras."""
 ANGLE = 5.0
-"""Degrees at which the rays to a feature meet best."""
+"""Best triangulation angle, in degrees."""
 NARROWER, WIDER = 2.0, 10.0
-"""Degrees less and more than that, at which a feature has lost two fifths of its worth."""
+"""Standard deviations of the score below and above that angle, in degrees."""
 NO_FEATURE = 1e-6
-"""Worth of a photograph with which no feature is shared: better than none."""
+"""Score of a pair without shared features: better than no neighbour."""
 
 Pair = tuple[int, int]
 Matches = dict[Pair, tuple[Pixels, Pixels]]
@@ -39,26 +37,26 @@ Matches = dict[Pair, tuple[Pixels, Pixels]]
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Who is matched with whom."""
+    """Selected neighbours of all photographs."""
 
     of: tuple[tuple[int, ...], ...]
-    """The photographs that each one is matched with, the best one first."""
+    """Neighbours of each photograph, the best one first."""
     matches: Matches
-    """Features that were found in both, for all pairs that were compared."""
+    """Feature matches of all compared pairs."""
 
     @property
     def pairs(self) -> list[Pair]:
-        """Photographs i < j of which one is matched with the other."""
+        """Pairs i < j of neighbours."""
         return ascending((i, j) for i, others in enumerate(self.of) for j in others)
 
     def either_way(self, number: int) -> list[int]:
-        """Those that photograph `number` is matched with, or that are matched with it."""
+        """List the neighbours of a photograph and those it is a neighbour of."""
         back = {other for other, chosen in enumerate(self.of) if number in chosen}
         return sorted(back | set(self.of[number]))
 
 
 def neighbours_among(images: Sequence[StereoImage], count: int = COUNT) -> Neighbours:
-    """Up to `count` photographs to match each of `images` with."""
+    """Select up to `count` neighbours for each image."""
     features = side_by_side(features_of, images)
     found = {(i, j): matches(features[i], features[j]) for i, j in close_pairs(images)}
     worth = np.zeros((len(images), len(images)))
@@ -70,8 +68,7 @@ def neighbours_among(images: Sequence[StereoImage], count: int = COUNT) -> Neigh
 
 
 def close_pairs(images: Sequence[StereoImage]) -> list[Pair]:
-    """Pairs i < j with a baseline, of which one is among those that are most like the other by
-    where they stand and look."""
+    """List pairs i < j with a baseline and a similar position and direction."""
     centers = np.stack([image.center for image in images])
     forward = np.stack([image.rotation[:, 2] for image in images])
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
@@ -85,12 +82,12 @@ def close_pairs(images: Sequence[StereoImage]) -> list[Pair]:
 
 
 def ascending(pairs: Iterable[Pair]) -> list[Pair]:
-    """Each of `pairs` once, the smaller number first."""
+    """Sort pairs and remove duplicates, the smaller number first."""
     return sorted({(min(pair), max(pair)) for pair in pairs})
 
 
 def shared_worth(a: StereoImage, b: StereoImage, in_a: Pixels, in_b: Pixels) -> float:
-    """How much two photographs tell of depth by the features that they share."""
+    """Score two photographs by the triangulation angles of their matches."""
     if len(in_a) == 0:
         return 0.0
     baseline = float(np.linalg.norm(a.center - b.center))
@@ -98,6 +95,6 @@ def shared_worth(a: StereoImage, b: StereoImage, in_a: Pixels, in_b: Pixels) -> 
 
 
 def angle_worth(ratio: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-    """Worth, up to 1, of features whose depth is that many baselines away, inverted."""
+    """Score triangulation angles, up to 1; `ratio` is baseline over depth."""
     excess = np.degrees(2 * np.arctan(ratio / 2)) - ANGLE
     return np.exp(-((excess / np.where(excess < 0, NARROWER, WIDER)) ** 2) / 2)

@@ -1,4 +1,4 @@
-"""Views as the kernels want them: arrays, and lengths in units of the widest baseline."""
+"""Views as arrays for stereo, with lengths in units of the widest baseline."""
 
 from __future__ import annotations
 
@@ -13,35 +13,32 @@ from gscompleter.errors import InputError
 from gscompleter.types import View
 
 MIN_SIDE = 8
-"""Pixels of an image's side under which nothing can be matched, and costs have no paths."""
+"""Smallest side of an image that stereo can match, in pixels."""
 
 
 @dataclass(frozen=True)
 class StereoImage:
-    """An image and its camera; lengths are in units of the widest baseline."""
+    """An image and its camera; lengths are in widest baselines."""
 
     image: Float[np.ndarray, "h w 3"]
     K: Float[np.ndarray, "3 3"]
     rotation: Float[np.ndarray, "3 3"]
-    """Camera axes to world axes."""
+    """Rotation from camera to world axes."""
     center: Float[np.ndarray, "3"]
     ignored: Bool[np.ndarray, "h w"] | None = None
-    """True where nothing is matched; None where everything is."""
+    """True at pixels that are not matched, or None to match all."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width."""
+        """Height and width in pixels."""
         return self.image.shape[0], self.image.shape[1]
 
 
 def stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]:
-    """`views` in units of their widest baseline, and that unit in scene units.
+    """Convert views to units of their widest baseline; return it in scene units too.
 
-    Offsets are rounded to 2^-16 of the baseline, which no image can tell apart, so that a scene
-    whose float32 poses were multiplied by any factor gives the very same values.
-
-    Raises:
-        InputError: with fewer than two views, tiny ones, or where all of them stand in one place.
+    Camera offsets are rounded to 2^-16 baselines, so that a scaled scene gives identical results.
+    Raise InputError for fewer than two views, a tiny image, or no baseline.
     """
     if len(views) < 2:
         raise InputError(
@@ -79,20 +76,21 @@ def _stereo_image(view: View, center: Float[np.ndarray, "3"]) -> StereoImage:
 def contrast(
     a: Float32[np.ndarray, "h w 3"], b: Float32[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w"]:
-    """How different each pixel of two images is, in the colour that differs most."""
+    """Compute the largest channel difference of each pixel of two images."""
     return largest(cv2.absdiff(a, b))
 
 
 def largest(values: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Of each pixel the largest of its three values."""
+    """Compute the largest channel of each pixel."""
     red, green, blue = cv2.split(values)
     return cv2.max(cv2.max(red, green), blue)
 
 
 def source_from_reference(reference: StereoImage, source: StereoImage) -> Float[np.ndarray, "3 4"]:
-    """[A | b]: a pixel (x, y, 1) of `reference` at inverse depth w lies at A (x, y, 1) + b w.
+    """Compute [A | b], the transform from reference pixels to source pixels.
 
-    The result is a homogeneous pixel of `source`; its third entry is the ratio of the z-depths.
+    A pixel (x, y, 1) at inverse depth w maps to A (x, y, 1) + b w, whose third entry is the z-depth
+    ratio.
     """
     rotation = source.rotation.T @ reference.rotation
     homography = source.K @ rotation @ np.linalg.inv(reference.K)

@@ -1,4 +1,4 @@
-"""How far away a feature lies that two photographs share."""
+"""Depth of matched features of two photographs."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from gscompleter.matching.features import Pixels
 from gscompleter.matching.stereo_image import StereoImage, source_from_reference
 
 MAX_ERROR = 3.0
-"""Pixels that a match may lie off its epipolar line: poses are noisy."""
+"""Largest distance of a match from its epipolar line, in pixels; poses are noisy."""
 MIN_PARALLAX = 1.0
-"""Pixels that a match must move to tell a depth."""
+"""Smallest parallax that gives a depth, in pixels."""
 
 
 def inverse_depths(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> Float[np.ndarray, "k"]:
-    """Inverse z-depths in `reference` of the matches that tell them."""
+    """Triangulate the valid matches; return inverse z-depth in `reference`."""
     inverse, good = triangulate(reference, source, pixels, matched)
     return inverse[good]
 
@@ -25,18 +25,14 @@ def inverse_depths(
 def triangulate(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """Inverse z-depths in `reference` of all matches, and which of these lie on their epipolar
-    lines and can be trusted.
-
-    A match that hardly moves tells nothing of depth.
-    """
+    """Triangulate all matches; return inverse z-depth in `reference` and a validity mask."""
     transform = source_from_reference(reference, source).astype(np.float64)
     at_infinity = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ transform[:, :3].T
     b = transform[:, 3]
-    # Least squares of matched * (A p + b w)_2 = (A p + b w)_xy in w.
-    slope = b[:2] - matched * b[2]
+    # Solve matched * (A p + b w)_2 = (A p + b w)_xy for w by least squares.
+    factor = b[:2] - matched * b[2]
     offset = matched * at_infinity[:, 2:] - at_infinity[:, :2]
-    inverse = (slope * offset).sum(1) / np.maximum((slope * slope).sum(1), 1e-12)
+    inverse = (factor * offset).sum(1) / np.maximum((factor * factor).sum(1), 1e-12)
     at_depth = at_infinity + inverse[:, None] * b
     ahead = (at_depth[:, 2] > 1e-6) & (at_infinity[:, 2] > 1e-6)
     scale = np.where(ahead, at_depth[:, 2], 1.0)[:, None]

@@ -1,1 +1,1 @@
-"""What judges a result, apart from what produces it."""
+"""Metrics of images, depth and geometry."""

@@ -1,8 +1,6 @@
-"""How much of what can be looked at a scene covers: the share of pixels with alpha of at least a
-half, over cameras around the path of the photographs that nothing was completed for.
+"""Coverage: share of pixels with alpha of at least 0.5, over held-out cameras.
 
-Such a camera lies at random between a photograph's camera and its nearest neighbour, moved aside by
-about as much as these stand apart, and turned by some degrees.
+The cameras are random, close to the path of the context cameras and rotated by some degrees.
 """
 
 from __future__ import annotations
@@ -23,71 +21,71 @@ from gscompleter.types import Camera, Completion, Render, merge
 
 NUM_CAMERAS = 32
 SIDE = 96
-"""Pixels of the longer side of the images that are looked at."""
+"""Longer side of the rendered images, in pixels."""
 TURN = 5.0
-"""Standard deviation, in degrees, of the turns to the side and up and down."""
+"""Standard deviation of yaw and pitch, in degrees."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Share of the pixels that the scene covers, before and after it was completed."""
+    """Share of pixels that the scene covers, before and after completion."""
 
     before: float
     after: float
     cameras: int
-    """How many cameras it was looked at from."""
+    """Number of cameras."""
 
     def as_summary(self) -> dict[str, float]:
-        """As `summary.json` has it."""
+        """Return the entry of `summary.json`."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Look:
-    """What one camera sees of a scene in a small image, before and after it was completed."""
+    """Renders of one camera before and after completion."""
 
     before: Render
     after: Render
 
 
 def looks_of(completion: Completion, cameras: Sequence[Camera], renderer: Renderer) -> list[Look]:
-    """What `cameras` see of the scene in small images, about."""
+    """Render the scene before and after completion in small images, from a thinned scene."""
     begun = thinned(completion.drawn_context, MAX_GAUSSIANS)
     aside = completion.set_aside is not None
     kept = thinned(completion.drawn[: completion.num_kept], MAX_GAUSSIANS) if aside else begun
     added = [thinned(result.added, MAX_GAUSSIANS) for result in completion.targets]
     new = merge([begun[:0], *added])
 
-    def look(camera: Camera) -> Look:
+    def render_pair(camera: Camera) -> Look:
         first = renderer.freeze(begun, camera)
         last = renderer.freeze(kept, camera) if aside else first
         return Look(first.context, last.composite(new))
 
-    return list(each_view(new)(look, [shrunk(camera, SIDE) for camera in cameras]))
+    return list(each_view(new)(render_pair, [shrunk(camera, SIDE) for camera in cameras]))
 
 
 def coverage_of(looks: Sequence[Look]) -> Coverage:
-    """How much a scene covers of what was looked at."""
+    """Compute the coverage before and after completion."""
     before, after = [look.before for look in looks], [look.after for look in looks]
     return Coverage(covered(before), covered(after), len(looks))
 
 
 def covered(renders: Sequence[Render]) -> float:
-    """Share of the pixels of all renders that the scene covers."""
+    """Compute the share of pixels of all renders that the scene covers."""
     return torch.cat([r.alpha.flatten() >= COVERED for r in renders]).float().mean().item()
 
 
 def held_out_cameras(
     cameras: Sequence[Camera], seed: int, count: int = NUM_CAMERAS
 ) -> list[Camera]:
-    """Cameras around the path of `cameras`, the same ones for the same seed."""
+    """Sample cameras around the path of `cameras`; the same seed gives the same cameras."""
     generator = torch.Generator().manual_seed(seed)
     step = spacing(cameras)
     return [held_out(cameras, step, generator) for _ in range(count)]
 
 
 def held_out(cameras: Sequence[Camera], step: float, generator: torch.Generator) -> Camera:
-    """A camera between one of `cameras` and its nearest neighbour, moved and turned at random."""
+    """Sample a camera between a random one of `cameras` and its nearest neighbour."""
     first = cameras[int(torch.randint(len(cameras), (), generator=generator))]
     share = torch.rand((), generator=generator).item()
     shift = step * torch.randn(3, generator=generator) / 3**0.5
@@ -99,13 +97,13 @@ def held_out(cameras: Sequence[Camera], step: float, generator: torch.Generator)
 
 
 def neighbour(camera: Camera, cameras: Sequence[Camera]) -> Camera:
-    """The camera that stands nearest to `camera`; itself where there is no other."""
+    """Return the camera nearest to `camera`, or `camera` itself if there is no other."""
     others = [other for other in cameras if other is not camera]
     return min(others, key=lambda other: baseline_between(camera, other), default=camera)
 
 
 def interpolated(first: Camera, second: Camera, share: float) -> Camera:
-    """`first` on its way to where `second` stands and looks."""
+    """Interpolate from `first` to the pose of `second`."""
     turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
     return moved(
         first, share_of_turn(turn, share).to(first.c2w), share * (second.center - first.center)

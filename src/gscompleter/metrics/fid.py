@@ -16,24 +16,14 @@ def fid(
     truths: Iterable[Float[Tensor, "h w 3"]],
     device: torch.device | str = "cpu",
 ) -> float:
-    """|μ - μ'|² + tr(Σ + Σ' - 2 (Σ Σ')^½) of Inception features of two sets of images; 0 is best.
+    """Compute |μ - μ'|² + tr(Σ + Σ' - 2 (Σ Σ')^½) of Inception features; 0 is best.
 
-    The 2,048 features of the last pooling layer, by `FrechetInceptionDistance` of torchmetrics
-    with its own weights (a download) and its own resizing to 299 x 299. Images are in [0, 1] and
-    may differ in size. The estimate is biased for few images: compare only sets of equal size,
-    thousands of images where possible.
-
-    This function was checked against a stand-in for torchmetrics only. Neither the real library
-    nor its weights were at hand where it was written.
-
-    Args:
-        images: What was rendered.
-        truths: The photographs; at least two on each side.
-        device: Where the features are computed.
+    This is `FrechetInceptionDistance` of torchmetrics with 2,048 features, its own weights and its
+    own resizing. The estimate is biased: compare sets of equal size only, with thousands of images
+    if possible. Tested with a stand-in for torchmetrics only.
 
     Raises:
-        InputError: where torchmetrics is missing, its weights cannot be had, or there are fewer
-            than two images on a side.
+        InputError: torchmetrics or its weights are missing, or a side has fewer than two images.
     """
     metric = load_metric().to(device)
     for images_of, real in ((truths, True), (images, False)):
@@ -48,11 +38,11 @@ def fid(
     return float(metric.compute())
 
 
-# The class is unknown without the optional package.
+# No return type: the class comes from an optional package.
 def load_metric():  # type: ignore[no-untyped-def]
-    """The metric of torchmetrics, for images in [0, 1]; errors as those of `fid`."""
+    """Load the torchmetrics metric for images in [0, 1]; errors as `fid`."""
     try:
-        # Here and not above: the package brings torchvision along.
+        # Imported here because the package imports torchvision.
         from torchmetrics.image.fid import FrechetInceptionDistance
 
         return FrechetInceptionDistance(feature=2048, normalize=True)

@@ -1,8 +1,6 @@
-"""HaarPSI (Reisenhofer et al., A Haar Wavelet-Based Perceptual Similarity Index for Image Quality
-Assessment, 2018), written from the published formula.
+"""HaarPSI (Reisenhofer et al., A Haar Wavelet-Based Perceptual Similarity Index, 2018).
 
-Where one image has an edge and the other has none their Haar wavelets differ, however near their
-colours are: blur costs. It is a weighted mean over pixels, so a part of an image can be judged.
+Haar wavelets differ where only one image has an edge, so blur is penalized.
 """
 
 from __future__ import annotations
@@ -15,9 +13,9 @@ from torch.nn.functional import avg_pool2d, conv2d, pad
 C = 30.0
 """Constant of the similarity, in units of 8-bit colours; fitted by the authors."""
 ALPHA = 4.2
-"""Slope of the logistic function; fitted by the authors."""
+"""Steepness of the logistic function; fitted by the authors."""
 YIQ = ((0.299, 0.587, 0.114), (0.5959, -0.2746, -0.3213), (0.2115, -0.5227, 0.3112))
-"""Luminance and the two chrominances of red, green and blue."""
+"""Conversion from RGB to luminance and two chrominances."""
 
 
 def haarpsi(
@@ -25,10 +23,10 @@ def haarpsi(
     truth: Float[Tensor, "h w 3"],
     where: Bool[Tensor, "h w"] | None = None,
 ) -> float | None:
-    """HaarPSI of two images in [0, 1], over the pixels of `where`; 1 is best, None of no pixel.
+    """Compute HaarPSI of two images in [0, 1] over the pixels of `where`; 1 is best.
 
-    Images are halved first, as published: a pixel of the half size counts where at least half of
-    its area lies in `where`.
+    Images are halved first, as published; a pixel counts if half of its area is in `where`. None
+    without such a pixel.
     """
     of_image, of_truth = planes(image), planes(truth)
     similarity, weight = similarities(of_image, of_truth)
@@ -37,14 +35,14 @@ def haarpsi(
         similarity, weight = similarity[:, inside], weight[:, inside]
     if similarity.numel() == 0:
         return None
-    # Where neither has an edge all pixels weigh alike.
+    # Without any edge all pixels have the same weight.
     tiny = torch.finfo(weight.dtype).eps
     mean = ((ALPHA * similarity).sigmoid() * (weight + tiny)).sum() / (weight + tiny).sum()
     return (mean.logit() / ALPHA).square().item()
 
 
 def planes(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 half_h half_w"]:
-    """YIQ in units of 8-bit colours, at half the size."""
+    """Convert to YIQ in units of 8-bit colours, at half the size."""
     colours = 255 * image.clamp(0, 1).double().cpu()
     return halved((colours @ colours.new_tensor(YIQ).T).movedim(-1, 0))
 
@@ -52,11 +50,7 @@ def planes(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 half_h half_w"]:
 def similarities(
     a: Float[Tensor, "3 h w"], b: Float[Tensor, "3 h w"]
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 h w"]]:
-    """Local similarity and its weight: of rows, of columns, and of the chrominances.
-
-    The two finer scales of the wavelets of luminance are compared; the coarsest says how much a
-    pixel matters.
-    """
+    """Compare two finer scales of luminance, and chrominance; the coarsest scale gives weights."""
     of_a, of_b = ([wavelets(p[0], scale) for scale in (1, 2, 3)] for p in (a, b))
     luminance = torch.stack([alike(x, y) for x, y in zip(of_a[:2], of_b[:2], strict=True)]).mean(0)
     chrominance = alike(neighbour_means(a[1:]), neighbour_means(b[1:])).mean(0, keepdim=True)
@@ -68,12 +62,12 @@ def similarities(
 
 
 def alike(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """(2 a b + c) / (a² + b² + c): 1 where both are the same."""
+    """Compute (2 a b + c) / (a² + b² + c), which is 1 for equal values."""
     return (2 * a * b + C) / (a**2 + b**2 + C)
 
 
 def wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tensor, "2 h w"]:
-    """Magnitudes of the Haar wavelets of 2^scale pixels, down the rows and along the columns."""
+    """Compute magnitudes of Haar wavelets of 2^scale pixels, along columns and rows."""
     size = 2**scale
     step = luminance.new_full((size, size), 1 / size)
     step[size // 2 :] *= -1
@@ -83,11 +77,11 @@ def wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tensor, "2 h 
 
 
 def neighbour_means(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
-    """Magnitudes of the means of 2 x 2 pixels, one for every pixel."""
+    """Compute magnitudes of the means of 2 x 2 pixels, one for every pixel."""
     return avg_pool2d(pad(values, (0, 1, 0, 1)), 2, stride=1).abs()
 
 
 def halved(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c half_h half_w"]:
-    """Means of 2 x 2 pixels; beyond an odd side there is black."""
+    """Average 2 x 2 pixels, with black beyond an odd side."""
     h, w = values.shape[1:]
     return avg_pool2d(pad(values, (0, w % 2, 0, h % 2)), 2)

@@ -1,4 +1,4 @@
-"""Image quality, each metric in one function with its formula."""
+"""Image metrics, one function each."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 MAX_PSNR = 100.0
-"""PSNR of equal images, in dB, where the formula has no finite value."""
+"""PSNR in dB of equal images."""
 
 LUMINANCE = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue (ITU-R BT.601)."""
+"""Weights of red, green and blue (ITU-R BT.601)."""
 
 RADIUS, SIGMA = 5, 1.5
-"""Of the Gaussian window of SSIM, in pixels."""
+"""Radius and sigma of SSIM's Gaussian window, in pixels."""
 
 
 def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
-    """Peak signal-to-noise ratio in dB: -10 log10(mean((clip(image) - truth)^2)), peak 1."""
+    """Compute PSNR in dB: -10 log10(mean((clip(image) - truth)²)) with peak 1."""
     error = (image.clamp(0, 1) - truth).double().square().mean().item()
     return min(-10 * math.log10(error), MAX_PSNR) if error > 0 else MAX_PSNR
 
@@ -29,20 +29,12 @@ def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
 def masked_psnr(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
 ) -> float | None:
-    """PSNR in dB over the pixels of `where` only; None where there are none.
-
-    With the hole mask it judges what was generated, with its complement what was observed.
-    """
+    """Compute PSNR in dB over the pixels of `where`, or None if there are none."""
     return psnr(image[where][None], truth[where][None]) if where.any() else None
 
 
 def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
-    """Structural similarity as MVSplat and DepthSplat report it.
-
-    With an 11-pixel Gaussian window, the covariances of a sample, colour channels averaged, range
-    1: what scikit-image gives, which takes longer to be imported than to answer. Both sides of the
-    image must be at least 11 pixels long.
-    """
+    """Compute SSIM as scikit-image does: 11-pixel Gaussian window, sample covariances, range 1."""
     a, b = image.clamp(0, 1).cpu().numpy(), truth.cpu().numpy()
     inner = similarities(a, b)[RADIUS:-RADIUS, RADIUS:-RADIUS]
     if inner.size == 0:
@@ -54,7 +46,7 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
 def similarities(
     a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """The structural similarity of two images (Wang et al. 2004) at each of their pixels."""
+    """Compute the structural similarity (Wang et al. 2004) at each pixel."""
     unbiased = (2 * RADIUS + 1) ** 2 / ((2 * RADIUS + 1) ** 2 - 1)
     mean_a, mean_b = blurred(a), blurred(b)
     var_a = unbiased * (blurred(a * a) - mean_a * mean_a)
@@ -66,7 +58,7 @@ def similarities(
 
 
 def blurred(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Means under a Gaussian window, summed in float64 and rounded after each direction."""
+    """Blur with a Gaussian window, summed in float64 and rounded after each direction."""
     weights = np.exp(-0.5 / SIGMA**2 * np.arange(-RADIUS, RADIUS + 1) ** 2)
     line, point = weights / weights.sum(), np.ones(1)
     down = cv2.sepFilter2D(values, cv2.CV_64F, point, line).astype(values.dtype)
@@ -76,12 +68,11 @@ def blurred(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
 def gradient_energy_ratio(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
 ) -> float | None:
-    """Gradient energy of `image` over that of `truth`: 1 is as sharp as the photograph, 0 is flat.
+    """Compute the gradient energy of `image` over that of `truth`: 1 is as sharp, 0 is flat.
 
-    The sum of squared central differences of the luminance, over the pixels of `where` whose four
-    neighbours lie in it too, so that the border of a hole is no gradient. It tells sharpness and
-    nothing of whether the edges are the true ones. None where there is no such pixel, or the
-    photograph has no gradient there.
+    Squared central differences of luminance are summed over pixels of `where` with all four
+    neighbours in `where`. This measures sharpness, not whether edges are correct. None without such
+    a pixel or gradient.
     """
     there = where[1:-1, 1:-1] & where[:-2, 1:-1] & where[2:, 1:-1]
     there = there & where[1:-1, :-2] & where[1:-1, 2:]
@@ -90,7 +81,7 @@ def gradient_energy_ratio(
 
 
 def gradient_energy(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h-2 w-2"]:
-    """Squared length of the gradient of luminance per pixel, by central differences."""
+    """Compute the squared gradient of luminance per pixel, by central differences."""
     luminance = image.double() @ image.new_tensor(LUMINANCE, dtype=torch.float64)
     down = (luminance[2:, 1:-1] - luminance[:-2, 1:-1]) / 2
     along = (luminance[1:-1, 2:] - luminance[1:-1, :-2]) / 2

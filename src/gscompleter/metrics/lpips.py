@@ -1,15 +1,10 @@
 """LPIPS, the learned perceptual distance of Zhang et al. (CVPR 2018), version 0.1.
 
-Both images run through a network trained on ImageNet. At five depths l the features of each
-pixel are scaled to unit length, and the squared differences of the channels c are weighted by
-learned, non-negative numbers w:
-
     LPIPS = sum_l mean_{y,x} sum_c w_lc (f_lc(y, x) - g_lc(y, x))²
 
-The modules are ours, in plain PyTorch; their parameters carry the names of the published files,
-two per network: the backbone as torchvision publishes it, and the linear weights of
-github.com/richzhang/PerceptualSimilarity. Other weights would give another metric, so a file is
-only read where its SHA-256 is that of the published one, and without weights there is no number.
+f and g are unit-length ImageNet features of the two images at five layers l, w the learned weights.
+The modules are ours; parameters are named as in the files of torchvision (backbone) and of
+github.com/richzhang/PerceptualSimilarity (w). Only files with the published SHA-256 are read.
 """
 
 from __future__ import annotations
@@ -39,29 +34,29 @@ class WeightsFile:
     url: str
     sha256: str
     cache: str
-    """Its folder within that of torch.hub."""
+    """Folder of the file in the cache of torch.hub."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """A backbone, where its features are read, and the files that fill it."""
+    """A backbone, the layers that are compared, and its files."""
 
     layers: tuple[tuple[int, int, int, int] | str, ...]
-    """A convolution as (channels, kernel, stride, padding), or `relu` or `pool`."""
+    """Convolutions as (channels, kernel, stride, padding), `relu` and `pool`."""
     pool: int
-    """Side of the max-pooling windows, which are 2 pixels apart."""
+    """Side of the max-pooling windows; their stride is 2 pixels."""
     taps: tuple[int, int, int, int, int]
     """Layers whose output is compared."""
     channels: tuple[int, int, int, int, int]
-    """Channels of those outputs."""
+    """Channels of these outputs."""
     min_side: int
-    """Fewest pixels per side of which something reaches the last tap."""
+    """Smallest image side for which the last tap has a pixel."""
     backbone: WeightsFile
     linear: WeightsFile
 
 
 def vgg_layers() -> tuple[tuple[int, int, int, int] | str, ...]:
-    """Layers of VGG16: blocks of 3 x 3 convolutions with pooling after each."""
+    """Return the layers of VGG16: blocks of 3 x 3 convolutions, each followed by pooling."""
     layers: list[tuple[int, int, int, int] | str] = []
     for channels, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
         for _ in range(depth):
@@ -71,14 +66,14 @@ def vgg_layers() -> tuple[tuple[int, int, int, int] | str, ...]:
 
 
 TORCHVISION = "https://download.pytorch.org/models/"
-# A commit and not a branch: what the address means cannot change.
+# The address names a commit, so its content cannot change.
 LINEAR = (
     "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/"
     "082bb24f84c091ea94de2867d34c4544f68e0963/lpips/weights/v0.1/"
 )
 
-# The SHA-256 of the backbones begin with the digits in their names. Those of the linear weights
-# have no publisher's statement; several independent projects record the same ones.
+# The names of the backbones contain the first digits of their SHA-256. Those of the linear weights
+# are not published; several independent projects record the same values.
 NETWORKS: dict[str, Network] = {
     "vgg": Network(
         layers=vgg_layers(),
@@ -128,7 +123,7 @@ NETWORKS: dict[str, Network] = {
 
 
 class Lpips(nn.Module):
-    """The metric as a module; `load_lpips` fills it with the published weights."""
+    """The metric as a module; `load_lpips` loads the published weights."""
 
     shift: Float[Tensor, "3 1 1"]
     scale: Float[Tensor, "3 1 1"]
@@ -138,7 +133,7 @@ class Lpips(nn.Module):
         self.network = network
         self.features = backbone(network)
         for i, channels in enumerate(network.channels):
-            # w_l. The published names count the dropout that stood in front during training.
+            # w_l. The published names count a dropout layer, which is used in training only.
             model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
             self.add_module(f"lin{i}", nn.ModuleDict({"model": model}))
         # ImageNet's mean and deviation, for colours in [-1, 1].
@@ -149,13 +144,7 @@ class Lpips(nn.Module):
     def forward(
         self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
     ) -> Float[Tensor, ""]:
-        """LPIPS between two images in [0, 1]; 0 for equal ones, greater is worse.
-
-        `image` is clipped to [0, 1] first, as it is for PSNR.
-
-        Raises:
-            InputError: where the images are too small for the network.
-        """
+        """Compute LPIPS of two images in [0, 1], with `image` clipped; 0 is best."""
         height, width = image.shape[:2]
         if min(height, width) < self.network.min_side:
             raise InputError(
@@ -170,7 +159,7 @@ class Lpips(nn.Module):
         return torch.stack(terms).sum()
 
     def unit_features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "1 _ _ _"]]:
-        """Features at the five taps, of unit length along the channels."""
+        """Compute features at the five taps, of unit length along the channels."""
         x = image.to(self.shift).permute(2, 0, 1) * 2 - 1
         x = ((x - self.shift) / self.scale)[None]
         found = []
@@ -183,7 +172,7 @@ class Lpips(nn.Module):
 
 
 def backbone(network: Network) -> nn.Sequential:
-    """The layers up to the last tap, numbered as torchvision numbers them."""
+    """Build the layers up to the last tap, numbered as in torchvision."""
     modules: list[nn.Module] = []
     channels = 3
     for layer in network.layers[: network.taps[-1] + 1]:
@@ -202,22 +191,18 @@ def backbone(network: Network) -> nn.Sequential:
 def load_lpips(
     network: NetworkName = "vgg", folder: Path | None = None, download: bool = True
 ) -> Lpips:
-    """The metric with its published weights, in evaluation mode and without gradients.
+    """Load the metric with its published weights, without gradients.
 
-    VGG16 is what MVSplat and DepthSplat report; the metric's authors recommend AlexNet for
-    comparing images, which is also several times faster.
+    MVSplat and DepthSplat report VGG16; the authors recommend AlexNet for comparing images.
 
     Args:
         network: `vgg` or `alex`.
-        folder: Where the two files lie, under their published names. None looks into the cache
-            of torch.hub: `checkpoints` for the backbone, `checkpoints/lpips_v0.1` for the linear
-            weights.
-        download: Fetch missing files into that cache (vgg: 530 MB, alex: 240 MB). A folder that
-            was given is taken as it is.
+        folder: Folder of the two files, with their published names; None means torch.hub's cache.
+        download: Download missing files to the cache (vgg: 530 MB, alex: 240 MB).
 
     Raises:
-        WeightsNotAvailable: where a file is missing and cannot be fetched.
-        InputError: where a file is not the published one, or the network is unknown.
+        WeightsNotAvailable: A file is missing and cannot be downloaded.
+        InputError: A file is not the published one, or the network is unknown.
     """
     if network not in NETWORKS:
         raise InputError(f"There is no LPIPS network {network!r}; choose {' or '.join(NETWORKS)}.")
@@ -226,7 +211,7 @@ def load_lpips(
     paths = [locate(file, wanted, folder, download and folder is None) for file in files]
     of_backbone, of_linear = map(read_weights, paths, files)
     metric = Lpips(wanted)
-    # The classifier behind the features is not part of the metric, nor are later layers.
+    # The file also holds the classifier, which the metric does not use.
     weights = {k: v for k, v in of_backbone.items() if k.startswith("features.")} | dict(of_linear)
     try:
         metric.load_state_dict(weights, strict=True)
@@ -238,15 +223,12 @@ def load_lpips(
 
 
 def place_of(file: WeightsFile, folder: Path | None) -> Path:
-    """Where a file is expected: in the given folder, else in the cache of torch.hub."""
+    """Return the expected path of a file, in `folder` or in the cache of torch.hub."""
     return (Path(torch.hub.get_dir()) / file.cache if folder is None else folder) / file.name
 
 
 def locate(file: WeightsFile, network: Network, folder: Path | None, download: bool) -> Path:
-    """The path of a weights file, after a download where that is allowed and needed.
-
-    Raises WeightsNotAvailable where there is none.
-    """
+    """Return the path of a weights file, downloaded if needed and allowed."""
     path = place_of(file, folder)
     if path.is_file():
         return path
@@ -254,7 +236,7 @@ def locate(file: WeightsFile, network: Network, folder: Path | None, download: b
     if download:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Checked against the hash before it gets its name.
+            # The hash is checked before the file gets its name.
             torch.hub.download_url_to_file(file.url, str(path), file.sha256, progress=False)
             return path
         except (OSError, RuntimeError) as error:
@@ -266,7 +248,7 @@ def locate(file: WeightsFile, network: Network, folder: Path | None, download: b
 
 
 def read_weights(path: Path, file: WeightsFile) -> Mapping[str, Tensor]:
-    """The tensors of a file with the expected hash, else an InputError; never any other object."""
+    """Read the tensors of a file; raise InputError if it is not the published one."""
     check_kind(path, file.name)
     check_sha256(path, file.sha256, file.name)
     weights = read_tensors(path, file.name)
@@ -276,7 +258,7 @@ def read_weights(path: Path, file: WeightsFile) -> Mapping[str, Tensor]:
 
 
 cached_lpips = lru_cache(maxsize=2)(load_lpips)
-"""`load_lpips`, which keeps the last two, as tables ask again and again."""
+"""`load_lpips` with a cache of two networks."""
 
 
 @torch.no_grad()
@@ -286,7 +268,7 @@ def lpips_if_available(
     network: NetworkName = "vgg",
     folder: Path | None = None,
 ) -> float | None:
-    """LPIPS where its weights lie on this machine, else None; nothing is downloaded."""
+    """Compute LPIPS, or return None if the weights are not on this machine."""
     try:
         metric = cached_lpips(network, folder, download=False)
     except WeightsNotAvailable:

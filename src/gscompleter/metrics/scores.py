@@ -1,4 +1,4 @@
-"""All scores of one method on one case, against photographs and depths that were held back."""
+"""Scores of one method on one case, against held-out photographs and depths."""
 
 from __future__ import annotations
 
@@ -28,15 +28,14 @@ from gscompleter.types import Camera, Gaussians, Render, View
 Image = Float[Tensor, "h w 3"]
 
 MIN_PIXELS = 50
-"""Fewest pixels that a difference or a ratio of depths is a median of."""
+"""Minimum number of pixels for a median of depths."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Photographs to score against. Their cameras have the depth range of the scene."""
+    """Photographs to score against; their cameras have the depth range of the scene."""
 
     views: tuple[View, ...]
-    """The context views."""
     target: View
     neighbours: tuple[View, ...] = ()
 
@@ -51,87 +50,83 @@ class Change:
 
 @dataclass(frozen=True)
 class Quality:
-    """One image against its photograph."""
+    """Scores of one image against its photograph."""
 
     psnr: float
-    """In dB."""
+    """PSNR in dB."""
     ssim: float
     lpips_vgg: float | None
-    """None where the weights are not on this machine."""
+    """None if the weights are not on this machine."""
     lpips_alex: float | None
 
 
 @dataclass(frozen=True)
 class Looks:
-    """Part of an image against its photograph, by what does not reward blur. None: of no pixel."""
+    """Scores of a part of an image that do not reward blur; None without a pixel."""
 
     flip: float | None
-    """Mean of the map of FLIP; None where flip-evaluator is missing, too."""
+    """Mean of the FLIP map; None also if flip-evaluator is missing."""
     haarpsi: float | None
     gradient_energy: float | None
-    """As a multiple of the photograph's; None where that is flat, too."""
+    """Gradient energy over that of the photograph; None also if the photograph is flat."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How a completion fares against the photographs it did not see. None: no truth exists."""
+    """Scores of a completion against held-out photographs; None if the truth is missing."""
 
     hole_fraction: float
     """Share of the target's pixels that the context does not cover."""
     target_before: Quality
     target_after: Quality
     hole_psnr: float | None
-    """PSNR at the target over the pixels of the hole only, after completion."""
+    """PSNR in dB at the target in the hole, after completion."""
     observed_psnr: Change | None
-    """PSNR at the target over all other pixels."""
+    """PSNR in dB at the target over all other pixels."""
     neighbours_psnr: Change | None
-    """Mean over the neighbours."""
+    """Mean PSNR in dB over the neighbour views."""
     context_psnr: tuple[Change, ...]
-    """Of each context view."""
+    """PSNR in dB of each context view."""
     context_ssim: tuple[Change, ...]
-    """Of each context view."""
+    """SSIM of each context view."""
     depth_observed: float | None
     """AbsRel at the target against the true depth, where the context covers it."""
     depth_hole: float | None
-    """The same where the context has a hole and the completion fills it."""
+    """The same in the filled hole."""
     depth_observed_pixels: int | None = None
-    """Number of pixels that `depth_observed` is the mean of."""
+    """Number of pixels of `depth_observed`."""
     depth_hole_pixels: int | None = None
-    """Number of pixels that `depth_hole` is the mean of."""
+    """Number of pixels of `depth_hole`."""
     depth_rim: float | None = None
-    """Median relative difference of depth between what was added, drawn alone, and the context,
-    where both cover the target: the step at the border of the holes."""
+    """Median relative depth difference of the added Gaussians to the context, where both cover."""
     align_pixels: int | None = None
-    """Number of pixels of the target that both cover: of `depth_rim` and the three below."""
+    """Number of target pixels that both cover, for `depth_rim` and the next three."""
     align_abs_rel: float | None = None
-    """AbsRel of what was added against the context (`geometry.alignment`)."""
+    """AbsRel of the added Gaussians against the context (`geometry.measure_alignment`)."""
     align_chamfer: float | None = None
-    """Chamfer distance between the two, as a share of the median depth at the target."""
+    """Their Chamfer distance as a share of the median depth at the target."""
     align_f_score: float | None = None
-    """F-score between the two."""
     registered_pixels: int | None = None
-    """Number of pixels of the target that the context covers and lifted Gaussians fall on, as they
-    were registered and before any were filtered: of the three below."""
+    """Number of covered target pixels with a registered Gaussian, for the next three."""
     registered_abs_rel: float | None = None
-    """AbsRel of all that was lifted against the context (`geometry.primitive_alignment`)."""
+    """AbsRel of all registered Gaussians against the context, before filtering."""
     registered_chamfer: float | None = None
-    """Chamfer distance between the two, as a share of the median depth at the target."""
+    """Their Chamfer distance as a share of the median depth at the target."""
     registered_f_score: float | None = None
-    """F-score between the two."""
     hole_looks: Looks | None = None
-    """At the target, in the hole, after completion."""
+    """At the target in the hole, after completion."""
     observed_looks: Looks | None = None
-    """Of all other pixels."""
+    """At the target over all other pixels."""
 
 
 @dataclass(frozen=True)
 class Drawings:
-    """What the target camera sees."""
+    """Renders at the target."""
 
     before: Render
     after: Render
     holes: Bool[Tensor, "h w"]
-    """True where the scene before has a hole."""
+    """True in holes of the scene before completion."""
 
 
 @torch.no_grad()
@@ -143,15 +138,9 @@ def score(
     renderer: Renderer,
     registered: Gaussians | None = None,
 ) -> tuple[Scores, Drawings]:
-    """All scores of a completion, and what the target camera sees of it.
+    """Score a completion, and return the renders at the target.
 
-    Args:
-        before: The scene before.
-        after: The scene after.
-        added: What stands in `after` beside `before`; None where that itself was changed.
-        truth: The photographs.
-        renderer: Draws all of them.
-        registered: All that was lifted, as it was registered; None where nothing was.
+    `added` is None if existing Gaussians were changed; `registered` has all lifted Gaussians.
     """
     target = truth.target
     was = renderer.render(before, target.camera)
@@ -190,7 +179,7 @@ def score(
 
 
 def alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
-    """Name the fields of `Scores` that an alignment fills, each after `name`."""
+    """Return the fields of `Scores` for an alignment, prefixed by `name`."""
     return {
         f"{name}_pixels": aligned.pixels,
         f"{name}_abs_rel": aligned.abs_rel,
@@ -200,10 +189,9 @@ def alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
 
 
 def quality(image: Float[Tensor, "h w 3"], photograph: View) -> Quality:
-    """PSNR, SSIM and, where the weights are at hand, LPIPS.
+    """Compute PSNR, SSIM and, if the weights are available, LPIPS.
 
-    What is to be ignored of the photograph does not count for PSNR, and counts as equal for the
-    others, which look at neighbourhoods.
+    Ignored pixels of the photograph do not count for PSNR and count as equal for the others.
     """
     truth, compared = photograph.image, photograph.compared(image)
     return Quality(
@@ -215,20 +203,20 @@ def quality(image: Float[Tensor, "h w 3"], photograph: View) -> Quality:
 
 
 def counted_psnr(image: Float[Tensor, "h w 3"], photograph: View) -> float:
-    """PSNR in dB over the pixels of the photograph that count; of none it is that of equality."""
+    """Compute PSNR in dB over valid pixels of the photograph; `MAX_PSNR` if there are none."""
     counted = masked_psnr(image, photograph.image, photograph.counted)
     return MAX_PSNR if counted is None else counted
 
 
 def counted_ssim(image: Float[Tensor, "h w 3"], photograph: View) -> float:
-    """SSIM, with what is to be ignored of the photograph taken for equal."""
+    """Compute SSIM, with ignored pixels of the photograph counted as equal."""
     return ssim(photograph.compared(image), photograph.image)
 
 
 def looks(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
 ) -> Looks:
-    """FLIP, HaarPSI and the ratio of gradient energies over the pixels of `where`."""
+    """Compute FLIP, HaarPSI and the gradient energy ratio over the pixels of `where`."""
     errors = flip_map(image, truth)
     return Looks(
         None if errors is None or not where.any() else errors[where.cpu()].mean().item(),
@@ -240,10 +228,7 @@ def looks(
 def rim_error(
     added: Gaussians, context: Render, target: Camera, renderer: Renderer
 ) -> float | None:
-    """Median of |D_added - D_context| / D_context where both cover the target.
-
-    None where fewer than `MIN_PIXELS` are covered by both.
-    """
+    """Compute the median of |D_added - D_context| / D_context; None for too few pixels."""
     alone = renderer.render(added, target).depth_map()
     both = alone.valid & context.depth_map().valid
     if both.sum() < MIN_PIXELS:
@@ -252,7 +237,7 @@ def rim_error(
 
 
 def mean_change(changes: Sequence[Change]) -> Change | None:
-    """Mean before and mean after; None of nothing."""
+    """Average the scores before and after; None for an empty sequence."""
     if not changes:
         return None
     n = len(changes)
@@ -270,7 +255,7 @@ def _masked_change(
 def _drawn(
     before: Gaussians, after: Gaussians, views: Sequence[View], renderer: Renderer
 ) -> list[tuple[Image, Image, View]]:
-    """The image of each view before and after, and its photograph."""
+    """Render each view before and after, and add its photograph."""
     return [
         (
             renderer.render(before, view.camera).image,

@@ -1,7 +1,4 @@
-"""Ψ: posed views -> Gaussians and a depth map per view.
-
-A reconstructor is anything callable with views. The table of names serves the command line.
-"""
+"""Ψ: posed views -> Gaussians and a depth map per view."""
 
 from __future__ import annotations
 
@@ -21,23 +18,23 @@ from gscompleter.weights.published import PUBLISHED
 
 @runtime_checkable
 class Reconstructor(Protocol):
-    """Ψ of the paper.
+    """Interface of Ψ (paper, Eq. 5 and 7).
 
-    The views' cameras carry `near` and `far` in scene units when `GSCompleter` calls it. The
-    Gaussians it returns lie in the world frame of the cameras and have its unit. All tensors it
-    returns lie on the device of the views' images.
+    The cameras carry `near` and `far` in scene units. The Gaussians have the frame and unit of the
+    cameras, and all tensors are on the device of the view images.
     """
 
-    def __call__(self, views: Sequence[View]) -> Reconstruction: ...
+    def __call__(self, views: Sequence[View]) -> Reconstruction:
+        """Reconstruct a scene from posed views."""
+        ...
 
 
 @runtime_checkable
 class Lifter(Protocol):
-    """A Ψ that spares itself what a completion does not keep."""
+    """Interface of a Ψ that can lift only some pixels of its first view."""
 
     def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
-        """As a call, but of the Gaussians only those of the pixels `wanted` of the first view, a
-        synthesized image."""
+        """Reconstruct `views`, with the Gaussians of `pixel_mask` in the first view only."""
 
 
 def reconstructed(
@@ -45,15 +42,9 @@ def reconstructed(
     views: Sequence[View],
     wanted: Bool[Tensor, "h w"] | None = None,
 ) -> Reconstruction:
-    """What Ψ makes of `views`, once all of it is seen to lie on the device of their images.
+    """Run Ψ on `views` and raise ValueError if its result is on another device.
 
-    Args:
-        reconstructor: Ψ.
-        views: Photographs, or a synthesized image and its anchor.
-        wanted: Pixels of the first view whose Gaussians are enough; a Ψ may give all of them.
-
-    Raises:
-        ValueError: where a tensor lies elsewhere; the sentence names it.
+    With `pixel_mask`, only these pixels of the first view need Gaussians; Ψ may return more.
     """
     if wanted is not None and isinstance(reconstructor, Lifter):
         found = reconstructor.lift(views, wanted)
@@ -63,14 +54,14 @@ def reconstructed(
     for name, tensor in tensors_in(found, "the reconstruction"):
         if tensor.device != device:
             raise ValueError(
-                f"the reconstructor returned {name} on {tensor.device}, and its views lie on "
+                f"the reconstructor returned {name} on {tensor.device}, and its views are on "
                 f"{device}; it must return all tensors on the device of the views' images"
             )
     return found
 
 
 def tensors_in(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
-    """All tensors that a frozen value holds, each with the expression that leads to it."""
+    """Yield every tensor inside nested dataclasses and tuples, with its attribute path."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, tuple):
@@ -85,7 +76,7 @@ def _plane_sweep(weights: Path | None, device: str) -> Reconstructor:
     from gscompleter.reconstructors.plane_sweep import PlaneSweep
 
     if weights is not None:
-        raise InputError(f"plane-sweep learned nothing and takes no weights; leave out {weights}.")
+        raise InputError(f"plane-sweep takes no weights; leave out {weights}.")
     return PlaneSweep()
 
 
@@ -99,12 +90,11 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
     "plane-sweep": _plane_sweep,
     **{name: partial(_feed_forward, name) for name, w in PUBLISHED.items() if w.is_reconstructor},
 }
-"""How each reconstructor is made, from the path of its weights (None takes the published ones) and
-the device that it runs on."""
+"""Builder of each reconstructor: (weights path or None for the default, device) -> Ψ."""
 
 
 def check_reconstructor(name: str) -> None:
-    """Raise InputError where there is no reconstructor of that name."""
+    """Raise InputError if no reconstructor has this name."""
     if name not in RECONSTRUCTORS:
         raise InputError(
             f"There is no reconstructor '{quoted(name)}'; choose one of "
@@ -115,17 +105,15 @@ def check_reconstructor(name: str) -> None:
 def load_reconstructor(
     name: str, weights: Path | str | None = None, device: str = "cpu"
 ) -> Reconstructor:
-    """The reconstructor called `name`.
+    """Load a reconstructor by name.
 
     Args:
-        name: One of RECONSTRUCTORS.
-        weights: The file of its weights; None takes the published ones, which are downloaded
-            where they are not on this machine.
-        device: Where a network runs. `plane-sweep` computes on the CPU, wherever its views lie.
+        name: A key of `RECONSTRUCTORS`.
+        weights: Path of the weights; None uses the published ones and downloads them if needed.
+        device: Device of the network. `plane-sweep` always runs on the CPU.
 
     Raises:
-        InputError: where there is none of that name, it takes no weights and some are given, or
-            they cannot be had or do not fit.
+        InputError: The name is unknown, or the weights are not needed, not available or do not fit.
     """
     check_reconstructor(name)
     return RECONSTRUCTORS[name](None if weights is None else Path(weights), device)

@@ -1,4 +1,4 @@
-"""A Ψ from any model of depth: splatted and fitted to the photographs as plane-sweep stereo is."""
+"""Ψ from any depth model: its depths become Gaussians, which are fitted to the photographs."""
 
 from __future__ import annotations
 
@@ -24,25 +24,21 @@ from gscompleter.types import DepthMap, Reconstruction, View
 
 @runtime_checkable
 class DepthModel(Protocol):
-    """Depths of posed photographs."""
+    """Interface of a model that predicts the depth of posed photographs."""
 
     def __call__(self, views: Sequence[View]) -> list[DepthMap]:
-        """z-depth of all pixels of `views`, in scene units; valid where the model tells it."""
+        """Predict the z-depth of each view, in scene units."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class FromDepth(Splatter):
-    """Depths of a model, splatted, and fitted to the photographs."""
+    """Reconstructor on top of a depth model."""
 
     model: DepthModel
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
-        """Gaussians of what `views` show, as `scene` tells, and the depths of all of their pixels.
-
-        Raises:
-            InputError: fewer than two views, no baseline between them, an empty depth range.
-        """
+        """Predict depths and build the scene; errors as in `PlaneSweep.__call__`."""
         views = ranged(views)
         images, unit = stereo_images(views)
         depths = self.model(views)
@@ -50,23 +46,19 @@ class FromDepth(Splatter):
         return self.scene(views, depths, layers, transforms_among(images))
 
     def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
-        """The Gaussians of the pixels `wanted` of the first view, a synthesized image.
-
-        Raises:
-            InputError: as a call.
-        """
+        """Lift the pixels of `pixel_mask` in the first view; errors as in `__call__`."""
         views = ranged(views)
         return self.wanted_of(views, self.model(views), wanted)
 
 
 def layer_of(image: StereoImage, depth: DepthMap, unit: float) -> Layer:
-    """What a model says of a view, per widest baseline of `unit` scene units."""
+    """Convert a predicted depth map to inverse depth per widest baseline (`unit`)."""
     inverse = (unit / depth.depth.detach().cpu().double()).float().numpy()
     sure = depth.valid.float() if depth.confidence is None else depth.confidence
     return Layer(image, inverse, np.ascontiguousarray(sure.detach().cpu().float().numpy()))
 
 
 def transforms_among(images: Sequence[StereoImage]) -> Transforms:
-    """From the pixels of each image to those of the others."""
+    """Compute the pixel transforms between all ordered pairs of images."""
     pairs = permutations(range(len(images)), 2)
     return {(i, j): source_from_reference(images[i], images[j]) for i, j in pairs}

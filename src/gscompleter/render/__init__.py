@@ -1,9 +1,9 @@
 """Renderers: colour, z-depth and alpha of Gaussians seen from a camera.
 
-All of them draw the 3DGS image formation of gsplat's classic mode: perspective EWA splatting with
-0.3 px² added to the 2D covariance, contributions under alpha 1/255 dropped, alpha capped at 0.999,
+All implement the 3DGS image formation of gsplat's classic mode: perspective EWA splatting with 0.3
+px² added to the 2D covariance, contributions under alpha 1/255 dropped, alpha capped at 0.999,
 compositing stopped when transmittance falls to 1e-4, colour over black. Antialiased Gaussians are
-drawn as in gsplat's antialiased mode: what that addition makes larger, it makes fainter.
+rendered as in gsplat's antialiased mode, which lowers opacities to compensate for that addition.
 """
 
 from __future__ import annotations
@@ -21,119 +21,114 @@ from gscompleter.kernels.sharing import many_at_once
 from gscompleter.types import Camera, Gaussians, Render
 
 OpacityRender = Callable[[Float[Tensor, "n"]], Render]
-"""Renders a frozen scene plus Gaussians of which only the opacities [n] may change."""
+"""Renders a frozen scene with Gaussians that vary in opacity [n] only."""
 
 OpacityImage = Callable[[Float[Tensor, "n"]], Float[Tensor, "h w 3"]]
-"""The image of it."""
+"""The image of an `OpacityRender`."""
 
 
 def image_of(plan: OpacityRender) -> OpacityImage:
-    """The image of what a plan renders."""
+    """Restrict an `OpacityRender` to its image."""
     return lambda opacities: plan(opacities).image
 
 
 DepthRender = Callable[[Float[Tensor, "n"]], Render]
-"""Renders a frozen scene plus Gaussians of which only the z-depths [n] may change."""
+"""Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
 
 
 LooksError = Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, ""]]
-"""How far an image is from what is wanted with these opacities and spherical harmonics of something
-in it; differentiable in both."""
+"""Squared error of an image at given opacities and harmonics; differentiable in both."""
 
 
 @runtime_checkable
 class AppearanceRender(Protocol):
-    """Draws a frozen scene plus Gaussians of which only the opacities [n] and the spherical
-    harmonics [n, k, 3] may change."""
+    """A frozen scene with Gaussians that vary in opacity and spherical harmonics only."""
 
     def __call__(
         self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
     ) -> Float[Tensor, "h w 3"]:
-        """The image; differentiable."""
+        """Render the image; differentiable."""
 
     def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
-        """The sum over the image of `weights`, from 0 up, times the squared differences from what
-        is `wanted`, of all channels."""
+        """Make an error function: sum of `weights` (>= 0) times squared errors of all channels."""
 
 
 def in_colours(plan: AppearanceRender, sh: Float[Tensor, "n k 3"]) -> OpacityImage:
-    """The image that a plan draws in these colours."""
+    """Fix the spherical harmonics of an `AppearanceRender`."""
     return lambda opacities: plan(opacities, sh)
 
 
 ColourSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
-"""Of each Gaussian, the sums over an image of its compositing weight times three layers, and of the
-weight itself."""
+"""Per Gaussian: compositing weight times an image [h, w, 3], and weight, summed over pixels."""
 
 
 ColourErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColourSums]
-"""Draws a frozen scene plus Gaussians of which only the colours [n, 3] may change, and sums what a
-photograph [h, w, 3] has more than the image."""
+"""Backprojects the residual of a photograph [h, w, 3], at given colours [n, 3]."""
 
 
 def each_view(drawn: Gaussians) -> Callable[..., Iterable[Any]]:
-    """`map`, for what is done to one view of `drawn` after the other: on a CPU several at a time,
-    which then need not wait for each other's threads."""
+    """Return a `map` over views of `scene`: on a CPU several at a time, elsewhere one by one."""
     return many_at_once if drawn.means.device.type == "cpu" else map
 
 
 @runtime_checkable
 class FrozenView(Protocol):
-    """A context scene that will not change, seen from a camera that will not move.
+    """A scene prepared for one camera: whatever depends on these two alone is computed once.
 
-    Whatever depends on these two alone is computed once, so that the optimisations, which
-    render the same context a hundred times, pay only for what they move.
+    Optimisations, which render the same context a hundred times, pay only for what they vary.
     """
 
     @property
     def context(self) -> Render:
-        """The context alone."""
+        """The render of the scene alone."""
 
     def extended(self, new: Gaussians) -> FrozenView:
-        """The view of context and `new`, in that order, both frozen."""
+        """Add `new` to the frozen scene, after its Gaussians."""
 
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
-        """For each Gaussian of the context, the sum over the image of each layer times the
-        Gaussian's compositing weight."""
+        """Sum `image` over the compositing weights of each Gaussian: Σ_p w_ip image_p."""
 
     def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
-        """The sum over the Gaussians of the context of compositing weight times value, from 0
-        up."""
+        """Splat a value >= 0 per Gaussian: Σ_i w_ip value_i."""
 
     def composite(self, new: Gaussians) -> Render:
-        """Context and `new` together; differentiable in `new`."""
+        """Render the scene with `new`; differentiable in `new`."""
 
     def plan(self, new: Gaussians) -> OpacityRender:
-        """Fix all of `new` but the opacities; the function it returns is differentiable."""
+        """Fix all of `new` but the opacities; the result is differentiable."""
 
     def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
-        """Fix all of `new` but the opacities and spherical harmonics, and draw it at least `where`
-        it is asked for; the function it returns is differentiable in both. It takes longer to make
-        than `plan`, and then draws faster."""
+        """Fix all of `new` but opacities and harmonics, and render it at least in the mask `where`.
+
+        Differentiable in both. Takes longer to make than `vary_opacities`, but renders faster.
+        """
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
-        """Fix all of `new` but its colours, which the camera sees as they are given, from 0 up."""
+        """Fix all of `new` but its colours, which the camera sees as given, from 0 up."""
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Fix all of `new` but how far along the rays of the camera it stands, and draw it at least
-        `where` it is asked for. Sizes follow, so that its image stays: what changes is which of two
-        is in front, and the depth, which is differentiable."""
+        """Fix all of `new` but its z-depths, and render it at least in the mask `where`.
+
+        Gaussians move along the camera's rays with constant footprint. The depth is differentiable.
+        """
 
 
 @runtime_checkable
 class Renderer(Protocol):
-    """Draws Gaussians; differentiable in means, quats, scales, opacities and sh."""
+    """Renders Gaussians; differentiable in means, quats, scales, opacities and sh."""
 
-    def render(self, gaussians: Gaussians, camera: Camera) -> Render: ...
+    def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render `gaussians` from `camera`."""
 
-    def freeze(self, context: Gaussians, camera: Camera) -> FrozenView: ...
+    def freeze(self, context: Gaussians, camera: Camera) -> FrozenView:
+        """Prepare `context` for many renders from `camera`."""
 
 
 def load_renderer(name: str) -> Renderer:
-    """The renderer called `name`: reference, cpu or cuda.
+    """Load the renderer called `name`: reference, cpu or cuda.
 
     Raises:
-        InputError: where the name is unknown, or `cuda` lacks a GPU or gsplat.
+        InputError: The name is unknown, or `cuda` lacks a GPU or gsplat.
     """
     if name == "cpu":
         from gscompleter.render.cpu import CpuRenderer
@@ -151,10 +146,10 @@ def load_renderer(name: str) -> Renderer:
 
 
 def choose_device(device: Literal["auto", "cpu", "cuda"] = "auto") -> Literal["cpu", "cuda"]:
-    """The device to run on: `auto` takes a GPU where torch sees one and gsplat is installed.
+    """Choose the device; `auto` uses a GPU if torch finds one and gsplat is installed.
 
     Raises:
-        InputError: where `cuda` is asked for and there is none.
+        InputError: The device is `cuda`, but there is no GPU or no gsplat.
     """
     has_gpu = torch.cuda.is_available()
     has_gsplat = importlib.util.find_spec("gsplat") is not None

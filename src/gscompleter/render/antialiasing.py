@@ -1,4 +1,4 @@
-"""Gaussians that were made for classic rendering, in a scene that is rendered antialiased."""
+"""Gaussians made for classic rendering, in a scene that is rendered antialiased."""
 
 from __future__ import annotations
 
@@ -13,16 +13,11 @@ from gscompleter.types import Camera, Gaussians
 
 
 def in_mode_of(scene: Gaussians, made: Gaussians, camera: Camera) -> Gaussians:
-    """Adapt new Gaussians to the mode that `scene` is rendered in.
+    """Adapt Gaussians made for the pixels of `camera` to the rendering mode of `scene`.
 
-    Classic rendering widens every splat by the low-pass and keeps its opacity. Antialiased
-    rendering does not keep it, and opacities end at 1, so that the low-pass at `camera` becomes
-    part of the Gaussians' own size: there they cover as much in total as they did.
-
-    Args:
-        scene: What they are added to.
-        made: Gaussians for the pixels of `camera`, before it.
-        camera: The camera that they were made for.
+    Classic rendering widens each splat by the low-pass and keeps its opacity; antialiased rendering
+    lowers it. So the low-pass becomes part of the Gaussians' own size, with the same total
+    coverage.
     """
     if made.is_antialiased or not scene.is_antialiased:
         return made

@@ -1,4 +1,4 @@
-"""Draws on CPUs through compiled kernels, fast enough to optimise with."""
+"""A renderer for CPUs on compiled kernels, fast enough to optimise with."""
 
 from __future__ import annotations
 
@@ -26,28 +26,29 @@ from gscompleter.render.folded import Folded, float32, folded
 from gscompleter.types import Camera, Gaussians, Render
 
 MAX_SIDE = TILE * np.iinfo(np.int16).max
-"""Pixels of an image's side, whose tiles the kernels number in 16 bits."""
+"""Largest side of an image in pixels, since kernels number tiles in 16 bits."""
 
 MAX_ENTRIES = np.iinfo(np.int32).max
-"""Of the tiles' lists together, which the kernels number in 32 bits."""
+"""Largest total length of the tiles' lists, which kernels number in 32 bits."""
 
 
 NEARLY_ALL = 0.9
-"""Share of splats in use from which on the others may stay: to copy the rest takes longer."""
+"""Share of splats in use from which a layer is kept whole, since copying takes longer."""
 
 
 @dataclass(frozen=True)
 class CpuRenderer:
-    """Draws in float32; other dtypes are converted. The same input gives the same bytes."""
+    """Renders in float32, converting other types. The same input gives the same bytes."""
 
     threads: int | None = None
-    """Threads to draw with; None takes NUMBA_NUM_THREADS, which is the number of usable cores
-    where it is not set. The result does not depend on it."""
+    """Number of threads, or None for NUMBA_NUM_THREADS; does not affect the result."""
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render `gaussians` from `camera`."""
         return self._empty(camera).composite(gaussians)
 
     def freeze(self, context: Gaussians, camera: Camera) -> CpuView:
+        """Prepare `context` for many renders from `camera`."""
         return self._empty(camera).extended(context)
 
     def _empty(self, camera: Camera) -> CpuView:
@@ -57,10 +58,10 @@ class CpuRenderer:
 
 @dataclass(frozen=True)
 class CpuView:
-    """The frozen context: projected, sorted, binned, and cut where nothing shows through it.
+    """The frozen context: projected, sorted, binned, and cut behind opaque surfaces.
 
-    Only splats that some tile draws are kept. With something new in it, only the tiles that this
-    touches are drawn; the others are those of the context's own frame.
+    It keeps only splats that some tile shows. New Gaussians are composited only in tiles they
+    touch.
     """
 
     viewpoint: Viewpoint
@@ -68,19 +69,19 @@ class CpuView:
     frame: Frame
     """The context alone."""
     depth_limits: Float32[ndarray, "tiles"]
-    """z-depth behind which a tile shows nothing new."""
+    """z-depth behind which a tile shows nothing."""
     rows: Int32[ndarray, "splats"]
-    """Which Gaussian of the context each splat is."""
+    """Index of the Gaussian of each splat."""
     count: int
-    """How many Gaussians the context has."""
+    """Number of Gaussians of the context."""
 
     @cached_property
     def context(self) -> Render:
-        """The context alone."""
+        """The render of the context alone."""
         return render_of(self.frame)
 
     def extended(self, new: Gaussians) -> CpuView:
-        """The same as freezing context and `new` together, in that order."""
+        """Freeze context and `new` together, in that order."""
         splats = self.viewpoint.project(arrays_of(new), new.is_antialiased)
         added, order = by_use(self.viewpoint.enter(splats, self.depth_limits))
         count = self.count + len(new)
@@ -101,28 +102,28 @@ class CpuView:
         return CpuView(self.viewpoint, layer, frame, depth_limits, rows, count)
 
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
-        """By the backward pass alone: the frame that is kept tells what every pixel let through."""
+        """Backproject `image` by the backward pass on the frozen frame."""
         nothing, itself = self.viewpoint.empty().layer, by_itself(self.layer)
         frame = self.frame._replace(used=np.ascontiguousarray(self.frame.used[:, ::-1]))
-        slopes = (layers, torch.zeros_like(layers[..., 0]), torch.zeros_like(layers[..., 0]))
-        drawn = (nothing, itself, frame, slopes, rasterizer.OF_COLOUR)
-        gradients = self.viewpoint.composite_backward(*drawn)
+        d_frame = (layers, torch.zeros_like(layers[..., 0]), torch.zeros_like(layers[..., 0]))
+        composited = (nothing, itself, frame, d_frame, rasterizer.OF_COLOUR)
+        gradients = self.viewpoint.composite_backward(*composited)
         totals = np.zeros((self.count, 3), np.float32)
         named = (self.layer.entries, self.rows, *gradients, totals)
-        pieces = ranges(len(self.rows), self.viewpoint.threads)  # Each looks at all entries.
+        pieces = ranges(len(self.rows), self.viewpoint.threads)  # Each reads all entries.
         calls = [(*piece, *named) for piece in pieces]
         run(lists.sum_by_name, calls, self.viewpoint.threads)
         return torch.from_numpy(totals)
 
     def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
-        """The lists that are kept, drawn once more with the values for red."""
+        """Composite the frozen lists once more, with the values as red."""
         splats = self.layer.splats.copy()
         splats[:, rasterizer.RED] = np.maximum(float32(values)[self.rows], 0)
         frame = self.viewpoint.composite(self.viewpoint.empty(), self.layer._replace(splats=splats))
         return torch.from_numpy(frame.image[..., 0].copy())
 
     def composite(self, new: Gaussians) -> Render:
-        """Context and `new` together; only `new` is projected, sorted and binned."""
+        """Render context and `new`; only `new` is projected, sorted and binned."""
         tensors = (getattr(new, name).to("cpu", torch.float32) for name in GaussianArrays._fields)
         return Render(*_Composite.apply(self, new.is_antialiased, *tensors))
 
@@ -136,7 +137,7 @@ class CpuView:
         return render
 
     def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> Folded:
-        """Project, sort and bin `new` once, and fold what is frozen around it."""
+        """Project, sort and bin `new` once, and bake the context around it."""
         arrays = opaque(new)
         limits = np.minimum(self.viewpoint.limits_within(where), self.depth_limits)
         binned = self.viewpoint.bin(arrays, new.is_antialiased, limits)
@@ -146,20 +147,20 @@ class CpuView:
         """Project, sort and bin `new` once."""
         binned = self.viewpoint.bin(arrays_of(new), new.is_antialiased, self.depth_limits)
 
-        def errors(colours: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColourSums:
-            binned.layer.splats[:, rasterizer.RED :] = np.maximum(float32(colours), 0)
+        def errors(colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColourSums:
+            binned.layer.splats[:, rasterizer.RED :] = np.maximum(float32(colors), 0)
             sums = self.viewpoint.missed_colours(self.layer, binned, float32(photograph))
             return torch.from_numpy(sums[:, :3]), torch.from_numpy(sums[:, 3])
 
         return errors
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Project `new` once, as far as it touches a tile that is asked for."""
+        """Project `new` once, as far as it touches tiles of the mask."""
         splats = self.viewpoint.project(arrays_of(new), new.is_antialiased)
         anywhere = self.viewpoint.limits_within(where)
-        asked = np.zeros(len(splats.boxes), np.bool_)
-        asked[self.viewpoint.enter(splats, anywhere).entries] = True
-        splats = splats.only(asked)
+        touched_splats = np.zeros(len(splats.boxes), np.bool_)
+        touched_splats[self.viewpoint.enter(splats, anywhere).entries] = True
+        splats = splats.only(touched_splats)
         limits = np.minimum(anywhere, self.depth_limits)
 
         def render(depths: Float[Tensor, "n"]) -> Render:
@@ -176,60 +177,62 @@ class Splats:
     opacities: Float32[ndarray, "n"]
     boxes: Integer[ndarray, "n 4"]
     factors: Float32[ndarray, "n"] | None = None
-    """Factors that opacities of antialiased Gaussians were multiplied by; None for others."""
+    """Factors on the opacities of antialiased Gaussians, or None for classic ones."""
 
     def at_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
-        """The same at other z-depths; what comes nearer than `near` gets an empty box."""
+        """Move the splats to other z-depths; those not beyond `near` get empty boxes."""
         columns = self.columns.copy()
         columns[:, rasterizer.DEPTH] = depths
         return replace(self, columns=columns).only(depths > near)
 
     def only(self, which: Bool[ndarray, "n"]) -> Splats:
-        """The same, where all others get an empty box."""
+        """Empty the boxes of all other splats."""
         return replace(self, boxes=self.boxes * which[:, None])
 
 
 @dataclass(frozen=True)
 class Binned:
-    """Splats in the lists of the tiles they touch, and the way back to their Gaussians."""
+    """Splats in the lists of the tiles, with the slots of their gradients."""
 
     layer: Layer
     slots: Int32[ndarray, "entries"]
-    """Where the gradient of each entry of the lists goes."""
+    """Slot of the gradient of each entry."""
     slot_start: Int64[ndarray, "bounds"]
-    """Where the gradients of each Gaussian start, and the end [n + 1]."""
+    """First slot of each Gaussian, and the end [n + 1]."""
 
 
 SplatArrays = tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]
 """Splats, their opacities and their boxes, see `Layer`."""
 
 EntryGradients = tuple[Float32[ndarray, "entries columns"], Bool[ndarray, "entries"]]
-"""Gradients of the entries of the tiles' lists, by slot, and which of them hold something."""
+"""Gradients of the tiles' entries by slot, and True for slots that were written."""
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera and the threads that draw for it: calls the kernels in their order."""
+    """A camera and its rendering threads; calls the kernels in order."""
 
     pinhole: Pinhole
     threads: int
 
     @property
     def tiles_x(self) -> int:
+        """Number of tiles in a row."""
         return -(-self.pinhole.width // TILE)
 
     @property
     def tiles(self) -> int:
+        """Number of tiles of the image."""
         return self.tiles_x * -(-self.pinhole.height // TILE)
 
     @property
     def box_type(self) -> type[np.signedinteger]:
-        """What numbers pixels: the smaller, the less is kept of a view."""
+        """Smallest type that holds pixel coordinates, to save memory."""
         fits = max(self.pinhole.width, self.pinhole.height) <= np.iinfo(np.int16).max
         return np.int16 if fits else np.int32
 
     def empty(self) -> CpuView:
-        """The view of a context without Gaussians."""
+        """Freeze a context without Gaussians."""
         height, width = self.pinhole.height, self.pinhole.width
         frame = Frame(
             image=np.zeros((height, width, 3), np.float32),
@@ -256,12 +259,11 @@ class Viewpoint:
         is_antialiased: bool,
         depth_limits: Float32[ndarray, "tiles"],
     ) -> Binned:
-        """Project the Gaussians, sort them and enter them into the lists of the tiles."""
+        """Project, sort and enter Gaussians into the lists of the tiles."""
         return by_splat(self.enter(self.project(gaussians, is_antialiased), depth_limits))
 
     def project(self, gaussians: GaussianArrays, is_antialiased: bool) -> Splats:
-        """The Gaussians as splats with the opacities that they have here; those that cannot be seen
-        get an empty box."""
+        """Project Gaussians to splats; invisible ones get empty boxes."""
         n = length_of(gaussians)
         columns = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
         boxes = np.empty((n, 4), self.box_type)
@@ -271,7 +273,7 @@ class Viewpoint:
         return Splats(columns, opacities, boxes, factors)
 
     def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Layer:
-        """Enter the splats into the lists of the tiles, and sort these."""
+        """Enter splats into the lists of the tiles, and sort these."""
         chunks = ranges(len(splats.columns), self.threads)
         counts = np.zeros((len(chunks), self.tiles), np.int32)
         seen = (splats.columns, splats.boxes, depth_limits, self.tiles_x)
@@ -281,8 +283,8 @@ class Viewpoint:
         if total > MAX_ENTRIES:
             raise InputError(
                 f"The {len(splats.columns):,} Gaussians cover {total:,} tiles of the image, and at "
-                f"most {MAX_ENTRIES:,} can be drawn; take fewer or smaller ones, or a smaller "
-                "image."
+                f"most {MAX_ENTRIES:,} can be rendered; use fewer or smaller Gaussians, or a "
+                "smaller image."
             )
         tile_start = lists.places_of(counts)
         entries, keys = np.empty(total, np.int32), np.empty(total, np.uint32)
@@ -295,7 +297,7 @@ class Viewpoint:
         return Layer(splats.columns, splats.opacities, splats.boxes, tile_start, entries)
 
     def composite(self, view: CpuView, new: Layer) -> Frame:
-        """Draw the context of `view` and a new layer merged by depth, where this has anything."""
+        """Composite the context of `scene` with a new layer, in the tiles that this touches."""
         frame = Frame(*(array.copy() for array in view.frame))
         tiles = touched(new)
         self.share(rasterizer.composite, len(tiles), tiles, view.layer, new, frame)
@@ -309,47 +311,45 @@ class Viewpoint:
         slopes: tuple[Tensor, ...],
         wanted: int = rasterizer.OF_ALL,
     ) -> EntryGradients:
-        """Gradients of the entries of the new layer from those of image, depth and alpha."""
+        """Compute the gradients of new entries from those of image, depth and alpha."""
         columns = {rasterizer.OF_ALL: rasterizer.NUM_GRADIENT_COLUMNS, rasterizer.OF_COLOUR: 3}
         values = np.empty((len(new.slots), columns.get(wanted, 1)), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
         tiles = touched(new.layer)
-        drawn = (tiles, context, new.layer, frame, tuple(map(float32, slopes)))
+        composited = (tiles, context, new.layer, frame, tuple(map(float32, slopes)))
         received = (new.slots, wanted, values, written)
-        self.share(rasterizer.composite_backward, len(tiles), *drawn, *received)
+        self.share(rasterizer.composite_backward, len(tiles), *composited, *received)
         return values, written
 
     def missed_colours(
         self, context: Layer, new: Binned, photograph: Float32[ndarray, "h w 3"]
     ) -> Float32[ndarray, "n 4"]:
-        """For each Gaussian of the new layer, the sums over the image of its compositing weight
-        times what the photograph has more in each colour, and of its weight."""
+        """Backproject the residual of a photograph; the fourth column sums the weights."""
         values = np.empty((len(new.slots), 4), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
         tiles = touched(new.layer)
-        drawn = (tiles, context, new.layer, photograph, new.slots, values, written)
-        self.share(rasterizer.missed_colours, len(tiles), *drawn)
+        composited = (tiles, context, new.layer, photograph, new.slots, values, written)
+        self.share(rasterizer.missed_colours, len(tiles), *composited)
         return self.sums(new, (values, written))
 
     def sums(self, new: Binned, gradients: EntryGradients) -> Float32[ndarray, "n columns"]:
-        """For each Gaussian, the sums of the gradients of its entries."""
+        """Sum the gradients of the entries of each Gaussian."""
         totals = np.empty((len(new.slot_start) - 1, gradients[0].shape[1]), np.float32)
         self.share(lists.sum_entries, len(totals), new.slot_start, *gradients, totals)
         return totals
 
     def limits_within(self, where: Bool[Tensor, "h w"]) -> Float32[ndarray, "tiles"]:
-        """Depth limits that let everything into the tiles that hold any pixel of a mask, and
-        nothing into the others."""
+        """Make depth limits that exclude all tiles outside a mask."""
         tiles = max_pool2d(where[None].float(), TILE, ceil_mode=True).flatten() > 0
         return np.where(tiles.cpu().numpy(), np.float32(np.inf), np.float32(-np.inf))
 
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
-        """Run `kernel(begin, end, *arguments)` over range(count), a piece at a time."""
+        """Run `kernel(begin, end, *arguments)` over range(count) on the threads."""
         share(kernel, count, *arguments, threads=self.threads)
 
 
 class _Composite(torch.autograd.Function):
-    """Image, depth and alpha of a frozen context with new Gaussians in it."""
+    """Image, depth and alpha of a frozen context with new Gaussians."""
 
     @staticmethod
     def forward(
@@ -361,30 +361,30 @@ class _Composite(torch.autograd.Function):
         frame = view.viewpoint.composite(view, binned.layer)
         render = render_of(frame)
         ctx.scene = (view, splats.factors, binned, frame)
-        # Saving tensors makes torch notice if one of them is written to before the backward pass.
+        # Torch raises an error if a saved tensor is written to before the backward pass.
         ctx.save_for_backward(*tensors, render.depth, render.alpha)
         return render.image, render.depth, render.alpha
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, factors, binned, frame = ctx.scene
         gaussians = GaussianArrays(*map(float32, ctx.saved_tensors[:5]))
-        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, slopes)
+        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
         result = GaussianArrays(*map(np.zeros_like, gaussians))
         seen = (gaussians, view.viewpoint.pinhole, factors)
-        drawn = (*seen, binned.layer.splats, binned.slot_start)
+        composited = (*seen, binned.layer.splats, binned.slot_start)
         n = len(gaussians.means)
-        view.viewpoint.share(rasterizer.project_backward, n, *drawn, *gradients, result)
+        view.viewpoint.share(rasterizer.project_backward, n, *composited, *gradients, result)
         return None, None, *map(torch.from_numpy, result)
 
 
 class _Planned(torch.autograd.Function):
-    """The same where only opacities change: nothing is projected, sorted or binned."""
+    """Image, depth and alpha for varying opacities: nothing is projected, sorted or binned."""
 
     @staticmethod
     def forward(ctx: Any, view: CpuView, binned: Binned, opacities: Tensor) -> tuple[Tensor, ...]:
-        seen = float32(opacities) * binned.layer.opacities  # those of opaque ones, here
+        seen = float32(opacities) * binned.layer.opacities  # those of opaque Gaussians
         layer = binned.layer._replace(opacities=seen)
         frame = view.viewpoint.composite(view, layer)
         render = render_of(frame)
@@ -394,18 +394,18 @@ class _Planned(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
         opacities = float32(ctx.saved_tensors[0])
-        drawn = (view.layer, binned, frame, slopes)
-        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_OPACITY)
+        composited = (view.layer, binned, frame, d_frame)
+        gradients = view.viewpoint.composite_backward(*composited, rasterizer.OF_OPACITY)
         sums = view.viewpoint.sums(binned, gradients)[:, 0]
         result = np.divide(sums, opacities, out=np.zeros_like(sums), where=sums != 0)
         return None, None, torch.from_numpy(result)
 
 
 class _Slid(torch.autograd.Function):
-    """The same where only depths along the rays change: nothing is projected."""
+    """Image, depth and alpha for varying depths: nothing is projected."""
 
     @staticmethod
     def forward(
@@ -422,23 +422,23 @@ class _Slid(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
-        drawn = (view.layer, binned, frame, slopes)
-        gradients = view.viewpoint.composite_backward(*drawn, rasterizer.OF_DEPTH)
+        composited = (view.layer, binned, frame, d_frame)
+        gradients = view.viewpoint.composite_backward(*composited, rasterizer.OF_DEPTH)
         return None, None, None, torch.from_numpy(view.viewpoint.sums(binned, gradients)[:, 0])
 
 
 def pinhole_of(camera: Camera) -> Pinhole:
-    """The camera as the kernels want it.
+    """Convert a camera for the kernels.
 
     Raises:
-        InputError: where its image is larger than the kernels can number.
+        InputError: The image is empty or larger than the kernels can number.
     """
     if not 0 < min(camera.width, camera.height) <= max(camera.width, camera.height) <= MAX_SIDE:
         raise InputError(
-            f"An image of {camera.width} x {camera.height} pixels cannot be drawn; its sides must "
-            f"have 1 to {MAX_SIDE:,} pixels."
+            f"An image of {camera.width} x {camera.height} pixels cannot be rendered; its sides "
+            f"must have 1 to {MAX_SIDE:,} pixels."
         )
     K = camera.K.detach().to("cpu", torch.float64)
     c2w = camera.c2w.detach().to("cpu", torch.float64)
@@ -453,19 +453,17 @@ def pinhole_of(camera: Camera) -> Pinhole:
 
 
 def touched(layer: Layer) -> Int64[ndarray, "touched"]:
-    """The tiles in which a layer has anything to draw."""
+    """Find the tiles in which a layer has entries."""
     return np.flatnonzero(np.diff(layer.tile_start))
 
 
 def starts_of(sizes: Integer[ndarray, "tiles"]) -> Int64[ndarray, "bounds"]:
-    """Where lists of these sizes start, one after the other, and the end."""
+    """Compute the starts of consecutive lists of these sizes, and the end."""
     return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)])
 
 
 def by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
-    """The layer with its splats in the order in which the tiles name them, those alone, and which
-    they are: a tile then finds its splats near each other in memory, which saves it half of its
-    time where there are a million."""
+    """Reorder splats by first use and drop unused ones, for locality; also return their order."""
     order, entries = lists.number_by_use(layer.entries, len(layer.splats))
     return Layer(*chosen([layer], [order]), layer.tile_start, entries), order
 
@@ -476,10 +474,10 @@ def joined(
     tile_start: Int64[ndarray, "bounds"],
     entries: Int32[ndarray, "entries"],
 ) -> tuple[Layer, list[Int32[ndarray, "_"]]]:
-    """Both layers as one: of their splats those that `entries` names, numbering those of `new`
-    after those of the context. Also which splats of each layer those are.
+    """Join two layers to one with only the splats that `entries` names.
 
-    The new ones stay as they are where they are alone and nearly all of them are named.
+    Entries number the splats of `new` after those of the context. Also returns the rows used of
+    each layer. New splats that are alone and nearly all used stay as they are.
     """
     counts = len(context.splats), len(new.splats)
     named = np.zeros(sum(counts), np.bool_)
@@ -495,18 +493,18 @@ def joined(
 
 
 def by_itself(layer: Layer) -> Binned:
-    """A layer whose entries keep their gradients apart: each in its own slot."""
+    """Give each entry of a layer its own slot."""
     slots = np.arange(len(layer.entries), dtype=np.int32)
     return Binned(layer, slots, np.zeros(1, np.int64))
 
 
 def by_splat(layer: Layer) -> Binned:
-    """A layer whose entries keep the gradients of a splat together."""
+    """Give the entries of each splat adjacent slots."""
     return Binned(layer, *lists.number_slots(layer.entries, len(layer.splats)))
 
 
 def chosen(layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]) -> SplatArrays:
-    """Splats, opacities and boxes of these rows of each of the layers, one after the other."""
+    """Gather the splats, opacities and boxes of these rows of each layer."""
     bounds = [0, *accumulate(map(len, rows))]
     taken = (
         np.empty((bounds[-1], rasterizer.NUM_SPLAT_COLUMNS), np.float32),
@@ -520,7 +518,7 @@ def chosen(layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]) -> Spla
 
 
 def length_of(gaussians: GaussianArrays) -> int:
-    """How many there are, once every array is seen to hold that many: kernels do not look."""
+    """Return the number of Gaussians; raise ValueError if the arrays differ in length."""
     lengths = {len(array) for array in gaussians}
     if len(lengths) > 1:
         raise ValueError(f"the fields of Gaussians have different lengths: {sorted(lengths)}")
@@ -528,16 +526,16 @@ def length_of(gaussians: GaussianArrays) -> int:
 
 
 def arrays_of(gaussians: Gaussians) -> GaussianArrays:
-    """The Gaussians as the kernels want them, without gradients."""
+    """Convert Gaussians for the kernels, without gradients."""
     return GaussianArrays(*(float32(getattr(gaussians, name)) for name in GaussianArrays._fields))
 
 
 def opaque(gaussians: Gaussians) -> GaussianArrays:
-    """The same at opacity 1, with which they touch all that they can touch with less."""
+    """Convert Gaussians at opacity 1, which makes their boxes hold for every opacity."""
     arrays = arrays_of(gaussians)
     return arrays._replace(opacities=np.ones_like(arrays.opacities))
 
 
 def render_of(frame: Frame) -> Render:
-    """The frame as tensors, which share its memory."""
+    """Convert a frame to tensors that share its memory."""
     return Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))

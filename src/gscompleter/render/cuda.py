@@ -1,4 +1,4 @@
-"""Draws on a GPU through gsplat >= 1.5.
+"""A renderer for GPUs through gsplat >= 1.5.
 
 Not verified: this file was written without a GPU at hand and has never been run. Its tests carry
 the marker `gpu` and compare it with the reference renderer; `make gpu` runs them.
@@ -31,21 +31,21 @@ from gscompleter.types import Camera, Gaussians, Render, merge
 
 @runtime_checkable
 class Drawing(Renderer, Protocol):
-    """What a frozen view asks of a renderer."""
+    """A renderer as a `CudaFrozenScene` needs it."""
 
     def visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
-        """Which of the Gaussians can reach the image, whatever stands before them."""
+        """Return True for Gaussians that reach the image, ignoring occlusion."""
 
     def plan(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
-        """Renders `gaussians` with opacities [n] that are no larger than their own."""
+        """Prepare renders with opacities [n] that are no larger than their own."""
 
 
 @dataclass(frozen=True)
 class CudaRenderer:
-    """Draws where the Gaussians lie, which must be a CUDA device.
+    """Renders on the device of the Gaussians, which must be a CUDA device.
 
     Raises:
-        InputError: where torch sees no GPU, or gsplat is not installed.
+        InputError: Torch finds no GPU, or gsplat is not installed.
     """
 
     def __post_init__(self) -> None:
@@ -55,43 +55,44 @@ class CudaRenderer:
             import gsplat  # noqa: F401
         except ImportError as error:
             raise InputError(
-                "The cuda renderer draws through gsplat, which is not installed; "
+                "The cuda renderer needs gsplat, which is not installed; "
                 "run `pip install gscompleter[cuda]`."
             ) from error
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render `gaussians` from `camera`."""
         if len(gaussians) == 0:
             empty = torch.zeros(camera.height, camera.width, device=gaussians.means.device)
             return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
-        colour_and_depth, alpha, _ = self.rasterized(gaussians, camera)
-        return Render(colour_and_depth[0, ..., :3], colour_and_depth[0, ..., 3], alpha[0, ..., 0])
+        color_and_depth, alpha, _ = self.rasterized(gaussians, camera)
+        return Render(color_and_depth[0, ..., :3], color_and_depth[0, ..., 3], alpha[0, ..., 0])
 
     def freeze(self, context: Gaussians, camera: Camera) -> CudaView:
+        """Prepare `context` for many renders from `camera`."""
         return frozen_by(self, context, camera)
 
     @torch.no_grad()
     def visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
-        """Those whose box touches the image; gsplat gives the others no radius and skips them."""
+        """Return True for Gaussians whose box touches the image: gsplat gives them a radius."""
         if len(gaussians) == 0:
             return torch.zeros_like(gaussians.generated, dtype=torch.bool)
         radii = self.rasterized(gaussians, camera)[2]["radii"]
         return (radii.reshape(len(gaussians), -1) > 0).all(dim=1)
 
     def plan(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
-        """Project, sort and bin once. The box of a fainter Gaussian lies within its own.
+        """Project, sort and bin once.
 
-        A fainter one draws the same in the larger box: what alpha 1/255 drops there is what the
-        smaller box leaves out.
+        Fainter Gaussians render the same in the larger box, where alpha 1/255 drops the rest.
         """
         from gsplat import rasterize_to_pixels
 
         with torch.no_grad():
             _, _, seen = self.rasterized(gaussians, camera)
-            given, drawn = gaussians.opacities, seen["opacities"].reshape(-1)
-            factors = torch.where(given > 0, drawn / given, 0.0)  # 1 for all but antialiased ones
+            given, rendered = gaussians.opacities, seen["opacities"].reshape(-1)
+            factors = torch.where(given > 0, rendered / given, 0.0)  # 1 unless antialiased
             center = camera.center.to(gaussians.means.device)
-            colours = colours_from(gaussians.sh, gaussians.means, center)
-            values = torch.cat([colours[None], seen["depths"][..., None]], dim=-1)
+            colors = colours_from(gaussians.sh, gaussians.means, center)
+            values = torch.cat([colors[None], seen["depths"][..., None]], dim=-1)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
             sums, alphas = rasterize_to_pixels(
@@ -113,11 +114,11 @@ class CudaRenderer:
     def rasterized(
         self, gaussians: Gaussians, camera: Camera
     ) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"], dict[str, Any]]:
-        """Colour and depth, alpha, and what gsplat found on the way there, of at least one."""
+        """Rasterize at least one Gaussian: colour and depth, alpha, and gsplat's metadata."""
         from gsplat import rasterization
 
         camera = camera.to(gaussians.means.device)
-        colour_and_depth, alpha, found = rasterization(
+        color_and_depth, alpha, found = rasterization(
             means=gaussians.means,
             quats=gaussians.quats,
             scales=gaussians.scales,
@@ -134,93 +135,92 @@ class CudaRenderer:
             render_mode="RGB+ED",  # the depth is already divided by alpha
             rasterize_mode="antialiased" if gaussians.is_antialiased else "classic",
         )
-        return colour_and_depth, alpha, found
+        return color_and_depth, alpha, found
 
 
 @dataclass(frozen=True)
 class CudaView:
-    """A frozen view that carries on only what its camera sees of the context.
+    """A frozen scene that keeps only Gaussians visible to its camera.
 
-    Each composite still projects and sorts what is left: new Gaussians may stand before the
-    context or within it, so that no part of its picture can be kept.
+    Each composite still projects and sorts all of them, since new ones may lie anywhere in between.
     """
 
     drawing: Drawing
     scene: Gaussians
     camera: Camera
     rows: Int64[Tensor, "m"]
-    """Which Gaussian of the context each of `scene` is."""
+    """Index in the context of each Gaussian of `scene`."""
     count: int
-    """How many Gaussians the context has."""
+    """Number of Gaussians of the context."""
 
     @cached_property
     def context(self) -> Render:
-        """The context alone."""
+        """The render of the context alone."""
         with torch.no_grad():
             return self.drawing.render(self.scene, self.camera)
 
     @cached_property
     def reaching(self) -> Int64[Tensor, "seen"]:
-        """Which of `scene` reach the image."""
+        """Indices in `scene` of the Gaussians that reach the image."""
         return self.drawing.visible(self.scene, self.camera).nonzero()[:, 0]
 
     @cached_property
     def seen(self) -> Gaussians:
-        """What of the context reaches the image, in the colours that this camera sees."""
+        """The visible Gaussians, with their colours as this camera sees them."""
         kept = self.scene[self.reaching]
         center = self.camera.center.to(kept.means.device)
-        colours = colours_from(kept.sh, kept.means, center)
-        return painted(kept, colours)
+        colors = colours_from(kept.sh, kept.means, center)
+        return painted(kept, colors)
 
     def extended(self, new: Gaussians) -> CudaView:
-        """The view of what is seen of the context, and of `new`."""
+        """Add `new` to the visible Gaussians."""
         numbers = self.count + torch.arange(len(new), device=self.rows.device)
         rows = torch.cat([self.rows[self.reaching], numbers])
         count = self.count + len(new)
         return replace(self, scene=merge([self.seen, new]), rows=rows, count=count)
 
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
-        """By the slopes of what is seen."""
+        """Backproject `image` by autograd."""
         sums = layers.new_zeros((self.count, 3))
         return sums.index_copy(
             0, self.rows[self.reaching], sums_by_slopes(self._painted, self.seen, layers)
         )
 
     def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
-        """What is seen, drawn once more."""
+        """Render the visible Gaussians with the values as grey."""
         return self._painted(grey(values[self.rows[self.reaching]]))[..., 0]
 
     def _painted(self, colours: Float[Tensor, "seen 3"]) -> Float[Tensor, "h w 3"]:
         return self.drawing.render(painted(self.seen, colours), self.camera).image
 
     def composite(self, new: Gaussians) -> Render:
-        """Context and `new` together."""
+        """Render context and `new`."""
         return self.drawing.render(merge([self.seen, new]), self.camera)
 
     def plan(self, new: Gaussians) -> OpacityRender:
-        """Context and `new` with other opacities, in boxes that hold for every opacity."""
+        """Fix all of `new` but the opacities, with boxes that hold for every opacity."""
         opaque = replace(new, opacities=torch.ones_like(new.opacities))
         render = self.drawing.plan(merge([self.seen, opaque]), self.camera)
         return lambda opacities: render(torch.cat([self.seen.opacities, opacities]))
 
     def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
-        """Context and `new` with other looks, all of it drawn anew."""
+        """Fix all of `new` but its appearance; each render is a full redraw."""
         return DrawnAnew(lambda *looks: self.composite(looking(new, *looks)).image)
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
-        """Context and `new` in other colours, all of it drawn anew."""
+        """Fix all of `new` but its colours; each render is a full redraw."""
 
-        def draw(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-            return self.composite(painted(new, colours)).image
+        def render(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+            return self.composite(painted(new, colors)).image
 
-        return lambda colours, photograph: errors_by_slopes(draw, new, colours, photograph)
+        return lambda colors, photograph: errors_by_slopes(render, new, colors, photograph)
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Context and `new` at other depths, all of it drawn anew."""
+        """Fix all of `new` but its depths; each render is a full redraw."""
         return lambda depths: self.composite(at_depths(new, self.camera, depths))
 
 
 def frozen_by(drawing: Drawing, context: Gaussians, camera: Camera) -> CudaView:
-    """The view of all of `context`."""
+    """Freeze all of `context`."""
     rows = torch.arange(len(context), device=context.means.device)
     return CudaView(drawing, context, camera, rows, len(context))

@@ -1,7 +1,7 @@
-"""New Gaussians in a frozen scene that keep their place: all that is frozen is folded once.
+"""A frozen scene baked between new Gaussians that vary in appearance only.
 
-Of a pixel only what is new in it is left, its fragments, and between two of them one colour and one
-transmittance of all that is frozen there. So a drawing costs what is new, however much is frozen.
+A pixel keeps the fragments of new Gaussians, and one colour and transmittance between two of them.
+So the cost of a render depends on the new Gaussians only.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Folded:
-    """New Gaussians of which only opacities and colours change, in a frozen scene."""
+    """A frozen scene with new Gaussians that vary in opacity and colour only."""
 
     viewpoint: Viewpoint
     image: Float32[ndarray, "h w 3"]
@@ -37,17 +37,17 @@ class Folded:
     binned: Binned
     means: Float32[ndarray, "n 3"]
     fragments: Sequence[Fragments]
-    """Of some tiles each."""
+    """One item per group of tiles."""
 
     def __call__(
         self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
     ) -> Float[Tensor, "h w 3"]:
-        """The image; differentiable."""
+        """Render the image; differentiable."""
         image: Tensor = _Drawn.apply(self, opacities, sh)
         return image
 
     def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
-        """How far the image is from what is wanted, told from the pixels that have fragments."""
+        """Make the error function, which evaluates only pixels that have fragments."""
         held = Held(self, float32(wanted), float32(weights))
 
         def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:
@@ -58,23 +58,23 @@ class Folded:
 
     @cached_property
     def shown(self) -> Int64[ndarray, "shown"]:
-        """Which of the Gaussians have fragments."""
+        """Indices of the Gaussians that have fragments."""
         named = np.zeros(len(self.means), np.bool_)
         for piece in self.fragments:
             named[piece.names[piece.names >= 0]] = True
         return np.flatnonzero(named)
 
     def colours(self, sh: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n 3"]:
-        """As the camera sees them; of those that it does not see, anything."""
-        colours = np.empty((len(sh), 3), np.float32)
+        """Compute the colours seen by the camera; those of invisible Gaussians are undefined."""
+        colors = np.empty((len(sh), 3), np.float32)
         seen = (self.shown, self.viewpoint.pinhole.center, self.means)
-        self.viewpoint.share(kernels.shade, len(self.shown), *seen, sh, colours)
-        return colours
+        self.viewpoint.share(kernels.shade, len(self.shown), *seen, sh, colors)
+        return colors
 
     def draw(
         self, opacities: Float32[ndarray, "n"], colours: Float32[ndarray, "n 3"]
     ) -> Float32[ndarray, "h w 3"]:
-        """The frozen image, drawn anew where it has fragments."""
+        """Render the frozen image with the pixels that have fragments."""
         image = self.image.copy()
         self.draw_fragments(opacities, colours, image)
         return image
@@ -86,8 +86,8 @@ class Folded:
         image: Float32[ndarray, "h w 3"],
     ) -> None:
         """Write the pixels that have fragments."""
-        drawn = [(piece, opacities, colours, image) for piece in self.fragments]
-        run(kernels.draw_fragments, drawn, self.viewpoint.threads)
+        calls = [(piece, opacities, colours, image) for piece in self.fragments]
+        run(kernels.draw_fragments, calls, self.viewpoint.threads)
 
     def slopes(
         self,
@@ -96,18 +96,18 @@ class Folded:
         image: Float32[ndarray, "h w 3"],
         d_image: Float32[ndarray, "h w 3"],
     ) -> Float32[ndarray, "n 4"]:
-        """Of opacities and colours, from those of the image."""
+        """Compute gradients of opacities and colours from those of the image."""
         values = np.empty((len(self.binned.slots), 4), np.float32)
         written = np.zeros(len(values), np.bool_)
-        drawn = (opacities, colours, image, d_image, values, written)
-        pieces = [(piece, *drawn) for piece in self.fragments]
+        arguments = (opacities, colours, image, d_image, values, written)
+        pieces = [(piece, *arguments) for piece in self.fragments]
         run(kernels.draw_fragments_backward, pieces, self.viewpoint.threads)
         return self.viewpoint.sums(self.binned, (values, written))
 
     def slopes_of_sh(
         self, colours: Float32[ndarray, "n 3"], slopes: Float32[ndarray, "n 3"], bands: int
     ) -> Float32[ndarray, "n k 3"]:
-        """Of spherical harmonics, from those of colours."""
+        """Compute gradients of spherical harmonics from those of colours."""
         d_sh = np.zeros((len(colours), bands, 3), np.float32)
         seen = (self.shown, self.viewpoint.pinhole.center, self.means)
         received = (colours, slopes, d_sh)
@@ -117,66 +117,66 @@ class Folded:
 
 @dataclass(frozen=True)
 class Held:
-    """What the image of `Folded` is held against."""
+    """A weighted target image for a `BakedScene`."""
 
     folded: Folded
     wanted: Float32[ndarray, "h w 3"]
     weights: Float32[ndarray, "h w"]
 
     def missed(self, image: Float32[ndarray, "h w 3"]) -> tuple[float, Float32[ndarray, "h w 3"]]:
-        """The error of the pixels that have fragments, and its slopes in them."""
-        slopes = np.empty_like(image)
+        """Compute the error of the pixels that have fragments, and its gradients in them."""
+        d_image = np.empty_like(image)
         errors = np.zeros(self.folded.viewpoint.tiles)  # summed in one order on any threads
-        seen = (image, self.wanted, self.weights, slopes, errors)
+        seen = (image, self.wanted, self.weights, d_image, errors)
         pieces = [(piece, *seen) for piece in self.folded.fragments]
         run(kernels.compare_fragments, pieces, self.folded.viewpoint.threads)
-        return float(errors.sum()), slopes
+        return float(errors.sum()), d_image
 
     @cached_property
     def elsewhere(self) -> float:
-        """The error of all others, which stays."""
+        """The constant error of all other pixels."""
         frozen = self.folded.image
         squares = np.square(frozen - self.wanted).sum(axis=2, dtype=np.float64)
         return float((self.weights * squares).sum()) - self.missed(frozen)[0]
 
 
 class _Missed(torch.autograd.Function):
-    """The error of the image of `Folded`."""
+    """The error of the image of a `BakedScene`."""
 
     @staticmethod
     def forward(ctx: Any, held: Held, opacities: Tensor, sh: Tensor) -> Tensor:
         folded = held.folded
-        colours, opaque = folded.colours(float32(sh)), float32(opacities)
+        colors, opaque = folded.colours(float32(sh)), float32(opacities)
         image = np.empty_like(folded.image)
-        folded.draw_fragments(opaque, colours, image)
-        error, slopes = held.missed(image)
-        ctx.scene = (folded, opaque, colours, image, slopes, sh.shape[1])
+        folded.draw_fragments(opaque, colors, image)
+        error, d_image = held.missed(image)
+        ctx.scene = (folded, opaque, colors, image, d_image, sh.shape[1])
         return torch.tensor(held.elsewhere + error, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        folded, opacities, colours, image, slopes, bands = ctx.scene
-        found = slope.item() * folded.slopes(opacities, colours, image, slopes)
-        return None, *slopes_of_looks(folded, colours, found, bands, ctx.needs_input_grad[2])
+    def backward(ctx: Any, d_error: Tensor) -> tuple[Tensor | None, ...]:
+        folded, opacities, colors, image, d_image, bands = ctx.scene
+        found = d_error.item() * folded.slopes(opacities, colors, image, d_image)
+        return None, *slopes_of_looks(folded, colors, found, bands, ctx.needs_input_grad[2])
 
 
 class _Drawn(torch.autograd.Function):
-    """The image of `Folded`."""
+    """The image of a `BakedScene`."""
 
     @staticmethod
     def forward(ctx: Any, folded: Folded, opacities: Tensor, sh: Tensor) -> Tensor:
-        colours, opaque = folded.colours(float32(sh)), float32(opacities)
-        image = folded.draw(opaque, colours)
-        ctx.scene = (folded, opaque, colours, image, sh.shape[1])
+        colors, opaque = folded.colours(float32(sh)), float32(opacities)
+        image = folded.draw(opaque, colors)
+        ctx.scene = (folded, opaque, colors, image, sh.shape[1])
         return torch.from_numpy(image)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        folded, opacities, colours, image, bands = ctx.scene
-        found = folded.slopes(opacities, colours, image, float32(slope))
-        return None, *slopes_of_looks(folded, colours, found, bands, ctx.needs_input_grad[2])
+    def backward(ctx: Any, d_image: Tensor) -> tuple[Tensor | None, ...]:
+        folded, opacities, colors, image, bands = ctx.scene
+        found = folded.slopes(opacities, colors, image, float32(d_image))
+        return None, *slopes_of_looks(folded, colors, found, bands, ctx.needs_input_grad[2])
 
 
 def slopes_of_looks(
@@ -186,7 +186,7 @@ def slopes_of_looks(
     bands: int,
     of_sh: bool,
 ) -> tuple[Tensor, Tensor | None]:
-    """Of opacities and, where they are asked for, of spherical harmonics."""
+    """Compute gradients of opacities and, if `wants_sh`, of spherical harmonics."""
     opacities = torch.from_numpy(np.ascontiguousarray(slopes[:, 0]))
     if not of_sh:
         return opacities, None
@@ -196,8 +196,7 @@ def slopes_of_looks(
 def folded(
     view: CpuView, binned: Binned, means: Float32[ndarray, "n 3"], where: Bool[Tensor, "h w"]
 ) -> Folded:
-    """The fragments of splats of opacity 1 `where` they are asked for, and what is frozen between
-    them."""
+    """Bake a frozen scene between the fragments of opaque splats in the mask `where`."""
     viewpoint, context, new = view.viewpoint, view.layer, binned.layer
     tiles = np.flatnonzero(np.diff(new.tile_start))
     behind = np.zeros_like(view.frame.image)
@@ -208,5 +207,5 @@ def folded(
 
 
 def float32(values: Tensor) -> Float32[ndarray, "..."]:
-    """The values of a tensor as a contiguous array, not copied where they are one already."""
+    """Convert a tensor to a contiguous array, without copying if it is one already."""
     return values.detach().to("cpu", torch.float32).contiguous().numpy()

@@ -1,4 +1,4 @@
-"""The same Gaussians in other colours, which tells how much of each an image shows."""
+"""Renders of Gaussians in other colours, which expose their compositing weights."""
 
 from __future__ import annotations
 
@@ -14,34 +14,37 @@ from gscompleter.types import Gaussians, sh_from_rgb
 
 
 def painted(gaussians: Gaussians, colours: Float[Tensor, "n 3"]) -> Gaussians:
-    """The Gaussians in colours that are the same from every side."""
+    """Give Gaussians colours that are the same from every direction."""
     return replace(gaussians, sh=sh_from_rgb(colours), encoded=None)
 
 
 def grey(values: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    """Colours that have each value in all three channels."""
+    """Repeat each value in three channels."""
     return values[:, None].expand(-1, 3)
 
 
 def looking(
     gaussians: Gaussians, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
 ) -> Gaussians:
-    """The Gaussians where they are, with other opacities and spherical harmonics."""
+    """Replace the opacities and spherical harmonics of Gaussians."""
     return replace(gaussians, opacities=opacities, sh=sh, encoded=None)
 
 
 @dataclass(frozen=True)
 class DrawnAnew:
-    """An `AppearanceRender` that draws all of the image whenever it is asked."""
+    """An `AppearanceRender` that redraws the whole image at each call."""
 
     draw: Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, "h w 3"]]
 
     def __call__(
         self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
     ) -> Float[Tensor, "h w 3"]:
+        """Render the image; differentiable."""
         return self.draw(opacities, sh)
 
     def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
+        """Make an error function: sum of `weights` (>= 0) times squared errors of all channels."""
+
         def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:
             return (weights * (self.draw(opacities, sh) - wanted).square().sum(dim=-1)).sum()
 
@@ -53,18 +56,14 @@ def sums_by_slopes(
     gaussians: Gaussians,
     layers: Float[Tensor, "h w 3"],
 ) -> Float[Tensor, "n 3"]:
-    """`FrozenView.sums` by autograd: a compositing weight is the slope of a pixel's colour in the
-    colour of the Gaussian.
+    """Sum `image` over the compositing weights of `gaussians`, by autograd through `render`.
 
-    Args:
-        draw: The image of the Gaussians in other colours, differentiable in them.
-        gaussians: The n Gaussians.
-        layers: What is summed.
+    A compositing weight is the gradient of a pixel in the colour of the Gaussian.
     """
     with torch.enable_grad():
-        colours = gaussians.means.new_full((len(gaussians), 3), 0.5).requires_grad_()
-        (slope,) = torch.autograd.grad((layers * draw(colours)).sum(), colours)
-    return slope
+        colors = gaussians.means.new_full((len(gaussians), 3), 0.5).requires_grad_()
+        (gradient,) = torch.autograd.grad((layers * draw(colors)).sum(), colors)
+    return gradient
 
 
 def errors_by_slopes(
@@ -73,7 +72,7 @@ def errors_by_slopes(
     colours: Float[Tensor, "n 3"],
     photograph: Float[Tensor, "h w 3"],
 ) -> ColourSums:
-    """`ColourErrors` by autograd; arguments as those of `sums_by_slopes`."""
+    """Implement `ColorErrors` by autograd; arguments as in `backproject_by_autograd`."""
     missing = photograph - draw(colours).detach()
     weights = sums_by_slopes(draw, gaussians, torch.ones_like(missing))[:, 0]
     return sums_by_slopes(draw, gaussians, missing), weights

@@ -1,8 +1,7 @@
-"""A proxy of a large scene: what cameras can see of it, in images of the size that is worked at.
+"""LOD proxies of large scenes.
 
-Where millions of Gaussians were brought, several share a pixel of each image. Those that lie within
-half a pixel of each other, however close a camera is, are drawn as one. A scene is completed by
-what is seen of its proxy; all that is written, and the pictures of it, are of the scene itself.
+Gaussians within half a pixel of each other are merged, at the working resolution of all cameras.
+Completion uses the proxy; all output is made from the scene itself.
 """
 
 from __future__ import annotations
@@ -23,29 +22,26 @@ from gscompleter.render.folded import float32
 from gscompleter.types import Camera, Gaussians, Proxy
 
 WORTH = 500_000
-"""Gaussians from which on a scene in order is drawn sooner by more than it takes to sort it."""
+"""Gaussians from which on a proxy saves more time than it takes to build."""
 REACH = 0.5
-"""Pixels from the first Gaussian of a run to any other."""
+"""Largest distance of a Gaussian from the first of its run, in pixels."""
 LARGEST = 2.0
-"""Standard deviations of a Gaussian that shares a run, in pixels, at most. Photographs and scene
-are compared over more than that."""
+"""Largest standard deviation of a Gaussian that shares a run, in pixels."""
 MAX_GROWTH = 8.0
-"""By how much both grow at most where the proxy would be too large otherwise."""
+"""Largest factor on both, if the proxy would be too large otherwise."""
 
 
 def proxy_of(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy | None:
-    """What `cameras` see of `scene`, drawn with fewer Gaussians where it has so many that it lies
-    in order; None where it is drawn itself, as on a GPU, which has no need of a proxy."""
+    """Build the LOD proxy of a large `scene`, or None if it is small or on a GPU."""
     if len(scene) < WORTH or scene.means.is_cuda:
         return None
     return run_by_run(scene, cameras)
 
 
 def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
-    """`scene` with one Gaussian for each run of neighbours in its order that lie close together and
-    are of one provenance.
+    """Merge runs of adjacent, close Gaussians of one provenance to one Gaussian each.
 
-    There are as few runs as views of `cameras` have room for. In a random order there are none.
+    Runs are as few as frozen views of `cameras` can hold. A scene in random order has no runs.
     """
     given = arrays_of(scene)
     given = given._replace(sh=given.sh.reshape(len(scene), -1))
@@ -56,9 +52,9 @@ def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
     means, quats, scales, opacities, sh = map(torch.from_numpy, found)
     first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
-    looks = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
-    drawn = Gaussians(means, quats, scales, *looks, is_antialiased=scene.is_antialiased)
-    return Proxy(drawn, run)
+    appearance = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
+    merged = Gaussians(means, quats, scales, *appearance, is_antialiased=scene.is_antialiased)
+    return Proxy(merged, run)
 
 
 def starts_of_runs(
@@ -67,7 +63,7 @@ def starts_of_runs(
     generated: UInt8[ndarray, "n"],
     cameras: Sequence[Camera],
 ) -> Int64[ndarray, "bounds"]:
-    """Where each run starts, and the end [m + 1]."""
+    """Find the start of each run, and the end [m + 1]."""
     centers = float32(torch.stack([camera.center for camera in cameras]))
     focals = float32(torch.stack([camera.K[0, 0] for camera in cameras]))
     begins = np.empty(len(means), np.bool_)

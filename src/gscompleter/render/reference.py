@@ -1,7 +1,4 @@
-"""The image formation in plain PyTorch: slow, short, differentiable by autograd, in any dtype.
-
-The fast renderers are tested against it, values and gradients.
-"""
+"""The image formation in plain PyTorch, slow and short, to test the fast renderers against."""
 
 from __future__ import annotations
 
@@ -27,9 +24,9 @@ from gscompleter.render.spherical_harmonics import colours_from
 from gscompleter.types import Camera, Gaussians, Render, merge
 
 BLUR = 0.3
-"""Added to the 2D variances, in px²: a low-pass of about a pixel."""
+"""Low-pass of about a pixel, added to the 2D variances, in px²."""
 TANGENT_MARGIN = 0.15
-"""Share of the image size beyond its border at which the perspective Jacobian is clamped."""
+"""Border at which the perspective Jacobian is clamped, relative to the image size."""
 MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
@@ -37,12 +34,13 @@ MIN_TRANSMITTANCE = 1e-4
 
 @dataclass(frozen=True)
 class ReferenceRenderer:
-    """Draws on any device and in the dtype of the Gaussians."""
+    """Renders on any device and in the dtype of the Gaussians."""
 
     max_elements: int = 1 << 22
     """Gaussians times pixels that are held in memory at once."""
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render `gaussians` from `camera`."""
         splats = project(gaussians, camera)
         camera = camera.to(gaussians.means.device)
         x = torch.arange(camera.width, device=camera.K.device) + 0.5
@@ -56,18 +54,19 @@ class ReferenceRenderer:
             for chunk in pixels.split(per_chunk)
         ]
         size = (camera.height, camera.width)
-        colour, weighted_depth, alpha = (torch.cat(parts) for parts in zip(*chunks, strict=True))
+        color, weighted_depth, alpha = (torch.cat(parts) for parts in zip(*chunks, strict=True))
         seen = alpha > 0
         depth = torch.where(seen, weighted_depth / torch.where(seen, alpha, 1), 0)
-        return Render(colour.view(*size, 3), depth.view(size), alpha.view(size))
+        return Render(color.view(*size, 3), depth.view(size), alpha.view(size))
 
     def freeze(self, context: Gaussians, camera: Camera) -> ReferenceView:
+        """Prepare `context` for many renders from `camera`."""
         return ReferenceView(self, context, camera)
 
 
 @dataclass(frozen=True)
 class ReferenceView:
-    """Renders context and new Gaussians together, every time from scratch, with any renderer."""
+    """A scene that is rendered from scratch every time, with any renderer."""
 
     renderer: Renderer
     scene: Gaussians
@@ -75,24 +74,30 @@ class ReferenceView:
 
     @cached_property
     def context(self) -> Render:
+        """The render of the scene alone."""
         return self.renderer.render(self.scene, self.camera)
 
     def extended(self, new: Gaussians) -> ReferenceView:
+        """Add `new` to the scene."""
         return replace(self, scene=merge([self.scene, new]))
 
     def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        """Backproject `image` by autograd."""
         return sums_by_slopes(self._painted, self.scene, layers)
 
     def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+        """Render the scene with the values as grey."""
         return self._painted(grey(values))[..., 0]
 
     def _painted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
         return self.renderer.render(painted(self.scene, colours), self.camera).image
 
     def composite(self, new: Gaussians) -> Render:
+        """Render scene and `new`."""
         return self.renderer.render(merge([self.scene, new]), self.camera)
 
     def plan(self, new: Gaussians) -> OpacityRender:
+        """Fix all of `new` but the opacities."""
         fixed = replace(
             new,
             means=new.means.detach(),
@@ -103,16 +108,19 @@ class ReferenceView:
         return lambda opacities: self.composite(replace(fixed, opacities=opacities))
 
     def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
+        """Fix all of `new` but its appearance."""
         return DrawnAnew(lambda *looks: self.composite(looking(new, *looks)).image)
 
     def plan_colours(self, new: Gaussians) -> ColourErrors:
+        """Fix all of `new` but its colours."""
 
-        def draw(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-            return self.composite(painted(new, colours)).image
+        def render(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+            return self.composite(painted(new, colors)).image
 
-        return lambda colours, photograph: errors_by_slopes(draw, new, colours, photograph)
+        return lambda colors, photograph: errors_by_slopes(render, new, colors, photograph)
 
     def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        """Fix all of `new` but its depths."""
         return lambda depths: self.composite(at_depths(new, self.camera, depths))
 
 
@@ -130,7 +138,7 @@ class Splats:
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Splats:
-    """The Gaussians behind the near plane, sorted by z, by the affine approximation of EWA."""
+    """Project the Gaussians beyond the near plane by the affine EWA approximation, sorted by z."""
     dtype, device = gaussians.means.dtype, gaussians.means.device
     c2w, K = camera.c2w.to(device, dtype), camera.K.to(device, dtype)
     camera_from_world = torch.linalg.inv(c2w[:3, :3])
@@ -159,10 +167,7 @@ def project(gaussians: Gaussians, camera: Camera) -> Splats:
 def jacobians(
     points: Float[Tensor, "n 3"], K: Float[Tensor, "3 3"], width: int, height: int
 ) -> Float[Tensor, "n 2 3"]:
-    """Derivative of the pixel with respect to the point in the camera.
-
-    Far outside of the image the affine approximation fails; the tangents are clamped there.
-    """
+    """Compute the Jacobian of the projection at points in the camera, with clamped tangents."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = points.unbind(-1)
     tan_x = (x / z).clamp(
@@ -180,7 +185,7 @@ def jacobians(
 
 
 def inverses(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
-    """Inverses of symmetric matrices."""
+    """Invert symmetric matrices."""
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     adjugates = torch.stack([c, -b, -b, a], dim=-1).view(-1, 2, 2)
     return adjugates / (a * c - b * b)[:, None, None]
@@ -189,11 +194,12 @@ def inverses(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
 def compensations(
     flat: Float[Tensor, "n 2 3"], covariances: Float[Tensor, "n 2 2"]
 ) -> Float[Tensor, "n"]:
-    """Factors of the opacities by which antialiased rendering makes up for the low-pass.
+    """Compute the factors on opacities that compensate for the low-pass when antialiased.
 
     Args:
-        flat: Axes of the Gaussians in the image, whose squares are the covariances before it.
-        covariances: The same after it.
+        flat: Axes of the Gaussians in the image; `flat @ flat.T` is the covariance before the
+            low-pass.
+        covariances: Covariances after it.
     """
     # Lagrange's identity gives the determinant of `flat @ flat.T` without cancellation.
     area = torch.linalg.cross(flat[:, 0], flat[:, 1]).norm(dim=-1)
@@ -203,7 +209,7 @@ def compensations(
 def composite(
     splats: Splats, pixels: Float[Tensor, "p 2"]
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"], Float[Tensor, "p"]]:
-    """Sums over the splats of weight times colour, weight times depth, and weight."""
+    """Sum weight times colour, weight times depth, and weight over the splats."""
     offsets = pixels - splats.centers[:, None]
     sigma = 0.5 * torch.einsum("mpi,mij,mpj->mp", offsets, splats.precisions, offsets)
     alpha = (splats.opacities[:, None] * torch.exp(-sigma)).clamp(max=MAX_ALPHA)

@@ -1,4 +1,4 @@
-"""View-dependent colour: real spherical harmonics in the basis and with the signs of 3DGS."""
+"""Real spherical harmonics in the basis and with the signs of 3DGS."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ SH_C3_CUBE = 1.445305721320277
 def colours_from(
     sh: Float[Tensor, "n k 3"], means: Float[Tensor, "n 3"], center: Float[Tensor, "3"]
 ) -> Float[Tensor, "n 3"]:
-    """Colours as seen from `center`: `max(0, 0.5 + sum of basis * sh)`.
+    """Evaluate colours as seen from `center`: `max(0, 0.5 + sum of basis * sh)`.
 
-    Differentiable in `sh` and, through the direction they are seen from, in `means`.
+    Differentiable in `sh` and, through the direction, in `means`.
     """
     if sh.shape[1] == 1:
         return (0.5 + SH_C0 * sh[:, 0]).clamp_min(0)
@@ -29,7 +29,7 @@ def colours_from(
 
 
 def sh_basis(directions: Float[Tensor, "n 3"], k: int) -> Float[Tensor, "n k"]:
-    """The first `k` (1, 4, 9 or 16) basis functions at unit `directions` in world axes."""
+    """Evaluate the first `k` (1, 4, 9 or 16) basis functions at unit `directions` (world)."""
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     basis = [torch.full_like(x, SH_C0)]

@@ -1,1 +1,1 @@
-"""What a reader is shown: the files of a completion, tables and plots of a run."""
+"""Output of completions and evaluations: files, pages, tables, plots and videos."""

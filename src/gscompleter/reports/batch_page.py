@@ -1,4 +1,4 @@
-"""The table and the page on a batch, made of its rows."""
+"""The table and the page of a batch."""
 
 from __future__ import annotations
 
@@ -21,11 +21,9 @@ from gscompleter.reports.page import NAME, QUALITY, Picture, rendered
 from gscompleter.reports.plain_words import shown
 
 INDEX, TABLE = "index.html", "table.csv"
-"""The page and the table of a batch."""
 HEIGHT = 96
-"""Pixels of the pictures of a job on the page."""
 PICTURES = 1_000
-"""Jobs of which the page shows pictures, about 5 MB; of the others it has rows."""
+"""Largest number of jobs with thumbnails on the page (about 5 MB)."""
 COLUMNS = (
     "job",
     "state",
@@ -45,26 +43,23 @@ COLUMNS = (
     "result_bytes",
     "peak_bytes",
 )
-"""Of the table."""
 HEAD = ("PSNR before", "PSNR after", "covered before", "covered after", "added", "seconds")
-"""Of the table on the page, after the name of the job."""
 WHEN = ("before", "after")
-"""How the names of the pictures of a target end."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A job on the page that is done."""
+    """A finished job on the page."""
 
     name: str
     cells: tuple[str, ...]
     link: str
-    """Where its own page lies, relative to this one."""
+    """Address of its report, relative to the page."""
     picture: Picture | None
 
 
 def scores_of(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """What the row of a completion says of it; means over its targets."""
+    """Average the scores of a completion over its targets."""
     targets = summary["targets"]
 
     def mean(key: str) -> float | None:
@@ -83,7 +78,7 @@ def scores_of(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def thumbnail_of(folder: Path) -> bytes | None:
-    """The first target before and after, side by side, as a JPEG; None where there is none."""
+    """Join the first target before and after as a JPEG, or return None without images."""
     try:
         pair = [read_pixels(folder / "images" / f"target1_{when}.png") for when in WHEN]
     except InputError:
@@ -96,24 +91,20 @@ def thumbnail_of(folder: Path) -> bytes | None:
 
 
 def sized(image: Image.Image) -> Image.Image:
-    """`image` as high as those on the page."""
+    """Resize an image to the height of a thumbnail."""
     width = max(1, round(image.width * HEIGHT / image.height))
     return image.resize((width, HEIGHT), Image.Resampling.LANCZOS)
 
 
 def write_overview(place: Place, jobs: Sequence[Job]) -> None:
-    """Write the table and the page on the rows of `jobs`.
-
-    Raises:
-        OutputError: where they cannot be written.
-    """
+    """Write the table and the page of `jobs`."""
     rows = [row for job in jobs if (row := read_row(place, job.name)) is not None]
     place.write(TABLE, table_of(rows).encode())
     place.write(INDEX, page_of(rows, lambda name: picture_of(place, name)).encode())
 
 
 def table_of(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Rows as CSV."""
+    """Format rows as CSV."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -122,7 +113,7 @@ def table_of(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def page_of(rows: Sequence[Mapping[str, Any]], picture: Callable[[str], Picture | None]) -> str:
-    """The page on rows."""
+    """Render the page of a batch."""
     good = [row for row in rows if row["state"] == "done"]
     bad = [f"{row['job']}: {row['reason']}" for row in rows if row["state"] == "failed"]
     return rendered(
@@ -141,20 +132,20 @@ def page_of(rows: Sequence[Mapping[str, Any]], picture: Callable[[str], Picture 
 
 
 def facts_of(good: Sequence[Mapping[str, Any]], failed: int) -> list[tuple[str, str]]:
-    """The head of the page."""
+    """List the numbers at the head of the page."""
     gains = [r["psnr_after"] - r["psnr_before"] for r in good if r["psnr_after"] is not None]
     seconds = [row["seconds"] for row in good]
     return [
         ("done", str(len(good))),
         ("failed", str(failed)),
-        ("median gain", f"{shown(median(gains))} dB" if gains else "–"),
+        ("median ΔPSNR", f"{shown(median(gains))} dB" if gains else "–"),
         ("median time", f"{shown(median(seconds))} s" if seconds else "–"),
-        ("time of all", f"{shown(sum(seconds) / 3600)} h" if seconds else "–"),
+        ("total time", f"{shown(sum(seconds) / 3600)} h" if seconds else "–"),
     ]
 
 
 def shown_job(row: Mapping[str, Any], picture: Picture | None) -> Shown:
-    """A row on the page, of a job that is done."""
+    """Format the row of a finished job."""
 
     def share(key: str) -> str:
         return "–" if row.get(key) is None else f"{100 * row[key]:.1f} %"
@@ -171,7 +162,7 @@ def shown_job(row: Mapping[str, Any], picture: Picture | None) -> Shown:
 
 
 def picture_of(place: Place, name: str) -> Picture | None:
-    """The picture of a job, inside of the page; None where it has none."""
+    """Read the thumbnail of a job as a data URI, or return None."""
     content = place.read(f"{THUMBNAILS}/{name}.jpg")
     if content is None:
         return None

@@ -1,8 +1,7 @@
-"""The cameras of a completion in space, drawn so that a page can turn them.
+"""A drawing of the cameras in space that the reader can rotate.
 
-Everything is told from the middle of the cameras, in an upright frame and in units of the radius of
-the drawing. Elements that turn carry their points in `data-points`; the script of the page projects
-these as `projected` does.
+Coordinates are relative to the middle of the cameras, upright, in units of the radius of the
+drawing. The script of the page projects the `data-points` of each element as `project_to_drawing`.
 """
 
 from __future__ import annotations
@@ -20,47 +19,45 @@ from gscompleter.reports.figures import figure, markup, put
 from gscompleter.reports.record import Points, Pose
 
 SIZE = 480.0
-"""Width and height of the drawing, in the units of its viewBox."""
 YAW, PITCH = 30.0, 25.0
-"""How the drawing is turned at first, in degrees."""
+"""Initial rotation, in degrees."""
 DEPTH = 0.11
-"""Length of a camera, in radii."""
+"""Length of a camera pyramid, in radii."""
 FARTHEST = 15.0
-"""Points are shown as far from the cameras as these stand apart, times this."""
+"""Largest distance of points from the cameras, as a factor of the extent of the cameras."""
 EDGE = 1.2
-"""How far from the middle points are drawn, in radii."""
+"""Largest coordinate of a point, in radii."""
 SHOWN = 0.9
-"""Share of all that is shown that lies within the radius."""
+"""Fraction of cameras and points within the radius."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A camera, what it is, and what it is called."""
+    """A camera with its role and labels."""
 
     pose: Pose
     kind: str
     """photograph, context, anchor or target."""
     name: str
     label: str = ""
-    """Text beside it."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of the drawing."""
+    """Coordinate frame of the drawing."""
 
     center: Float[np.ndarray, "3"]
     axes: Float[np.ndarray, "3 3"]
-    """Its axes as rows, the second upwards."""
+    """Axes as rows; the second points up."""
     radius: float
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """World points as the drawing tells them."""
+        """Convert world points to the drawing."""
         return (points - self.center) @ self.axes.T / self.radius
 
 
 def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
-    """A drawing of `cameras` among `points`; None where there are none, or not all are finite."""
+    """Draw `cameras` among `points`, or return None without cameras or with infinite ones."""
     poses = [np.array(camera.pose.c2w) for camera in cameras]
     if not poses or not all(p.shape == (3, 4) and np.isfinite(p).all() for p in poses):
         return None
@@ -68,8 +65,8 @@ def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
     means = np.array([mean for mean, _ in places]).reshape(-1, 3)
     frame = frame_of(np.stack(poses), means)
     targets = sum(camera.kind == "target" for camera in cameras)
-    told = f"{len(cameras)} cameras, {targets} of them targets, among {len(places)} points."
-    svg = figure("Cameras in space", told, SIZE, SIZE, "space")
+    text = f"{len(cameras)} cameras, {targets} of them targets, and {len(places)} scene points."
+    svg = figure("Cameras in space", text, SIZE, SIZE, "space")
     draw_points(svg, frame(means), [added for _, added in places])
     for camera, pose in zip(cameras, poses, strict=True):
         draw_camera(svg, camera, frame(frustum(pose, camera.pose.opening, DEPTH * frame.radius)))
@@ -77,32 +74,32 @@ def camera_figure(cameras: Sequence[Placed], points: Points) -> Markup | None:
 
 
 def finite(numbers: Sequence[float]) -> bool:
-    """Whether all of them can be drawn."""
+    """Return True if all numbers are finite."""
     return all(map(math.isfinite, numbers))
 
 
 def draw_points(svg: Element, points: Float[np.ndarray, "n 3"], added: Sequence[bool]) -> None:
-    """Draw those places on surfaces that lie within the drawing."""
+    """Draw the points within the borders of the drawing."""
     within = np.abs(points).max(axis=1, initial=0) <= EDGE
     centers, kinds = projected(points).tolist(), ["added" if new else "seen" for new in added]
     for row in np.flatnonzero(within):
-        (x, y), told = centers[row], text_of(points[row])
-        put(svg, "circle", class_=kinds[row], r=1.6, cx=x, cy=y, data_points=told)
+        (x, y), position = centers[row], text_of(points[row])
+        put(svg, "circle", class_=kinds[row], r=1.6, cx=x, cy=y, data_points=position)
 
 
 def draw_camera(svg: Element, camera: Placed, corners: Float[np.ndarray, "11 3"]) -> None:
-    """Draw a camera whose line from its centre along its edges is `corners`."""
+    """Draw a camera as one line along `corners`."""
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in projected(corners))
-    drawn = put(svg, "polyline", class_=camera.kind, points=line, data_points=text_of(corners))
-    put(drawn, "title", camera.name)
+    shape = put(svg, "polyline", class_=camera.kind, points=line, data_points=text_of(corners))
+    put(shape, "title", camera.name)
     if camera.label:
-        (x, y), told = projected(corners[:1])[0], text_of(corners[:1])
-        beside = {"dx": 6, "dy": -6, "data_points": told}
+        (x, y), position = projected(corners[:1])[0], text_of(corners[:1])
+        beside = {"dx": 6, "dy": -6, "data_points": position}
         put(svg, "text", camera.label, class_=camera.kind, x=x, y=y, **beside)
 
 
 def frame_of(poses: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "m 3"]) -> Frame:
-    """A frame around the cameras, upright as most of them are."""
+    """Fit a frame around cameras and points whose up axis is that of most cameras."""
     cameras = poses[:, :, 3]
     middle = cameras.mean(axis=0)
     apart = distances(cameras, middle).max()
@@ -121,14 +118,14 @@ def frame_of(poses: Float[np.ndarray, "n 3 4"], points: Float[np.ndarray, "m 3"]
 
 
 def distances(points: Float[np.ndarray, "n 3"], center: Float[np.ndarray, "3"]) -> np.ndarray:
-    """How far points lie from `center`: [n]."""
+    """Compute the distances [n] of points from `center`."""
     return np.linalg.norm(points - center, axis=1)
 
 
 def frustum(
     pose: Float[np.ndarray, "3 4"], opening: tuple[float, float], depth: float
 ) -> Float[np.ndarray, "11 3"]:
-    """World points of one line along the edges of a camera `depth` deep, from its centre on."""
+    """Compute the world points of one line along the edges of a camera pyramid."""
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     wide, high = opening
     corners = np.c_[signs * np.array(opening) / max(wide, high) * 0.6, np.ones(4)] * depth
@@ -139,7 +136,7 @@ def frustum(
 def projected(
     points: Float[np.ndarray, "n 3"], yaw: float = YAW, pitch: float = PITCH
 ) -> Float[np.ndarray, "n 2"]:
-    """Where points of the drawing's frame are drawn, in parallel projection."""
+    """Project points onto the drawing by parallel projection."""
     (sin_y, cos_y), (sin_p, cos_p) = (
         (np.sin(angle), np.cos(angle)) for angle in np.radians([yaw, pitch])
     )
@@ -151,7 +148,7 @@ def projected(
 
 
 def text_of(points: Float[np.ndarray, "*n 3"]) -> str:
-    """Points as the script reads them."""
+    """Format points for the script of the page."""
     return " ".join(f"{value:.3f}" for value in points.flatten().tolist())
 
 
@@ -161,7 +158,7 @@ def placed_cameras(
     targets: Sequence[Pose],
     photographs: Sequence[Pose],
 ) -> Iterator[Placed]:
-    """All cameras with what they are: photographs first, targets last, so that these are on top."""
+    """Yield all cameras with their roles: photographs first and targets last, on top."""
     for pose in photographs:
         yield Placed(pose, "photograph", "a photograph of the scene")
     for pose, frame in context:

@@ -1,4 +1,4 @@
-"""What a completion leaves in its output folder: two scenes, images and numbers."""
+"""The output folder of a completion: scenes, images, report.json and summary.json."""
 
 from __future__ import annotations
 
@@ -30,32 +30,29 @@ from gscompleter.splats.removed import save_removed
 from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion, View
 
 GENERATED = "generated.ply"
-"""The file with what was added, alone."""
 
 IGNORED = (1.0, 0.0, 1.0)
-"""Colour of what is ignored, in pictures of photographs."""
 
 Scores = dict[str, float | None]
-"""By their names, what an image scores; None where there is no photograph."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A camera to complete, and what is known of it for scoring."""
+    """A target camera with the photograph that scores it."""
 
     camera: Camera
     frame: int | None = None
-    """Its number in the scene; None for a camera from elsewhere."""
+    """Frame number in the scene; None for a camera from elsewhere."""
     photograph: Float[Tensor, "h w 3"] | None = None
-    """What the camera took, where it took anything. No stage sees it but `oracle`."""
+    """Photograph at the target, if there is one. Only the generator `oracle` uses it."""
     ignored: Bool[Tensor, "h w"] | None = None
-    """True where that is to be ignored; None where all of it counts."""
+    """True for pixels that are not scored; None if all are."""
     near: int | None = None
-    """Number of the frame that a camera was derived from, where it was found and not named."""
+    """Frame number that a planned camera was derived from; None if the user gave the camera."""
 
     @property
     def view(self) -> View | None:
-        """The photograph with its camera; None where there is none."""
+        """The photograph with its camera, or None."""
         if self.photograph is None:
             return None
         return View(self.photograph, self.camera, self.frame, ignored=self.ignored)
@@ -63,46 +60,44 @@ class Target:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """A photograph that is neither of the context nor of a target: it only scores the result."""
+    """A photograph that is neither context nor target and only scores the result."""
 
     view: View
-    """In the frame of the result."""
+    """View in the frame of the result."""
     is_check: bool = False
     """True if a small copy of it checked the input splat."""
 
 
 @dataclass(frozen=True)
 class Brought:
-    """The file that a context was read from."""
+    """The file of the input splat."""
 
     path: Path
     kept: Bool[Tensor, "n"] | None = None
-    """Which of its Gaussians the context holds, in their order; None for all."""
+    """Mask of the Gaussians in the file that form the context; None for all."""
     order: Int64[Tensor, "n"] | None = None
-    """Which of these each Gaussian of the context is, where it has them in another order."""
+    """Index among these of each Gaussian of the context; None for the order of the file."""
 
 
 @dataclass(frozen=True)
 class Around:
-    """What surrounds a completion, for its report."""
+    """Views around the photographs, for the report."""
 
     looks: tuple[Look, ...] = ()
-    """What cameras around the photographs see before and after."""
     photographs: tuple[Camera, ...] = ()
     """Cameras of all photographs, in the frame of the result."""
 
 
 @dataclass(frozen=True)
 class Images:
-    """One camera's view of the scene before and after."""
+    """Renders of one camera before and after the completion."""
 
     before: Render
     after: Render
     truth: View | None
-    """The photograph; None where there is none."""
 
     def scores(self) -> Scores:
-        """PSNR (dB) and SSIM against what counts of the photograph; None where there is none."""
+        """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
         images, truth = {"before": self.before.image, "after": self.after.image}, self.truth
         if truth is None:
             return {f"{name}_{when}": None for name in ("psnr", "ssim") for when in images}
@@ -115,19 +110,18 @@ class Images:
 def compare(
     completion: Completion, camera: Camera, truth: View | None, renderer: Renderer
 ) -> Images:
-    """The context and the completed scene as `camera` sees them."""
+    """Render the context and the completed scene."""
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
         if completion.set_aside is None:
             after = frozen.composite(completion.added)
-        else:  # some of the context was set aside
+        else:  # some of the context was pruned
             after = renderer.render(completion.scene, camera)
     return Images(frozen.context, after, truth)
 
 
 def at_photographs(completion: Completion, completer: GSCompleter) -> list[Images]:
-    """The same at the photographs of the context. What `completer` saw there is not drawn again,
-    unless a proxy stood for the scene."""
+    """Render the context views, from the cache of `completer` unless it used an LOD proxy."""
     views = completion.views
     if completion.proxy is not None:
         return [compare(completion, v.camera, v, completer.renderer) for v in views]
@@ -139,8 +133,7 @@ def at_photographs(completion: Completion, completer: GSCompleter) -> list[Image
 def score_held_out(
     completion: Completion, photographs: Sequence[HeldOut], renderer: Renderer
 ) -> list[dict[str, Any]]:
-    """Score the context and the completed scene at photographs that were not used, for the
-    summary."""
+    """Score the scene before and after at held-out photographs."""
 
     def score(held_out: HeldOut) -> dict[str, Any]:
         view = held_out.view
@@ -156,8 +149,7 @@ def summarize(
     scores: Sequence[Scores],
     said: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The content of `summary.json`: what was `said` in advance, and what came of it; `scores` are
-    those of the photographs, then of the targets."""
+    """Build summary.json from the facts of the run and the scores of context and targets."""
     count = len(completion.views)
     return {
         "version": __version__,
@@ -186,7 +178,7 @@ def summarize(
                     for key in ("scale", "shift", "inliers", "method", "agreement")
                 },
                 **scored,
-                # the property of completed.ply that marks what this target added
+                # the property of completed.ply that marks the Gaussians of this target
                 "target_id": int(result.added.generated[0]) if len(result.added) else None,
                 "added": len(result.added),
                 "notes": list(result.notes),
@@ -202,26 +194,24 @@ def summarize(
 
 
 def gains_of(completion: Completion) -> list[list[float] | None]:
-    """By how much each photograph is brighter than it is compared, by channel; None where exposures
-    were not evened out."""
+    """List the exposure gains per photograph and channel; None if they were not normalized."""
     if completion.gains is None:
         return [None] * len(completion.views)
     return completion.gains.tolist()
 
 
 def covered_by(around: Around) -> dict[str, Any]:
-    """How much of what surrounds it a completion covers, for the summary; nothing where nobody
-    looked."""
+    """Summarize the coverage of the surrounding views, if there are any."""
     return {"coverage": coverage_of(around.looks).as_summary()} if around.looks else {}
 
 
 def share_of(mask: Bool[Tensor, "h w"] | None) -> float:
-    """Compute the share of an image in which `mask` is True; 0 without one."""
+    """Compute the fraction of True pixels; 0 without a mask."""
     return 0.0 if mask is None else mask.float().mean().item()
 
 
 def counts(completion: Completion) -> dict[str, int]:
-    """How many Gaussians were given and added and, of a scene that was doubted, set aside."""
+    """Count the Gaussians of the context, the added and, of an input splat, the pruned ones."""
     found = {"context": len(completion.context), "added": len(completion.added)}
     if completion.evidence is None:
         return found
@@ -239,20 +229,13 @@ def write_report(
     around: Callable[[], Around] = Around,
     held_out: Sequence[HeldOut] = (),
 ) -> dict[str, Any]:
-    """Write the three scenes, `images/`, `report.json` and `summary.json`; returns the summary.
+    """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
-    Args:
-        folder: Where to.
-        completion: What was done.
-        targets: The cameras it was done for, in their order.
-        completer: What did it, and draws the scene before and after.
-        said: Settings, seed and device, for the summary.
-        brought: Where the context comes from, if not from Ψ: `completed.ply` keeps its layout.
-        around: Tells what surrounds it; asked once all else is drawn and written.
-        held_out: Photographs that were not used, for scores alone.
+    `completed.ply` keeps the layout of an input splat. Surrounding views are rendered last, and
+    held-out photographs only score the result.
 
     Raises:
-        InputError: where a file cannot be written.
+        InputError: if a file cannot be written.
     """
     context_images = at_photographs(completion, completer)
     target_images = [
@@ -278,11 +261,7 @@ def write_report(
 
 
 def write_scenes(folder: Path, completion: Completion, brought: Brought | None) -> None:
-    """Write the three scenes, and what was removed of one that was brought.
-
-    Raises:
-        InputError: where a file cannot be written.
-    """
+    """Write the three scenes, and the pruned Gaussians of an input splat."""
     if brought is None:
         save_own(folder, completion)
         return
@@ -298,11 +277,7 @@ def write_scenes(folder: Path, completion: Completion, brought: Brought | None) 
 def write_pictures(
     folder: Path, number: int, result: TargetCompletion, images: Images
 ) -> Limits | None:
-    """Write the pictures of a target; returns the ends of the colours of its depths.
-
-    Raises:
-        InputError: where a file cannot be written.
-    """
+    """Write the images of a target; return the limits of its depth colours."""
     named = pictures(result, images)
     write_images({folder / f"target{number}_{name}.png": named[name] for name in named})
     depths = {"before": images.before.depth_map(), "after": images.after.depth_map()}
@@ -314,11 +289,7 @@ def write_pictures(
 
 
 def write_ignored(folder: Path, views: Sequence[View]) -> None:
-    """Write each photograph of which something is ignored, with that in the colour `IGNORED`.
-
-    Raises:
-        InputError: where a file cannot be written.
-    """
+    """Write each photograph that has ignored pixels, with these painted over."""
     painted = {}
     for number, view in enumerate(views, start=1):
         if view.ignored is not None:
@@ -329,11 +300,7 @@ def write_ignored(folder: Path, views: Sequence[View]) -> None:
 
 
 def write_looks(folder: Path, looks: Sequence[Look]) -> None:
-    """Write what cameras around the photographs see before and after.
-
-    Raises:
-        InputError: where a file cannot be written.
-    """
+    """Write the surrounding views before and after."""
     seen = {}
     for number, look in enumerate(looks, start=1):
         seen[folder / f"around{number}_before.png"] = look.before.image
@@ -342,21 +309,12 @@ def write_looks(folder: Path, looks: Sequence[Look]) -> None:
 
 
 def write_images(images: Mapping[Path, Tensor]) -> None:
-    """Write images, several at a time: colour [h, w, 3], grey or masks [h, w].
-
-    Raises:
-        InputError: where a file cannot be written.
-    """
+    """Write images in parallel: colour [h, w, 3], grey or masks [h, w]."""
     side_by_side(write_image, images.keys(), images.values())
 
 
 def save_own(folder: Path, completion: Completion) -> None:
-    """Write the three scenes of a context that Ψ made side by side: their rows fit into memory
-    together, which those of a splat that is brought may not.
-
-    Raises:
-        InputError: where a file cannot be written.
-    """
+    """Write the three scenes of a reconstructed context in parallel; they fit into memory."""
     paths = [folder / name for name in (CONTEXT, COMPLETED, GENERATED)]
     scenes = completion.context, completion.scene, completion.added
     side_by_side(save_ply, paths, scenes, (None, True, True))
@@ -365,7 +323,7 @@ def save_own(folder: Path, completion: Completion) -> None:
 def as_in_file(
     completion: Completion, brought: Brought
 ) -> tuple[Gaussians, Bool[Tensor, "n"] | None]:
-    """The context, and what of it was set aside, in the order of the file."""
+    """Sort the context and its pruned mask in the order of the input file."""
     context, aside = completion.context, completion.removed
     if brought.order is None:
         return context, aside
@@ -380,15 +338,7 @@ def save_brought(
     added: Gaussians,
     brought: Brought,
 ) -> None:
-    """Write `completed.ply` in the layout of the file that was brought, and `removed.ply`.
-
-    Args:
-        folder: Where to.
-        context: The n Gaussians that were brought.
-        aside: Which of them are left out; None for none.
-        added: What comes behind them.
-        brought: The file.
-    """
+    """Write `completed.ply` in the layout of the input splat, and `removed.ply`."""
     kept = brought.kept
     if aside is None or not aside.any():
         save_like(folder / COMPLETED, context, added, brought.path, kept)
@@ -403,7 +353,7 @@ def save_brought(
 
 
 def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:
-    """The pictures of one target by name: colour [h, w, 3], or a mask [h, w]."""
+    """Collect the images of a target by name: colour [h, w, 3] or masks [h, w]."""
     found = {
         "before": images.before.image,
         "after": images.after.image,
@@ -419,7 +369,7 @@ def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:
 
 
 def strip(pictures: Sequence[Float[Tensor, "h _w 3"]], gap: int = 4) -> Float[Tensor, "h wide 3"]:
-    """Pictures of one height side by side on white."""
+    """Join images of one height side by side on white."""
     white = torch.ones((pictures[0].shape[0], gap, 3))
     parts = [part for picture in pictures for part in (white, picture.cpu().clamp(0, 1))]
     return torch.cat(parts[1:], dim=1)

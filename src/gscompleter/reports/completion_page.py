@@ -1,4 +1,4 @@
-"""The page on a completion, made of nothing but what lies in its output folder."""
+"""The report page of a completion, made from its output folder alone."""
 
 from __future__ import annotations
 
@@ -23,34 +23,29 @@ from gscompleter.reports.plain_words import about_scene, about_target, gain, per
 from gscompleter.reports.record import TargetRecord
 
 VIEWER = "view.html"
-"""The page of the viewer, where it lies beside the report."""
 PICTURES = {
-    "reference": "The image that was synthesized",
-    "hole_mask": "Where the scene had a hole (white)",
-    "support": "How far photographs support what the target saw (white: fully)",
-    "truth": "The photograph, used for scores only",
+    "reference": "Reference: the synthesized image",
+    "hole_mask": "Hole mask (white: hole)",
+    "support": "Trust: agreement of the scene with the photographs (white: full)",
+    "truth": "Photograph, used for scores only",
 }
-"""By their names in `images/`, the pictures of a target besides before and after."""
 CURVES = {
     "register": "Loss of the registration along the rays",
     "refine": "Loss of the refinement",
 }
-"""By their names in the record, the optimisations of a target."""
 METHODS = {
-    "ransac": "RANSAC fitted scene depth = {scale} × lifted depth {shift}; {inliers} of the pixels "
+    "ransac": "RANSAC fits scene depth = {scale} × lifted depth {shift}; {inliers} of the pixels "
     "agree",
-    "median": "The median ratio of depths was taken, scene depth = {scale} × lifted depth; "
+    "median": "The median depth ratio is used: scene depth = {scale} × lifted depth; "
     "{inliers} of the pixels agree",
-    "identity": "Depths were left as they were lifted",
+    "identity": "The lifted depths are used unchanged",
 }
-"""By how the affine of a target was found, what is said of it."""
 SCORES = ("camera", "PSNR before", "PSNR after", "change", "SSIM before", "SSIM after", "change")
-"""The head of a table of scores."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """What the page shows of a target."""
+    """Content of the page about one target."""
 
     number: int
     name: str
@@ -68,10 +63,10 @@ class Section:
 
 
 def completion_page(folder: Path) -> str:
-    """The page on the completion in `folder`.
+    """Render the page of the completion in `folder`.
 
     Raises:
-        InputError: where it holds none, or one of another version, or a damaged one.
+        InputError: if the folder has no completion, a damaged one, or one of another version.
     """
     found = read_finished(folder)
     summary, record = found.summary, found.record
@@ -94,7 +89,7 @@ def completion_page(folder: Path) -> str:
             "pitch": PITCH,
             "scores": score_tables(summary),
             "bars": time_bars("Seconds by stage", stages_of(summary)),
-            "total": f"{shown(summary.seconds.get('total'), 1)} s in all, on {summary.device}.",
+            "total": f"{shown(summary.seconds.get('total'), 1)} s in total on {summary.device}.",
             "settings": settings_table(summary),
             "viewer": viewer,
         },
@@ -102,25 +97,25 @@ def completion_page(folder: Path) -> str:
 
 
 def viewer_of(folder: Path) -> str | None:
-    """The address of the viewer's page, where there is one."""
+    """Return the address of the viewer's page if it exists."""
     return VIEWER if os.path.isfile(folder / VIEWER) else None
 
 
 def title_of(summary: Summary) -> str:
-    """What the scene is called: the name of its folder, or of the splat that was brought."""
+    """Choose the title: the name of the scene folder or of the input splat."""
     path = summary.scene.splat or str(summary.settings.get("folder") or "")
     return Path(path).name or "Scene"
 
 
 def unit_of(summary: Summary) -> str:
-    """What lengths are in: metres where the format says so and no splat has a frame of its own."""
+    """Return metres if the format defines them and the splat has no frame of its own."""
     format = FORMATS.get(summary.scene.format)
     known = format is not None and format.unit is not None and summary.frame.method == "given"
     return str(format.unit) if format is not None and known else "scene units"
 
 
 def facts_of(summary: Summary) -> list[tuple[str, str]]:
-    """The numbers at the head of the page."""
+    """List the numbers at the head of the page."""
     covered = summary.coverage
     facts = [
         ("covered around the photographs", f"{percent(covered.before)} → {percent(covered.after)}"),
@@ -129,13 +124,13 @@ def facts_of(summary: Summary) -> list[tuple[str, str]]:
         ("time", f"{shown(summary.seconds.get('total'), 1)} s"),
     ]
     removed = summary.gaussians.get("removed")
-    return facts if not removed else [*facts, ("Gaussians set aside", f"{removed:,}")]
+    return facts if not removed else [*facts, ("Gaussians pruned", f"{removed:,}")]
 
 
 def section(
     number: int, row: TargetRow, kept: TargetRecord, gallery: Gallery, unit: str, viewer: str | None
 ) -> Section:
-    """What the page shows of a target."""
+    """Build the section of a target."""
     name = f"target{number}"
     limits = kept.depth_limits
     return Section(
@@ -160,7 +155,7 @@ def section(
 
 
 def target_facts(row: TargetRow) -> list[tuple[str, str]]:
-    """The numbers below the image of a target."""
+    """List the numbers below the images of a target."""
     facts = [("hole", percent(row.hole_fraction)), ("Gaussians added", f"{row.added:,}")]
     if row.anchor is not None:
         facts.append(("anchor", f"photograph {row.anchor}"))
@@ -171,7 +166,7 @@ def target_facts(row: TargetRow) -> list[tuple[str, str]]:
 
 
 def pictures_of(number: int, row: TargetRow, gallery: Gallery) -> Iterator[tuple[Picture, str]]:
-    """The pictures of a target besides before and after, as far as it has them."""
+    """Embed the images of a target other than before and after."""
     for name, caption in PICTURES.items():
         file = f"target{number}_{name}.png"
         expected = name == "hole_mask" or (name == "truth" and row.psnr_after is not None)
@@ -181,22 +176,20 @@ def pictures_of(number: int, row: TargetRow, gallery: Gallery) -> Iterator[tuple
 
 
 def fit_sentence(affine: Affine, unit: str) -> str:
-    """How the lifted depths were brought to the scene's."""
+    """Describe the depth alignment of a target."""
     sign = "−" if affine.shift < 0 else "+"
     shift = f"{sign} {shown(abs(affine.shift), 3)} {unit}"
-    words = METHODS.get(affine.method, "Depths were fitted by an unknown method")
-    said = words.format(
+    words = METHODS.get(affine.method, "The depths are aligned by an unknown method")
+    text = words.format(
         scale=shown(affine.scale, 3), shift=shift, inliers=percent(affine.inliers, 0)
     )
     if affine.agreement is None:
-        return f"{said}."
-    return (
-        f"{said}. At the target {percent(affine.agreement, 0)} of what is seen of the scene agree."
-    )
+        return f"{text}."
+    return f"{text}. At the target, {percent(affine.agreement, 0)} of the visible scene agree."
 
 
 def scatter_of(affine: Affine, kept: TargetRecord, unit: str) -> Markup | None:
-    """The depths that the affine was fitted to; None where none were kept."""
+    """Plot the depths that the alignment was fitted to, or return None without any."""
     if kept.pairs is None:
         return None
     pairs = zip(kept.pairs.predicted, kept.pairs.context, kept.pairs.agrees, strict=False)
@@ -204,7 +197,7 @@ def scatter_of(affine: Affine, kept: TargetRecord, unit: str) -> Markup | None:
 
 
 def curves_of(kept: TargetRecord) -> Iterator[tuple[Markup, str]]:
-    """The losses of a target, as far as there are any."""
+    """Plot the recorded losses of a target."""
     for name, caption in CURVES.items():
         curve = loss_curve(caption, kept.losses.get(name, ()))
         if curve is not None:
@@ -212,32 +205,34 @@ def curves_of(kept: TargetRecord) -> Iterator[tuple[Markup, str]]:
 
 
 def coverage_sentence(summary: Summary) -> str:
-    """How much is covered, before and after."""
+    """Describe the coverage around the photographs."""
     covered = summary.coverage
     return (
-        f"{covered.cameras} cameras around the photographs, which nothing was completed for, see "
-        f"{percent(covered.before)} of their images covered before and "
-        f"{percent(covered.after)} after."
+        f"{covered.cameras} cameras around the photographs, none of them a target, test the "
+        f"result: the scene covers {percent(covered.before)} of their images before and "
+        f"{percent(covered.after)} after the completion."
     )
 
 
 def around(found: Finished, gallery: Gallery) -> Iterator[tuple[Slider, str]]:
-    """What cameras around the photographs see, those that changed most."""
+    """Embed the surrounding views that changed most."""
     for number, look in enumerate(found.record.around, start=1):
         slider = gallery.slider(f"around{number}", f"Camera {number} around the photographs")
         yield slider, f"{percent(look.before, 0)} → {percent(look.after, 0)} covered"
 
 
 def ignored_pictures(summary: Summary, gallery: Gallery) -> Iterator[tuple[Picture, str]]:
-    """The photographs of the context of which something is ignored, with that painted over."""
+    """Embed the photographs that have ignored pixels."""
     for number, row in enumerate(summary.context, start=1):
         if row.ignored > 0:
-            caption = f"Photograph {row.frame}, {percent(row.ignored)} of it ignored (magenta)"
+            caption = (
+                f"Photograph {row.frame}: {percent(row.ignored)} of the image is ignored (magenta)"
+            )
             yield gallery.photo(f"context{number}_ignored.png", caption), caption
 
 
 def cameras_of(found: Finished) -> Markup | None:
-    """The cameras in space."""
+    """Draw the cameras of the completion."""
     summary, record = found.summary, found.record
     frames = [row.frame for row in summary.context]
     cameras = placed_cameras(
@@ -250,15 +245,15 @@ def cameras_of(found: Finished) -> Markup | None:
 
 
 def cameras_caption(found: Finished) -> str:
-    """How many cameras the drawing shows."""
+    """Describe how many cameras the drawing shows."""
     record = found.record
-    drawn, count = len(record.photographs), record.num_photographs
-    of = f"{count} photographs" if drawn == count else f"{drawn} of {count} photographs"
-    return f"{of}, {len(record.context)} of the context. Drag the drawing to turn it."
+    kept, count = len(record.photographs), record.num_photographs
+    text = f"{count} photographs" if kept == count else f"{kept} of {count} photographs"
+    return f"{text}, {len(record.context)} in the context. Drag the drawing to rotate it."
 
 
 def score_tables(summary: Summary) -> list[Table]:
-    """The scores at the targets, at photographs that were not used and at those of the context."""
+    """Make the tables of scores: targets, held-out photographs, context."""
     targets = [score_row(f"{n}: {row.name}", row) for n, row in enumerate(summary.targets, start=1)]
     context = [score_row(f"photograph {row.frame}", row) for row in summary.context]
     unused = [score_row(f"photograph {row.frame}", row) for row in summary.held_out]
@@ -266,8 +261,8 @@ def score_tables(summary: Summary) -> list[Table]:
         unused.append(score_row("mean", mean_of(summary.held_out)))
     tables = [
         Table("At the targets", SCORES, targets),
-        Table("At photographs that were not used", SCORES, unused),
-        Table("At the photographs of the context", SCORES, context),
+        Table("At held-out photographs", SCORES, unused),
+        Table("At the context photographs", SCORES, context),
     ]
     return [table for table in tables if table.rows]
 
@@ -280,7 +275,7 @@ def mean_of(rows: Sequence[Scores]) -> Scores:
 
 
 def score_row(name: str, row: Scores) -> list[str]:
-    """A line of a table of scores."""
+    """Format a row of a table of scores."""
     psnr, ssim = (row.psnr_before, row.psnr_after), (row.ssim_before, row.ssim_after)
     return [
         name,
@@ -292,13 +287,13 @@ def score_row(name: str, row: Scores) -> list[str]:
 
 
 def stages_of(summary: Summary) -> dict[str, float]:
-    """Seconds of each stage."""
+    """Return the seconds of each stage without the total."""
     return {name: seconds for name, seconds in summary.seconds.items() if name != "total"}
 
 
 def settings_table(summary: Summary) -> Table:
-    """Everything that decided the result."""
-    told = {
+    """Make the table of all settings."""
+    facts = {
         "version": summary.version,
         "format": summary.scene.format,
         "near": summary.depth_range.near,
@@ -306,12 +301,12 @@ def settings_table(summary: Summary) -> Table:
         "seed": summary.seed,
         "device": summary.device,
     }
-    rows = [*flat({"settings": summary.settings}), *flat({"found": told})]
-    return Table("Everything that decided the result", ("setting", "value"), rows)
+    rows = [*flat({"settings": summary.settings}), *flat({"found": facts})]
+    return Table("All settings", ("setting", "value"), rows)
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Settings in settings as one list of names with dots, and values as JSON."""
+    """Flatten nested settings to dotted names with values as JSON."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{name}.")

@@ -1,4 +1,4 @@
-"""Depth maps as pictures: the colours of viridis over the logarithm of z-depth, grey for none."""
+"""Depth maps as images: viridis over the logarithm of z-depth, grey without depth."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from gscompleter.io.image import COMPRESSION
 from gscompleter.types import DepthMap
 
 NONE = (128, 128, 128)
-"""The colour of pixels without depth."""
 TAIL = 0.01
-"""Share of the depths at either end that may lie beyond the ends of the colours."""
+"""Fraction of the depths at either end that the colours do not resolve."""
 
 
 def colours() -> UInt8[np.ndarray, "256 3"]:
-    """The palette: first the colour of no depth, then viridis from near to far."""
+    """Make the palette: grey for no depth, then viridis from near to far."""
     steps = np.linspace(0, 255, 255).round().astype(np.uint8)
     viridis = cv2.applyColorMap(steps, cv2.COLORMAP_VIRIDIS).reshape(-1, 3)[:, ::-1]
     return np.concatenate([np.array([NONE], np.uint8), viridis])
 
 
 def limits_of(maps: Sequence[DepthMap]) -> tuple[float, float] | None:
-    """The depths at both ends of the colours, for all of `maps`; None where there are none."""
+    """Compute the nearest and farthest depth of the colours, or None without any depth."""
     known = np.concatenate([depths_of(m)[is_known(m)] for m in maps])
     if len(known) == 0:
         return None
@@ -38,11 +37,7 @@ def limits_of(maps: Sequence[DepthMap]) -> tuple[float, float] | None:
 
 
 def write_depth(path: Path, depth: DepthMap, limits: tuple[float, float]) -> None:
-    """Write a depth map as a PNG with a palette; `limits` are the depths at the ends of it.
-
-    Raises:
-        InputError: where the file cannot be written.
-    """
+    """Write a depth map as a palette PNG with colours between `limits`."""
     near, far = np.log(limits)
     known = is_known(depth)
     place = (np.log(depths_of(depth), where=known, out=np.zeros(known.shape)) - near) / (far - near)
@@ -54,11 +49,11 @@ def write_depth(path: Path, depth: DepthMap, limits: tuple[float, float]) -> Non
 
 
 def depths_of(depth: DepthMap) -> np.ndarray:
-    """z-depths [h, w] on the CPU."""
+    """Copy z-depths [h, w] to the CPU."""
     return depth.depth.detach().cpu().double().numpy()
 
 
 def is_known(depth: DepthMap) -> np.ndarray:
-    """Where a depth map [h, w] holds a depth."""
+    """Compute the mask [h, w] of pixels with a depth."""
     finite = torch.isfinite(depth.depth) & (depth.depth > 0)
     return (depth.valid & finite).cpu().numpy()

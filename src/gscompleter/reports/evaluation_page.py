@@ -1,4 +1,4 @@
-"""The page on a run of `evaluate`, made of its tables and plots."""
+"""The report page of an evaluation, made from its tables and plots."""
 
 from __future__ import annotations
 
@@ -16,16 +16,13 @@ from gscompleter.reports.plain_words import shown
 from gscompleter.reports.summary import GROUPS, Column, stage_place
 
 TABLES = "tables.json"
-"""The file that says a folder holds an evaluation."""
 TIMINGS = "timings.json"
-ADVICE = "let `tables` write it again"
-"""What to do about a damaged file."""
+ADVICE = "run `gscompleter tables` again"
 PLOTS = {
-    "gain_by_hole": "Gain at the target against the size of the hole",
-    "gain_by_distance": "Gain at the target against the distance from what was given",
-    "seconds": "Median seconds of a step, by stage",
+    "gain_by_hole": "ΔPSNR at the target by hole size",
+    "gain_by_distance": "ΔPSNR at the target by distance from the context",
+    "seconds": "Median seconds of a step by stage",
 }
-"""By the names of their files, what the plots show."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +52,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Tables:
-    """`tables.json`, as far as the page needs it."""
+    """The parts of `tables.json` that the page shows."""
 
     cases: int
     common: tuple[str, ...]
@@ -64,22 +61,21 @@ class Tables:
     fid: Fid
     failures: tuple[Failure, ...]
     notes: tuple[str, ...] = ()
-    """Notes on the scores, a sentence or two each."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What a method took."""
+    """Median seconds by stage and peak memory of a method."""
 
     seconds: Mapping[str, float]
     peak_bytes: float | None
 
 
 def evaluation_page(folder: Path) -> str:
-    """The page on the evaluation in `folder`.
+    """Render the page of the evaluation in `folder`.
 
     Raises:
-        InputError: where it holds none, or a damaged one.
+        InputError: if the folder has no evaluation, or a damaged one.
     """
     check_results(folder, TABLES)
     tables = as_written(Tables, read_json(folder / TABLES, ADVICE), folder / TABLES, ADVICE)
@@ -88,7 +84,7 @@ def evaluation_page(folder: Path) -> str:
         "evaluation.html",
         {
             "facts": [
-                ("cases that all finished", f"{len(tables.common)} of {tables.cases}"),
+                ("cases finished by all methods", f"{len(tables.common)} of {tables.cases}"),
                 ("methods", str(len(tables.methods))),
                 ("failed", str(len(tables.failures))),
             ],
@@ -105,20 +101,16 @@ def evaluation_page(folder: Path) -> str:
 
 
 def read_timings(path: Path) -> dict[str, Timing]:
-    """By method, what it took.
-
-    Raises:
-        InputError: where the file is missing or damaged.
-    """
+    """Read the timings by method."""
     content = read_json(path, ADVICE)
     if not isinstance(content, Mapping):
-        raise InputError(f"{quoted(path)} is not what an evaluation writes; {ADVICE}.")
+        raise InputError(f"{quoted(path)} is not a file of timings; {ADVICE}.")
     methods = {name: value for name, value in content.items() if name != "steps"}
     return {name: as_written(Timing, value, path, ADVICE) for name, value in methods.items()}
 
 
 def score_tables(tables: Tables) -> Iterator[Table]:
-    """The tables of scores, each with the columns that any method has a value in."""
+    """Make the tables of scores, without columns that have no value."""
     for title, columns in GROUPS.items():
         present = [c for c in columns if any(cell_of(row, c) for row in tables.methods.values())]
         rows = [
@@ -136,13 +128,13 @@ def score_tables(tables: Tables) -> Iterator[Table]:
 
 
 def cell_of(row: Mapping[str, int | Score], column: Column) -> Score | None:
-    """The entry of a method in a column; None where it has no value."""
+    """Return the entry of a method in a column, or None without a value."""
     score = row.get(column.key)
     return score if isinstance(score, Score) and score.value is not None else None
 
 
 def score_text(score: Score | None, column: Column, count: int) -> str:
-    """A score, and of how many cases it is where that is not all `count`."""
+    """Format a score, with the number of its cases if that is not `count`."""
     if score is None:
         return "–"
     number = shown(score.value, column.digits)
@@ -150,24 +142,24 @@ def score_text(score: Score | None, column: Column, count: int) -> str:
 
 
 def distance_table(tables: Tables) -> Table | None:
-    """The gain by the distance from the known views; None where there is one distance."""
+    """Make the table of ΔPSNR by distance, or return None for a single distance."""
     gains = tables.gain_by_distance
     if len(gains) < 2:
         return None
     rows = [[m, *(shown(gains[gap].get(m)) for gap in gains)] for m in tables.methods]
-    caption = "Mean gain in dB, by frames from the target to the nearest context frame"
+    caption = "Mean ΔPSNR in dB by frames from the target to the nearest context frame"
     return Table(caption, ["method", *gains], rows)
 
 
 def fid_sentence(fid: Fid) -> str:
-    """FID of each method, or the reason why there is none."""
+    """Describe the FID of each method."""
     if fid.reason is not None:
         return f"FID: {fid.reason}."
     return "FID: " + ", ".join(f"{method} {shown(v)}" for method, v in fid.values.items()) + "."
 
 
 def plots_of(folder: Path) -> Iterator[tuple[Picture, str]]:
-    """The plots, as far as there are any."""
+    """Embed the plots that exist."""
     gallery = gallery_of(folder)
     steps = {path.stem: "" for path in sorted(folder.glob("sequence_*.png"))}
     captions = {name: f"Steps of {name.removeprefix('sequence_')}" for name in steps}
@@ -177,12 +169,12 @@ def plots_of(folder: Path) -> Iterator[tuple[Picture, str]]:
 
 
 def totals(timings: Mapping[str, Timing]) -> dict[str, float]:
-    """By method, the seconds of a step in all."""
+    """Return the total seconds of a step by method."""
     return {method: t.seconds["total"] for method, t in timings.items() if "total" in t.seconds}
 
 
 def timing_table(timings: Mapping[str, Timing]) -> Table:
-    """Median seconds by stage, and the most memory."""
+    """Make the table of median seconds by stage and of peak memory."""
     stages = sorted({stage for t in timings.values() for stage in t.seconds}, key=stage_place)
     rows = []
     for method, timing in timings.items():
@@ -190,11 +182,11 @@ def timing_table(timings: Mapping[str, Timing]) -> Table:
         seconds = (shown(timing.seconds.get(stage)) for stage in stages)
         rows.append([method, *seconds, shown(memory)])
     return Table(
-        "Median seconds of a step, and the most memory (GiB)", ["method", *stages, "memory"], rows
+        "Median seconds of a step and peak memory (GiB)", ["method", *stages, "memory"], rows
     )
 
 
 def failure_table(failures: Sequence[Failure]) -> Table | None:
-    """What failed and why; None where nothing did."""
+    """Make the table of failures, or return None without any."""
     rows = [[failure.case, failure.method, failure.reason] for failure in failures]
     return Table("Failed", ("case", "method", "reason"), rows) if rows else None

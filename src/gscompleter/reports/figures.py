@@ -1,7 +1,4 @@
-"""Figures of a report as SVG elements: curves, dots, bars, a scale of colours, cameras in space.
-
-Elements are built and serialized by the standard library, which escapes every text in them.
-"""
+"""SVG figures of a report: curves, scatter plots, bars, colour scales."""
 
 from __future__ import annotations
 
@@ -16,20 +13,16 @@ from markupsafe import Markup
 from gscompleter.reports.depth_picture import NONE, colours
 
 WIDTH, HEIGHT = 360.0, 220.0
-"""Of a plot, in the units of its viewBox."""
 LEFT, BOTTOM, TOP, RIGHT = 52.0, 40.0, 12.0, 12.0
 """Margins around the axes."""
 BAR, GAP = 16.0, 10.0
-"""Height of a bar, and the space below it."""
 NAMES, LONGEST = 96.0, 230.0
-"""Width of what stands before bars, and of the longest bar."""
 COLOURS = 48
-"""Patches of a scale of colours."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A linear axis: the values at both ends, and where these are drawn."""
+    """A linear axis: its range in values and in drawing units."""
 
     low: float
     high: float
@@ -37,12 +30,12 @@ class Axis:
     end: float
 
     def __call__(self, value: float) -> float:
-        """Where `value` is drawn."""
+        """Compute the drawing position of a value."""
         return self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start)
 
 
 def figure(title: str, description: str, width: float, height: float, kind: str) -> Element:
-    """An empty drawing with its texts for those who do not see it."""
+    """Create an empty drawing with a title and a description for screen readers."""
     svg = Element(
         "svg", {"viewBox": f"0 0 {width:g} {height:g}", "role": "img", "class": f"figure {kind}"}
     )
@@ -52,12 +45,12 @@ def figure(title: str, description: str, width: float, height: float, kind: str)
 
 
 def markup(svg: Element) -> Markup:
-    """A drawing as part of a page."""
+    """Serialize a drawing for a page."""
     return Markup(tostring(svg, encoding="unicode"))
 
 
 def put(parent: Element, tag: str, text: str | None = None, **attributes: object) -> Element:
-    """A new element; numbers are written with two decimals, `class_` as class."""
+    """Add an element; numbers get two decimals, and `class_` becomes class."""
     written = {
         name.rstrip("_").replace("_", "-"): number(value) for name, value in attributes.items()
     }
@@ -67,12 +60,12 @@ def put(parent: Element, tag: str, text: str | None = None, **attributes: object
 
 
 def number(value: object) -> str:
-    """A number of an attribute, or its text."""
+    """Format the value of an attribute."""
     return f"{round(value, 2):g}" if isinstance(value, float) else str(value)
 
 
 def ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Round numbers from `low` to `high`."""
+    """Return round numbers from `low` to `high`."""
     raw = (high - low) / most
     size = 10.0 ** math.floor(math.log10(raw))
     step = next(size * factor for factor in (1, 2, 5, 10) if size * factor >= raw * (1 - 1e-9))
@@ -82,16 +75,16 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def span(values: Sequence[float]) -> tuple[float, float]:
-    """The range of an axis that shows `values`, never empty."""
+    """Compute an axis range around `values`, never empty."""
     low, high = min(values), max(values)
-    room = 0.05 * ((high - low) or abs(high) or 1.0)
-    return low - room, high + room
+    padding = 0.05 * ((high - low) or abs(high) or 1.0)
+    return low - padding, high + padding
 
 
 def plot(
     svg: Element, x: tuple[float, float], y: tuple[float, float], names: Sequence[str]
 ) -> list[Axis]:
-    """Draw the two axes called `names` with their grid; returns them."""
+    """Draw two axes with a grid and return them."""
     low, middle = HEIGHT - BOTTOM, (HEIGHT - BOTTOM + TOP) / 2
     across, up = Axis(*x, LEFT, WIDTH - RIGHT), Axis(*y, low, TOP)
     for value in ticks(*x):
@@ -109,18 +102,18 @@ def plot(
 
 
 def label(svg: Element, text: str, kind: str, x: float, y: float, anchor: str = "start") -> Element:
-    """Write a text whose start, middle or end lies at a place."""
+    """Add a text at a position."""
     return put(svg, "text", text, class_=kind, x=x, y=y, text_anchor=anchor)
 
 
 def loss_curve(title: str, losses: Sequence[float]) -> Markup | None:
-    """The loss of each iteration; None where there are less than two."""
+    """Plot the loss over the iterations, or return None for less than two."""
     known = [(float(k), loss) for k, loss in enumerate(losses, start=1) if math.isfinite(loss)]
     if len(known) < 2:
         return None
     first, last = known[0][1], known[-1][1]
-    told = f"A curve over {len(losses)} iterations, from {first:.3g} to {last:.3g}."
-    svg = figure(title, told, WIDTH, HEIGHT, "plot")
+    text = f"A curve over {len(losses)} iterations, from {first:.3g} to {last:.3g}."
+    svg = figure(title, text, WIDTH, HEIGHT, "plot")
     x, y = plot(
         svg, (0.0, float(len(losses))), span([loss for _, loss in known]), ("iteration", "loss")
     )
@@ -132,21 +125,21 @@ def loss_curve(title: str, losses: Sequence[float]) -> Markup | None:
 def affine_scatter(
     pairs: Sequence[tuple[float, float, bool]], scale: float, shift: float, unit: str
 ) -> Markup | None:
-    """Lifted against scene depths with the affine through them; None where there are none.
+    """Plot lifted against scene depths with the fitted line, or return None without pairs.
 
     Args:
-        pairs: Lifted depth, depth of the scene, and whether the affine brings one to the other.
-        scale: Of the affine.
-        shift: Of the affine.
-        unit: What depths are in.
+        pairs: Lifted depth, scene depth, and True for an inlier.
+        scale: Scale of the fit.
+        shift: Shift of the fit.
+        unit: Unit of the depths.
     """
     known = [pair for pair in pairs if math.isfinite(pair[0] + pair[1])]
     if not known or not math.isfinite(scale + shift):
         return None
     share = sum(agrees for *_, agrees in known) / len(known)
     line = f"{scale:.3f} times depth plus {shift:.3g}"
-    told = f"{len(known)} pixels; {share:.0%} lie on the line {line}."
-    svg = figure("Depths before and after the affine", told, WIDTH, HEIGHT, "plot")
+    text = f"{len(known)} pixels; {share:.0%} lie on the line {line}."
+    svg = figure("Lifted depth against scene depth", text, WIDTH, HEIGHT, "plot")
     ranges = span([p for p, _, _ in known]), span([c for _, c, _ in known])
     x, y = plot(svg, *ranges, (f"lifted depth ({unit})", f"scene depth ({unit})"))
     for agrees, kind in ((False, "outlier"), (True, "inlier")):
@@ -162,7 +155,7 @@ def affine_scatter(
 def line_within(
     scale: float, shift: float, x: tuple[float, float], y: tuple[float, float]
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """The ends of the part of a rising line that lies in a rectangle; None where there is none."""
+    """Clip a rising line to a rectangle, or return None if they do not meet."""
     if scale <= 0:
         return None
     low, high = max(x[0], (y[0] - shift) / scale), min(x[1], (y[1] - shift) / scale)
@@ -170,14 +163,14 @@ def line_within(
 
 
 def time_bars(title: str, seconds: Mapping[str, float]) -> Markup | None:
-    """A bar for each stage, with its seconds; None where nothing took any."""
+    """Draw one bar per stage, or return None if no stage took time."""
     known = {name: s for name, s in seconds.items() if math.isfinite(s) and s >= 0}
     longest = max(known.values(), default=0.0)
     if longest <= 0:
         return None
-    told = ", ".join(f"{name} {s:.2f} s" for name, s in known.items())
+    text = ", ".join(f"{name} {s:.2f} s" for name, s in known.items())
     height = len(known) * (BAR + GAP)
-    svg = figure(title, f"{told}.", NAMES + LONGEST + 60, height, "bars")
+    svg = figure(title, f"{text}.", NAMES + LONGEST + 60, height, "bars")
     for row, (name, s) in enumerate(known.items()):
         top, width = row * (BAR + GAP), s / longest * LONGEST
         label(svg, name, "name", NAMES - 8, top + 13, "end")
@@ -187,25 +180,25 @@ def time_bars(title: str, seconds: Mapping[str, float]) -> Markup | None:
 
 
 def colour_scale(limits: tuple[float, float], unit: str) -> Markup | None:
-    """The colours of pictures of depth, with the depths that they stand for."""
+    """Draw the colours of depth images with their depths."""
     near, far = limits
     if not 0 < near < far < math.inf:
         return None
-    told = f"From {near:.3g} to {far:.3g} {unit}, by the logarithm; grey where there is no depth."
-    svg = figure("Colours of depth", told, WIDTH, 44.0, "scale")
+    text = f"From {near:.3g} to {far:.3g} {unit} on a logarithmic scale; grey means no depth."
+    svg = figure("Depth colours", text, WIDTH, 44.0, "scale")
     wide = WIDTH - 88
     for k, colour in enumerate(colours()[np.linspace(1, 255, COLOURS).astype(int)].tolist()):
         patch(svg, k * wide / COLOURS, wide / COLOURS + 0.5, colour)
     for share, anchor in ((0.0, "start"), (0.5, "middle"), (1.0, "end")):
         depth = near * (far / near) ** share
-        text = f"{depth:.3g} {unit}" if share == 1 else f"{depth:.3g}"
-        label(svg, text, "tick", share * wide, 30.0, anchor)
+        tick = f"{depth:.3g} {unit}" if share == 1 else f"{depth:.3g}"
+        label(svg, tick, "tick", share * wide, 30.0, anchor)
     patch(svg, wide + 16, 14.0, NONE)
     label(svg, "no depth", "tick", wide + 34, 12.0)
     return markup(svg)
 
 
 def patch(svg: Element, x: float, width: float, colour: Sequence[int]) -> None:
-    """Draw a patch of a scale of colours."""
+    """Draw a patch of a colour scale."""
     fill = "#{:02x}{:02x}{:02x}".format(*colour)
     put(svg, "rect", x=x, y=0.0, width=width, height=14.0, fill=fill, shape_rendering="crispEdges")

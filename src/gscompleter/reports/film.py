@@ -1,7 +1,7 @@
-"""A film of a completion: a way through the holes, before and after side by side.
+"""A video that moves through the completed holes, before and after side by side.
 
-The camera starts at the photograph nearest to the first target, goes through each target, and comes
-back the same way, so that it may be shown again and again, and every picture is drawn once.
+The camera starts at the photograph nearest to the first target, passes all targets and returns the
+same way, so the video can loop and each frame is rendered once.
 """
 
 from __future__ import annotations
@@ -27,43 +27,26 @@ from gscompleter.stages.candidates import resized, shrunk
 from gscompleter.types import Camera, Completion
 
 NAME = "video.mp4"
-"""The file in the output folder."""
 RATE = 24
-"""Frames per second."""
 SECONDS = 3.0
-"""Of the way there; the way back takes as long."""
+"""Duration of one direction."""
 FRAMES = round(RATE * SECONDS)
-"""Frames that are drawn where targets are few."""
+"""Frames rendered if there are few targets."""
 MIN_LEG = 0.75
-"""Seconds, at least, from one camera to the next."""
 MAX_TARGETS = 6
-"""Targets that it goes through at most: the first ones."""
 MAX_SIDE = 640
-"""Pixels of the longer side of one half at most, where that is no narrower than `MIN_WIDTH`."""
+"""Longer side of one half in pixels, unless `MIN_WIDTH` needs more."""
 GAP = 4
-"""Pixels between the halves."""
 MIN_WIDTH = 720
-"""Pixels of a row of the film at least, both halves and the gap together."""
+"""Smallest width of the video in pixels."""
 LABEL = 12
-"""Pixels of the letters at least."""
 MAX_PHOTOGRAPHS = 200
-"""Photographs, evenly drawn from all, that it may come by."""
 
 
 def write_film(
     folder: Path, completion: Completion, photographs: Sequence[Camera], renderer: Renderer
 ) -> None:
-    """Write `video.mp4` into a folder that nobody reads yet; nothing where there is no target.
-
-    Args:
-        folder: Where to.
-        completion: What was done.
-        photographs: Cameras of all photographs, in the frame of the result.
-        renderer: Draws the scene before and after.
-
-    Raises:
-        InputError: where ffmpeg fails.
-    """
+    """Write `video.mp4`, or nothing without a target."""
     if not completion.targets:
         return
     way = stops(completion)
@@ -73,8 +56,10 @@ def write_film(
 
 
 def stops(completion: Completion) -> list[Camera]:
-    """The cameras that the film comes by: a photograph's, and those of targets where something was
-    added, or of all where nothing was. All see as the first target does."""
+    """Choose a photograph and the targets with added Gaussians, or all targets if none has any.
+
+    All cameras get the intrinsics of the first target.
+    """
     results = [r for r in completion.targets if len(r.added)] or list(completion.targets)
     targets = [result.target for result in results[:MAX_TARGETS]]
     photographs = [view.camera for view in completion.views]
@@ -84,29 +69,29 @@ def stops(completion: Completion) -> list[Camera]:
 
 
 def widened(camera: Camera) -> Camera:
-    """Enlarge the image of a camera, if need be, so that two of them make a film."""
+    """Enlarge the image if two of them are narrower than the video."""
     factor = max((MIN_WIDTH - GAP) / 2 / camera.width, 1.0)
     return resized(camera, math.ceil(factor * camera.width), math.ceil(factor * camera.height))
 
 
 def even(camera: Camera) -> Camera:
-    """`camera` without the last column and row of its image where their number is odd."""
+    """Crop the image to an even width and height."""
     return replace(camera, width=camera.width // 2 * 2, height=camera.height // 2 * 2)
 
 
 def frames(
     completion: Completion, cameras: Sequence[Camera], renderer: Renderer
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """What `cameras` see before and after, there and back."""
-    drawn = []
+    """Render the frames, there and back."""
+    images = []
     for camera in track(cameras, "video"):
-        drawn.append(frame(completion, camera, renderer))
-        yield drawn[-1]
-    yield from drawn[-2:0:-1]
+        images.append(frame(completion, camera, renderer))
+        yield images[-1]
+    yield from images[-2:0:-1]
 
 
 def frame(completion: Completion, camera: Camera, renderer: Renderer) -> UInt8[np.ndarray, "h w 3"]:
-    """Before and after side by side on white, each with its name."""
+    """Render before and after side by side on white, with labels."""
     images = compare(completion, camera, None, renderer)
     before = labelled(as_pixels(images.before.image), "before")
     after = labelled(as_pixels(images.after.image), "after")
@@ -115,7 +100,7 @@ def frame(completion: Completion, camera: Camera, renderer: Renderer) -> UInt8[n
 
 
 def labelled(image: UInt8[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """`image` with its name in a corner, white on a dark field, so that it can be read on all."""
+    """Write a label in the corner, white on a dark box."""
     size = max(LABEL, image.shape[0] // 24)
     font, canvas = ImageFont.load_default(size), Image.fromarray(image)
     draw, inset = ImageDraw.Draw(canvas, "RGBA"), size // 2

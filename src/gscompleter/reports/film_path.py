@@ -1,7 +1,7 @@
-"""The way of a film's camera: from stop to stop along the photographs, smooth, its horizon level.
+"""The camera path of a video: smooth, near the photographs, with a level horizon.
 
-Between two targets that stand far apart a straight line may lead through what is looked at; where
-photographs were taken there is room, and the scene looks best.
+A straight line between distant targets may pass through surfaces. Around the photographs
+there is free space, and the scene is sharpest.
 """
 
 from __future__ import annotations
@@ -22,24 +22,21 @@ from gscompleter.stages.candidates import places, upward
 from gscompleter.types import Camera
 
 WINDOW = 0.15
-"""Share of the frames of a leg, to either side, that corners are rounded over."""
+"""Half width of the smoothing window, as a fraction of a leg."""
 ABOUT_UP = 1e-3
-"""How much the top of the images counts for what is up, against that their rows are level."""
+"""Weight of the image's up direction against level image rows."""
 ROUGHLY = 0.7
-"""Cosine of the angle within which images of photographs that are not turned show it there."""
+"""Cosine limit between a camera's up direction and the mean for cameras held upright."""
 STEEP = 0.99
-"""Cosine of the angle to what is up, from which on a camera has no horizon to keep level."""
+"""Cosine to the vertical above which a camera has no horizon."""
 
 
 def path_through(
     stops: Sequence[Camera], photographs: Sequence[Camera], count: int
 ) -> list[Camera]:
-    """The cameras of a way that slows down at each stop.
+    """Plan a path through two or more stops, with `count` frames from one to the next.
 
-    Args:
-        stops: Where it comes by, in this order; at least two.
-        photographs: Cameras that it may come by, too.
-        count: Frames from one stop to the next.
+    It slows down at each stop and may pass the photographs.
     """
     up = vertical([*stops, *photographs])
     legs = [leg(a, b, photographs, up, count) for a, b in pairwise(stops)]
@@ -53,7 +50,7 @@ def leg(
     up: Float[Tensor, "3"],
     count: int,
 ) -> list[Camera]:
-    """`count` cameras from `first` on, and `second`."""
+    """Plan `count` cameras from `first` on, and `second`."""
     way = waypoints(first, second, photographs)
     sharp = [at(way, smoothstep(k / count)) for k in range(count + 1)]
     widths = [min(k, count - k, round(WINDOW * count)) for k in range(count + 1)]
@@ -66,21 +63,22 @@ def leg(
 
 
 def vertical(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
-    """The direction to which the rows of the images are most nearly square, upwards, of length 1.
-    Level cameras tell it exactly, however far they look up or down."""
+    """Estimate the unit up direction, to which image rows of level cameras are orthogonal."""
     about = upward(cameras).double()
     axes = torch.stack([camera.c2w[:3, :2].T for camera in cameras]).double()
     rows = axes[-axes[:, 1] @ about > ROUGHLY, 0]
-    # Where all look the same way, several directions are square to the rows.
+    # If all cameras have the same direction, several axes are orthogonal to the rows.
     slant = rows.T @ rows / len(rows) - ABOUT_UP * torch.outer(about, about)
     axis = torch.linalg.eigh(slant).eigenvectors[:, 0]
     return (axis if axis @ about > 0 else -axis).to(cameras[0].c2w)
 
 
 def waypoints(first: Camera, second: Camera, photographs: Sequence[Camera]) -> list[Camera]:
-    """`first`, photographs on the way and `second`: of all ways the one with the least sum of
-    squared steps, which takes many short ones. All see as `first` does."""
-    # Here, so that what shows no film does not wait for it.
+    """Find the path along photographs with the smallest sum of squared steps.
+
+    It prefers many short steps. All cameras get the intrinsics of `first`.
+    """
+    # Imported here, since SciPy is slow to import and only videos need it.
     from scipy.sparse.csgraph import shortest_path
 
     cameras = [first, *photographs, second]
@@ -95,7 +93,7 @@ def waypoints(first: Camera, second: Camera, photographs: Sequence[Camera]) -> l
 
 
 def at(way: Sequence[Camera], share: float) -> Camera:
-    """The camera after a share of the way, by its length."""
+    """Interpolate the path at a fraction of its length."""
     where = places(way).double().cpu()
     ends = np.concatenate([[0.0], np.cumsum((where[1:] - where[:-1]).norm(dim=1).numpy())])
     done = share * ends[-1]
@@ -105,12 +103,12 @@ def at(way: Sequence[Camera], share: float) -> Camera:
 
 
 def smoothstep(share: float) -> float:
-    """From 0 to 1, at rest at both ends."""
+    """Ease from 0 to 1 with zero speed at both ends."""
     return share * share * (3 - 2 * share)
 
 
 def mean(cameras: Sequence[Camera]) -> Camera:
-    """The camera amidst several that stand and look about alike."""
+    """Average cameras that are close to each other."""
     if len(cameras) == 1:
         return cameras[0]
     c2w = torch.stack([camera.c2w for camera in cameras]).double().mean(dim=0)
@@ -120,20 +118,20 @@ def mean(cameras: Sequence[Camera]) -> Camera:
 
 
 def level(camera: Camera, up: Float[Tensor, "3"]) -> tuple[Tensor, Tensor]:
-    """Right [3] and down [3] of a camera that looks the same way and keeps its horizon level."""
+    """Compute the right [3] and down [3] axes of a level camera with the same direction."""
     right = normalize(torch.linalg.cross(camera.forward, up), dim=0)
     return right, torch.linalg.cross(camera.forward, right)
 
 
 def roll(camera: Camera, up: Float[Tensor, "3"]) -> float:
-    """By how many radians a camera is turned about what it looks at, away from level."""
+    """Measure the rotation about the viewing direction, in radians from level."""
     right, down = level(camera, up)
     across = camera.c2w[:3, 0]
     return math.atan2((across @ down).item(), (across @ right).item())
 
 
 def rolled(camera: Camera, angle: float, up: Float[Tensor, "3"]) -> Camera:
-    """`camera` with another roll, in radians."""
+    """Set the roll of a camera, in radians."""
     right, down = level(camera, up)
     cos, sin = math.cos(angle), math.sin(angle)
     c2w = camera.c2w.clone()

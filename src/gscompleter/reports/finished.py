@@ -1,4 +1,4 @@
-"""A finished completion as its folder has it: checked on the way in, like any other file."""
+"""The output folder of a finished completion, validated as it is read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from gscompleter.io.json_file import read_json
 from gscompleter.reports.record import NAME, Record
 
 ADVICE = "complete the scene again"
-"""What to do about a damaged file."""
 
 RENAMED = {
     "context": {"gain": "exposure_gain", "contradicted": "dynamic_fraction"},
@@ -28,11 +27,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Affine:
-    """How the depths of a target were brought to the scene's."""
+    """Depth alignment of a target."""
 
     scale: float
     shift: float
-    """In scene units."""
     inliers: float
     method: str
     agreement: float | None = None
@@ -40,7 +38,7 @@ class Affine:
 
 @dataclass(frozen=True)
 class Scores:
-    """A camera against its photograph; None where there is none."""
+    """Scores of a camera against its photograph; None without one."""
 
     frame: int | None
     psnr_before: float | None
@@ -54,24 +52,23 @@ class ContextRow(Scores):
     """A photograph of the context."""
 
     exposure_gain: tuple[float, ...] | None = None
-    """By how much it is brighter than it is compared, by channel; None where it is not."""
+    """Exposure gain per channel; None if exposures were not normalized."""
     dynamic_fraction: float = 0.0
-    """Share of it that the others contradict, because something moved."""
+    """Fraction of the image in the dynamic mask."""
     ignored: float = 0.0
-    """Share of it that is ignored, because it stays the same while the camera moves."""
+    """Fraction of ignored pixels, which stay the same while the camera moves."""
 
 
 @dataclass(frozen=True)
 class HeldOutRow(Scores):
-    """A photograph that was not used."""
+    """A photograph that only scores the result."""
 
     is_check: bool = False
-    """True if a small copy of it checked the input splat."""
 
 
 @dataclass(frozen=True)
 class TargetRow(Scores):
-    """What came of a target."""
+    """Result at a target."""
 
     anchor: int | None
     anchor_fallback: bool
@@ -83,7 +80,7 @@ class TargetRow(Scores):
 
     @property
     def name(self) -> str:
-        """What the report calls it besides its number."""
+        """Name of the target beside its number."""
         if self.derived_from is not None:
             return f"near photograph {self.derived_from}"
         return "a given camera" if self.frame is None else f"photograph {self.frame}"
@@ -91,7 +88,7 @@ class TargetRow(Scores):
 
 @dataclass(frozen=True)
 class Covered:
-    """Shares of what cameras around the photographs see."""
+    """Covered fractions of the surrounding views."""
 
     before: float
     after: float
@@ -100,7 +97,7 @@ class Covered:
 
 @dataclass(frozen=True)
 class Placing:
-    """Where the .ply lies relative to the photographs."""
+    """Transform from the photographs to the .ply."""
 
     method: str
     transform: tuple[tuple[float, ...], ...]
@@ -109,7 +106,7 @@ class Placing:
 
 @dataclass(frozen=True)
 class Scene:
-    """What was opened."""
+    """The opened scene."""
 
     format: str
     photographs: int
@@ -119,7 +116,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class DepthRange:
-    """What was worked in, in scene units."""
+    """Near and far plane in scene units."""
 
     near: float | None = None
     far: float | None = None
@@ -127,7 +124,7 @@ class DepthRange:
 
 @dataclass(frozen=True)
 class Summary:
-    """`summary.json`, as far as a report needs it."""
+    """The parts of `summary.json` that a report shows."""
 
     version: str
     settings: Mapping[str, Any]
@@ -146,30 +143,31 @@ class Summary:
 
 @dataclass(frozen=True)
 class Finished:
-    """All that a report of a completion is made of."""
+    """All data of a completion report."""
 
     folder: Path
-    """Where `images/` lie."""
     summary: Summary
     record: Record
 
 
 def read_finished(folder: Path) -> Finished:
-    """What an output folder holds.
+    """Read an output folder.
 
     Raises:
-        InputError: where it is none, of another version, or damaged.
+        InputError: if it has no completion, a damaged one, or one of another version.
     """
     check_results(folder, SUMMARY)
     content = read_json(folder / SUMMARY, ADVICE)
     check_version(folder, content)
     summary = as_written(Summary, with_new_keys(content), folder / SUMMARY)
     if not os.path.isfile(folder / NAME):
-        raise InputError(f"{quoted(folder)} has no {NAME}, of which a report is made; {ADVICE}.")
+        raise InputError(f"{quoted(folder)} has no {NAME}, which the report needs; {ADVICE}.")
     record = as_written(Record, read_json(folder / NAME, ADVICE), folder / NAME)
     sizes = (len(summary.targets), len(summary.context))
     if sizes != (len(record.targets), len(record.context)):
-        raise InputError(f"{SUMMARY} and {NAME} in {quoted(folder)} differ in cameras; {ADVICE}.")
+        raise InputError(
+            f"{SUMMARY} and {NAME} in {quoted(folder)} list different numbers of cameras; {ADVICE}."
+        )
     return Finished(folder, summary, record)
 
 
@@ -188,26 +186,18 @@ def with_new_keys(content: Any) -> Any:
 
 
 def check_results(folder: Path, name: str) -> None:
-    """Make sure that `folder` is one, and holds a file called `name`.
-
-    Raises:
-        InputError: where it is or does not.
-    """
+    """Raise an InputError unless `folder` holds the file `name`."""
     if not os.path.isdir(folder):
-        raise InputError(f"There is no folder {quoted(folder)}; name one that has results.")
+        raise InputError(f"There is no folder {quoted(folder)}; name one with results.")
     if not os.path.isfile(folder / name):
         raise InputError(
-            f"{quoted(folder)} has no {name}; name the folder that a completion or an evaluation "
-            "wrote."
+            f"{quoted(folder)} has no {name}; name the output folder of a completion or an "
+            "evaluation."
         )
 
 
 def check_version(folder: Path, content: Any) -> None:
-    """Make sure that a summary is of this version.
-
-    Raises:
-        InputError: where it is of another.
-    """
+    """Raise an InputError unless this version wrote the summary."""
     version = content.get("version") if isinstance(content, Mapping) else None
     if isinstance(version, str) and version != __version__:
         raise InputError(
@@ -217,11 +207,7 @@ def check_version(folder: Path, content: Any) -> None:
 
 
 def as_written(kind: type[T], content: Any, path: Path, advice: str = ADVICE) -> T:
-    """The content of the file at `path` as a value of `kind`; an error gives `advice`.
-
-    Raises:
-        InputError: where it is not one.
-    """
+    """Validate the content of a JSON file; raise an InputError with `advice` if it does not fit."""
     from pydantic import TypeAdapter, ValidationError
 
     try:
@@ -230,6 +216,5 @@ def as_written(kind: type[T], content: Any, path: Path, advice: str = ADVICE) ->
         wrong = error.errors(include_url=False)[0]
         place = ".".join(map(str, wrong["loc"])) or "its content"
         raise InputError(
-            f"{quoted(path)} does not hold what a report needs ({quoted(place)}: "
-            f"{quoted(wrong['msg'])}); {advice}."
+            f"{quoted(path)} is damaged ({quoted(place)}: {quoted(wrong['msg'])}); {advice}."
         ) from None

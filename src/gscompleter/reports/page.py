@@ -1,7 +1,6 @@
-"""Pages that need nothing but themselves: one HTML file with its style, script and pictures inside.
+"""Self-contained HTML pages: one file with style, script and images.
 
-Whatever text a page shows, the template escapes. A policy in the page lets it load nothing and run
-no script but its own.
+Templates escape all text. A content security policy blocks all requests and other scripts.
 """
 
 from __future__ import annotations
@@ -25,38 +24,34 @@ from gscompleter.io.files import replacing
 from gscompleter.io.image import image_size, jpeg_of, read_pixels
 
 NAME = "report.html"
-"""The file in the output folder."""
 QUALITY = 85
-"""Of the JPEGs in a page, of 100."""
 MAX_PIXELS = 12_000_000
-"""Of all pictures of a page together, about 5 MB; where there are more, all are shrunk alike."""
+"""Largest sum of image pixels in a page (about 5 MB); more are scaled down."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture in a page, or the reason why there is none."""
+    """An embedded image, or the reason why it is missing."""
 
     alt: str
     width: int = 0
     height: int = 0
     uri: str | None = None
     missing: str | None = None
-    """A sentence where the file is missing or damaged."""
 
 
 @dataclass(frozen=True)
 class Slider:
-    """Two pictures of one camera, one over the other."""
+    """Two images of one camera with a movable border."""
 
     before: Picture
     after: Picture
     label: str
-    """What the slider compares."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under a head; the first cell of a row is its head."""
+    """A table of text; the first cell of a row is its head."""
 
     caption: str
     head: Sequence[str]
@@ -65,21 +60,21 @@ class Table:
 
 @dataclass(frozen=True)
 class Gallery:
-    """The pictures of a folder, embedded at one scale."""
+    """Images of a folder, embedded at one scale."""
 
     folder: Path
     scale: float = 1.0
 
     def photo(self, name: str, alt: str) -> Picture:
-        """A picture in true colours, as a JPEG."""
+        """Embed an image in full colour as a JPEG."""
         return self._embedded(name, alt, exact=False)
 
     def exact(self, name: str, alt: str) -> Picture:
-        """A mask, a picture of depth or a plot, as a PNG."""
+        """Embed a mask, depth image or plot as a PNG."""
         return self._embedded(name, alt, exact=True)
 
     def slider(self, name: str, label: str, exact: bool = False) -> Slider:
-        """The pictures called `name` before and after."""
+        """Embed an image before and after."""
         before, after = (
             self._embedded(f"{name}_{when}.png", f"{label}, {when}", exact)
             for when in ("before", "after")
@@ -96,7 +91,7 @@ class Gallery:
 
 
 def gallery_of(folder: Path) -> Gallery:
-    """The pictures of `folder`, at a scale at which all of them fit into a page."""
+    """Choose a scale at which all images of `folder` fit into a page."""
     pixels = 0
     for path in sorted(folder.glob("*.png")):
         try:
@@ -108,7 +103,7 @@ def gallery_of(folder: Path) -> Gallery:
 
 
 def shrunk(image: Image.Image, scale: float, exact: bool) -> Image.Image:
-    """`image` at `scale`; what is exact gets no colours between others."""
+    """Scale an image, without interpolation if `exact`."""
     if scale == 1:
         return image
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
@@ -116,13 +111,13 @@ def shrunk(image: Image.Image, scale: float, exact: bool) -> Image.Image:
 
 
 def data_uri(image: Image.Image, exact: bool) -> str:
-    """`image` as the address of itself: a PNG where it is exact, else a JPEG."""
+    """Encode an image as a data URI: PNG if `exact`, else JPEG."""
     kind, content = ("png", png_of(image)) if exact else ("jpeg", jpeg_of(image, QUALITY))
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def png_of(image: Image.Image) -> bytes:
-    """`image` as a PNG file, by a palette where it has few colours."""
+    """Encode an image as PNG, with a palette for up to 256 colours."""
     file = io.BytesIO()
     colours = image.getcolors(256)
     (image.quantize(256) if colours else image).save(file, format="PNG", compress_level=6)
@@ -130,7 +125,7 @@ def png_of(image: Image.Image) -> bytes:
 
 
 def rendered(template: str, values: Mapping[str, object]) -> str:
-    """The page that a template makes of `values`."""
+    """Render a template with style and script."""
     style, script = part("style.css"), part("script.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     shared = {"style": Markup(style), "script": Markup(script), "digest": digest}
@@ -138,18 +133,14 @@ def rendered(template: str, values: Mapping[str, object]) -> str:
 
 
 def write_page(folder: Path, page: str) -> None:
-    """Write `report.html`.
-
-    Raises:
-        InputError: where it cannot be written.
-    """
+    """Write `report.html`."""
     with replacing(folder / NAME) as file:
         file.write(page.encode())
 
 
 @cache
 def environment() -> Environment:
-    """Reads templates that escape all text, and know no value that is not given."""
+    """Create the template environment: escapes all text, refuses unknown names."""
     return Environment(
         loader=FunctionLoader(part),
         autoescape=True,
@@ -160,5 +151,5 @@ def environment() -> Environment:
 
 
 def part(name: str) -> str:
-    """A file of the folder `templates`."""
+    """Read a file of the folder `templates`."""
     return files(__package__).joinpath("templates").joinpath(name).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What was done otherwise than usual, in plain words."""
+"""Notes on what differs from a usual completion, as sentences."""
 
 from __future__ import annotations
 
@@ -9,129 +9,128 @@ from gscompleter.reports.finished import Summary, TargetRow
 
 PLACED = {
     "given": None,
-    "cameras": "The splat lies in the frame of its cameras.json, not in that of the photographs.",
-    "dataparser": "The splat lies in the frame that its trainer's dataparser made.",
-    "normalised": "The splat lies in a frame that its trainer normalised.",
-    "similarity": "The splat lay in a frame of its own; it was found by matching features.",
+    "cameras": "The splat is in the frame of its cameras.json, not in that of the photographs.",
+    "dataparser": "The splat is in the frame of its trainer's dataparser.",
+    "normalised": "The splat is in a frame that its trainer normalised.",
+    "similarity": "The splat is in a frame of its own, aligned by matching features.",
 }
-"""By how the frame of a splat was found, what is said of it."""
-NO_TARGET = "No camera was found that has much to gain; nothing was completed."
-"""What is said of a completion without any target."""
+NO_TARGET = "No large hole was found around the photographs; nothing was completed."
 
 
 def moved(shares: Mapping[int | None, float]) -> str | None:
-    """What is said where photographs, by their frames, are contradicted in a share of them."""
-    told = [f"{percent(share)} of frame {frame}" for frame, share in shares.items() if share > 0]
-    if not told:
+    """Describe the dynamic fractions of photographs by frame, or return None if all are 0."""
+    parts = [f"{percent(share)} of frame {frame}" for frame, share in shares.items() if share > 0]
+    if not parts:
         return None
     return (
-        f"Photographs contradict each other in {', '.join(told)}, as where something moves: what "
-        "is completed takes nothing from there."
+        f"{', '.join(parts)} show something that moves; the completion does not use these regions."
     )
 
 
 def left_out(shares: Iterable[float]) -> str | None:
-    """Describe the shares of photographs that are ignored; None where all of them is 0."""
+    """Describe the ignored fractions of photographs, or return None if all are 0."""
     most = max(shares, default=0.0)
     if most == 0:
         return None
     return (
-        f"Up to {percent(most)} of a photograph stays the same while the camera moves, as the "
-        "bonnet of a vehicle does: it is ignored, in scores too (images/context*_ignored.png)."
+        f"Up to {percent(most)} of a photograph stays the same while the camera moves, like the "
+        "bonnet of a vehicle; it is ignored, also in scores (images/context*_ignored.png)."
     )
 
 
 def exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
-    """What is said where Ψ evened out the exposures of photographs by these gains."""
+    """Describe the exposure gains of photographs, or return None without any."""
     factors = [factor for gain in gains for factor in gain or ()]
     if not factors or min(factors) <= 0:
         return None
     return (
-        "The photographs of the context differ in exposure, by a factor of up to "
-        f"{max(factors) / min(factors):.2f}; the scene has their mean, in which they are compared. "
-        "Those of targets are compared as they were taken."
+        "The exposures of the context photographs differ by a factor of up to "
+        f"{max(factors) / min(factors):.2f}; the scene has the mean exposure, at which these "
+        "photographs are scored. Target photographs are scored as they are."
     )
 
 
 def about_target(row: TargetRow) -> list[str]:
-    """Fallbacks at a target: the notes of the completion, and what no note says."""
-    said = " ".join(row.notes)
+    """List the notes of a target, with fallbacks that no note mentions."""
+    text = " ".join(row.notes)
     found = list(row.notes)
-    if row.anchor_fallback and "least-turned" not in said:
-        found.append("Every photograph is turned too far; the least-turned one is the anchor.")
-    if row.affine.method == "median" and "median" not in said:
-        found.append("RANSAC found no trustworthy fit; the median depth ratio took its place.")
-    if row.added == 0 and "nothing" not in said.lower():
+    if row.anchor_fallback and "least-turned" not in text:
+        found.append("Every view is turned too far; the least-turned one is the anchor.")
+    if row.affine.method == "median" and "median" not in text:
+        found.append(
+            "RANSAC finds no reliable depth correction; the median depth ratio replaces it."
+        )
+    if row.added == 0 and "nothing" not in text.lower():
         found.append("Nothing was added here.")
     return found
 
 
 def about_scene(summary: Summary) -> list[str]:
-    """What concerns the whole completion."""
+    """List the notes on the whole completion."""
     return [*opened(summary), *compared(summary), *came_of_it(summary)]
 
 
 def opened(summary: Summary) -> Iterator[str]:
-    """Of the photographs and the frame that they share with the result."""
-    placed = PLACED.get(summary.frame.method, "The splat lies in a frame of its own.")
+    """Describe the photographs and the frame of the result."""
+    placed = PLACED.get(summary.frame.method, "The splat is in a frame of its own.")
     if placed is not None:
-        yield f"{placed} summary.json has the transform from the photographs to the result."
+        yield f"{placed} summary.json lists the transform from the photographs to the result."
     if any(summary.frame.origin):
         yield (
-            "The coordinates are large against the distances between the cameras, so the result is "
-            "relative to a local origin; summary.json has it."
+            "The coordinates are much larger than the distances between the cameras, so the result "
+            "is relative to a local origin, which summary.json lists."
         )
-    seen_to_move = moved({row.frame: row.dynamic_fraction for row in summary.context})
-    if seen_to_move is not None:
-        yield seen_to_move
-    carried = left_out(row.ignored for row in summary.context)
-    if carried is not None:
-        yield carried
+    motion = moved({row.frame: row.dynamic_fraction for row in summary.context})
+    if motion is not None:
+        yield motion
+    static = left_out(row.ignored for row in summary.context)
+    if static is not None:
+        yield static
     if summary.settings.get("context") is None:
         yield (
-            f"Nobody named the photographs to work with: {summary.scene.used} of "
-            f"{summary.scene.photographs} were chosen."
+            f"{summary.scene.used} of {summary.scene.photographs} photographs were chosen as the "
+            "context; --context chooses others."
         )
 
 
 def compared(summary: Summary) -> Iterator[str]:
-    """Of what the scores mean."""
-    evened = exposures([row.exposure_gain for row in summary.context])
-    if evened is not None:
-        yield evened
+    """Describe how the images are scored."""
+    exposure = exposures([row.exposure_gain for row in summary.context])
+    if exposure is not None:
+        yield exposure
     if summary.settings.get("uses_target_photographs"):
         yield (
-            "The generator was shown the photographs of the targets, so the scores measure where "
-            "things were put and not what was synthesized."
+            "The generator uses the photographs of the targets, so the scores measure the geometry "
+            "and not the synthesized images."
         )
     if summary.targets and all(row.psnr_after is None for row in summary.targets):
-        yield "No photograph of a target exists, so nothing is scored there."
+        yield "No target has a photograph, so there are no scores at targets."
 
 
 def came_of_it(summary: Summary) -> Iterator[str]:
-    """Of the scene that came of it."""
+    """Describe the completed scene."""
     removed = summary.gaussians.get("removed")
     if removed is not None:
         yield (
-            "The scene was brought, and counts as a hole where no photograph supports it. "
-            f"{removed:,} of its Gaussians stood in the way and were set aside."
+            f"{removed:,} Gaussians of the input splat were pruned because they covered holes; "
+            "regions that no photograph confirms count as holes."
         )
     if not summary.targets:
         yield NO_TARGET
 
 
 def shown(value: float | None, digits: int = 2) -> str:
-    """A number; a dash where there is none, or none that can be written."""
+    """Format a number, with a dash for None or an infinite one."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def percent(share: float | None, digits: int = 1) -> str:
-    """A share of one, as a percentage."""
+    """Format a fraction as a percentage."""
     return "–" if share is None or not math.isfinite(share) else f"{100 * share:.{digits}f} %"
 
 
 def gain(before: float | None, after: float | None, digits: int = 2) -> str:
-    """By how much a score rose, with its sign."""
+    """Format the change of a score with its sign."""
     if before is None or after is None or not math.isfinite(after - before):
         return "–"
     rise = round(after - before, digits)

@@ -1,5 +1,4 @@
-"""Pictures of a run: gain against the size of the hole and against distance, time by stage, and the
-steps of sequences."""
+"""Plots of a run: ΔPSNR by hole size and distance, time by stage, steps of sequences."""
 
 from __future__ import annotations
 
@@ -18,35 +17,29 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MARKERS = "osD^vP*X<>"
-"""One for each method, again from the first where they run out."""
 
 
 class PlotsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in a sentence)
-    """The library that draws is missing."""
+    """Error for a missing matplotlib."""
 
 
 def plots(summary: Summary, out: Path) -> list[Path]:
-    """Draw the plots of a run into `out`, as far as there is something to show.
+    """Draw the plots of a run that have data into `out`.
 
-    `gain_by_hole.png`, `gain_by_distance.png` and `seconds.png`, and `sequence_TASK.png` for each
-    task of several steps. Where methods are compared with ours, its ablations are left out of the
-    first two, which they would fill.
-
-    Raises:
-        PlotsNotAvailable: where matplotlib is missing.
-        InputError: where a file cannot be written.
+    Writes `gain_by_hole.png`, `gain_by_distance.png`, `seconds.png`, and `sequence_TASK.png` for
+    each sequence. The first two omit ablations if other methods are compared.
     """
-    drawn = [
+    paths = [
         save_curves(out / f"sequence_{slug(name)}.png", steps)
         for name, steps in summary.sequences.items()
     ]
     if not summary.common:
-        return drawn
-    drawn.append(save_plot(out / "gain_by_hole.png", draw_gain_by_hole, summary))
+        return paths
+    paths.append(save_plot(out / "gain_by_hole.png", draw_gain_by_hole, summary))
     if len(summary.gains) > 1:
-        drawn.append(save_plot(out / "gain_by_distance.png", draw_gain_by_distance, summary))
+        paths.append(save_plot(out / "gain_by_distance.png", draw_gain_by_distance, summary))
     height = 1.5 + 0.28 * len(summary.methods)
-    return [*drawn, save_plot(out / "seconds.png", draw_seconds, summary, height)]
+    return [*paths, save_plot(out / "seconds.png", draw_seconds, summary, height)]
 
 
 CURVES: tuple[tuple[str, Callable[[Step], float | None]], ...] = (
@@ -54,11 +47,10 @@ CURVES: tuple[tuple[str, Callable[[Step], float | None]], ...] = (
     ("depth scale", lambda step: step["depth_scale"]),
     ("seconds", lambda step: step["seconds"]["total"]),
 )
-"""What is drawn of each step, one above the other."""
 
 
 def save_curves(path: Path, steps: Mapping[str, Sequence[Step]]) -> Path:
-    """A PNG of each method's steps in one sequence; errors as those of `plots`."""
+    """Plot the steps of each method in one sequence."""
     figure = new_figure(7.0)
     panels = figure.subplots(len(CURVES), sharex=True)
     for axes, (title, of) in zip(panels, CURVES, strict=True):
@@ -78,10 +70,7 @@ def save_curves(path: Path, steps: Mapping[str, Sequence[Step]]) -> Path:
 def save_plot(
     path: Path, draw: Callable[[Axes, Summary], None], summary: Summary, height: float = 4.5
 ) -> Path:
-    """A PNG of what `draw` draws, 8 inches wide; errors as those of `plots`.
-
-    The same values give the same bytes.
-    """
+    """Write a plot 8 inches wide as a PNG."""
     figure = new_figure(height)
     draw(figure.add_subplot(), summary)
     figure.legend(loc="outside right upper", fontsize="small")
@@ -89,14 +78,14 @@ def save_plot(
 
 
 def write_figure(figure: Figure, path: Path) -> Path:
-    """Write a figure as a PNG; the same values give the same bytes."""
+    """Write a figure as a PNG; equal values give equal bytes."""
     with replacing(path) as file:
         figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
     return path
 
 
 def new_figure(height: float) -> Figure:
-    """An empty figure that needs no display; PlotsNotAvailable where matplotlib is missing."""
+    """Create an empty figure; raise `PlotsNotAvailable` without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -107,14 +96,14 @@ def new_figure(height: float) -> Figure:
 
 
 def compared(methods: Sequence[str]) -> list[str]:
-    """The methods whose gains are worth a curve: not the context, and not every ablation."""
+    """Select the methods for the plots: not the context, and no ablations beside other methods."""
     ablations = {*ABLATIONS, "unconstrained", *(f"paper/{name}" for name in ABLATIONS)}
     others = [name for name in methods if name != "context" and name not in ablations]
     return others or [name for name in methods if name != "context"] or list(methods)
 
 
 def draw_gain_by_hole(axes: Axes, summary: Summary) -> None:
-    """A point for each step: how much of the target was a hole, and what was gained there."""
+    """Plot the ΔPSNR of each step against the hole fraction."""
     for number, method in enumerate(compared(summary.methods)):
         steps = [step for row in summary.rows[method] for step in row["steps"]]
         axes.plot(
@@ -128,7 +117,7 @@ def draw_gain_by_hole(axes: Axes, summary: Summary) -> None:
 
 
 def draw_gain_by_distance(axes: Axes, summary: Summary) -> None:
-    """Mean gain against the frames between the target and the nearest context frame."""
+    """Plot the mean ΔPSNR against the frames to the nearest context frame."""
     for number, method in enumerate(compared(summary.methods)):
         gains = {
             gap: value
@@ -141,7 +130,7 @@ def draw_gain_by_distance(axes: Axes, summary: Summary) -> None:
 
 
 def draw_seconds(axes: Axes, summary: Summary) -> None:
-    """Median seconds of each stage, one bar for each method."""
+    """Draw one bar per method with the median seconds of each stage."""
     seconds = {method: summary.seconds(method) for method in summary.methods}
     stages = sorted(
         {s for found in seconds.values() for s in found if s != "total"}, key=stage_place
@@ -158,7 +147,7 @@ def draw_seconds(axes: Axes, summary: Summary) -> None:
 
 
 def style_of(number: int) -> dict[str, Any]:
-    """How the curve of that number looks."""
+    """Return the style of a curve by its number."""
     marker = MARKERS[number % len(MARKERS)]
     return {"color": f"C{number % 10}", "marker": marker, "markersize": 5, "alpha": 0.8}
 
@@ -166,5 +155,5 @@ def style_of(number: int) -> dict[str, Any]:
 def _finish_gain(axes: Axes, label: str) -> None:
     axes.axhline(0, color="black", linewidth=0.8)
     axes.set_xlabel(label)
-    axes.set_ylabel("gain at the target (dB PSNR)")
+    axes.set_ylabel("ΔPSNR at the target (dB)")
     axes.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""`report.json`: what a report shows of a completion besides its summary and its images."""
+"""Data of `report.json`: what a report shows besides the summary and the images."""
 
 from __future__ import annotations
 
@@ -15,35 +15,30 @@ from gscompleter.metrics.coverage import Look, covered
 from gscompleter.types import Camera, Completion, DepthPairs, Gaussians, TargetCompletion
 
 NAME = "report.json"
-"""The file in the output folder."""
 MAX_PHOTOGRAPHS = 200
-"""Cameras of photographs that are kept at most."""
 MAX_POINTS = 600
-"""Places of Gaussians that are kept at most, of the context and of what was added each."""
+"""Largest number of points to keep, of the context and of the added Gaussians each."""
 MAX_LOOKS = 6
-"""Cameras around the photographs whose images are kept at most: those that change most."""
 OPAQUE = 0.3
-"""Opacity from which on a Gaussian counts as a place on a surface."""
 NOTICEABLE = 0.002
-"""Least mean difference of colour, in [0, 1], of an image that changed."""
+"""Smallest mean colour difference, in [0, 1], of a changed image."""
 
 Limits = tuple[float, float]
-"""z-depth at both ends of the colours, in scene units."""
+"""z-depths at the ends of the colours, in scene units."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a camera stands and what it looks at, in the frame of the .ply."""
+    """Pose and field of view of a camera, in the frame of the .ply."""
 
     c2w: tuple[tuple[float, ...], ...]
-    """Camera to world, three rows of four."""
     opening: tuple[float, float]
-    """Tangents of half of the opening angles, across and down."""
+    """Tangents of half the field of view, horizontally and vertically."""
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Depths that were compared for the affine, in scene units."""
+    """Depth pairs of the alignment, in scene units."""
 
     seen_from: Literal["anchor", "target"]
     predicted: tuple[float, ...]
@@ -53,19 +48,17 @@ class Pairs:
 
 @dataclass(frozen=True)
 class TargetRecord:
-    """What was kept of a target."""
+    """Data of a target."""
 
     camera: Pose
     depth_limits: Limits | None
-    """Of the pictures of depth; None where the target sees none."""
     losses: Mapping[str, tuple[float, ...]]
-    """By optimisation, the loss of each iteration."""
     pairs: Pairs | None
 
 
 @dataclass(frozen=True)
 class LookRecord:
-    """How much a camera around the photographs sees covered, as shares of its image."""
+    """Covered fractions of a surrounding view."""
 
     before: float
     after: float
@@ -73,11 +66,10 @@ class LookRecord:
 
 @dataclass(frozen=True)
 class Points:
-    """Places on surfaces of the scene, in the frame of the .ply."""
+    """Surface points of the scene, in the frame of the .ply."""
 
     means: tuple[tuple[float, float, float], ...]
     added: tuple[bool, ...]
-    """Whether a target added it."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +78,6 @@ class Record:
 
     context: tuple[Pose, ...]
     photographs: tuple[Pose, ...]
-    """Of the scene, evenly drawn from all."""
     num_photographs: int
     targets: tuple[TargetRecord, ...]
     around: tuple[LookRecord, ...]
@@ -99,14 +90,7 @@ def record_of(
     around: Sequence[Look],
     photographs: Sequence[Camera],
 ) -> Record:
-    """What is kept of a completion.
-
-    Args:
-        completion: What was done.
-        limits: For each target, the ends of the colours of its pictures of depth.
-        around: What the cameras whose images are kept saw.
-        photographs: The cameras of all photographs, in the frame of the result.
-    """
+    """Collect the data of a completion."""
     targets = zip(completion.targets, limits, strict=True)
     return Record(
         context=tuple(pose_of(view.camera) for view in completion.views),
@@ -119,20 +103,20 @@ def record_of(
 
 
 def target_record(result: TargetCompletion, limits: Limits | None) -> TargetRecord:
-    """What is kept of a target."""
+    """Collect the data of a target."""
     losses = {name: rounded(torch.tensor(values)) for name, values in result.losses.items()}
     pairs = None if result.pairs is None else pairs_record(result.pairs)
     return TargetRecord(pose_of(result.target), limits, losses, pairs)
 
 
 def pairs_record(pairs: DepthPairs) -> Pairs:
-    """Compared depths as numbers of six digits."""
+    """Round the depth pairs to six digits."""
     agrees = tuple(pairs.agrees.tolist())
     return Pairs(pairs.seen_from, rounded(pairs.predicted), rounded(pairs.context), agrees)
 
 
 def pose_of(camera: Camera) -> Pose:
-    """Where a camera stands, and how wide it sees."""
+    """Convert a camera to its pose and field of view."""
     focal_x, focal_y = camera.K[0, 0].item(), camera.K[1, 1].item()
     values = rounded(camera.c2w[:3].flatten())
     rows = tuple(values[k : k + 4] for k in (0, 4, 8))
@@ -140,7 +124,7 @@ def pose_of(camera: Camera) -> Pose:
 
 
 def points_of(completion: Completion) -> Points:
-    """Some places on the surfaces of the context and of what was added."""
+    """Sample surface points of the context and of the added Gaussians."""
     parts = [places(completion.context), places(completion.added)]
     means = tuple((x, y, z) for part in parts for x, y, z in part)
     added = tuple(number == 1 for number, part in enumerate(parts) for _ in part)
@@ -148,7 +132,7 @@ def points_of(completion: Completion) -> Points:
 
 
 def places(gaussians: Gaussians) -> list[tuple[float, ...]]:
-    """Where some of the opaque ones of `gaussians` lie."""
+    """Sample means of opaque Gaussians."""
     opaque = gaussians.means[gaussians.opacities >= OPAQUE]
     order = torch.randperm(len(opaque), generator=torch.Generator().manual_seed(0))
     chosen = opaque[order[:MAX_POINTS].to(opaque.device)]
@@ -157,27 +141,27 @@ def places(gaussians: Gaussians) -> list[tuple[float, ...]]:
 
 
 def most_changed(looks: Sequence[Look]) -> list[Look]:
-    """Those looks whose images changed most, the most changed first, if they changed at all."""
+    """Select the views whose images changed most, in descending order."""
     changes = [(look.after.image - look.before.image).abs().mean().item() for look in looks]
     order = sorted(range(len(looks)), key=changes.__getitem__, reverse=True)
     return [looks[i] for i in order[:MAX_LOOKS] if changes[i] >= NOTICEABLE]
 
 
 def spread(items: Sequence[Camera], most: int) -> Sequence[Camera]:
-    """Every n-th of `items`, at most `most` of them."""
+    """Take every n-th item so that at most `most` are left."""
     return items[:: max(1, -(-len(items) // most))]
 
 
 def as_json(record: Record) -> str:
-    """The content of the file."""
+    """Serialize the record."""
     return json.dumps(record, default=vars, separators=(",", ":")) + "\n"
 
 
 def write_record(folder: Path, record: Record) -> None:
-    """Write `report.json` into a folder that nobody reads yet."""
+    """Write `report.json`."""
     (folder / NAME).write_text(as_json(record))
 
 
 def rounded(values: Tensor) -> tuple[float, ...]:
-    """Numbers [n] of six significant digits."""
+    """Round numbers [n] to six significant digits."""
     return tuple(float(f"{value:.6g}") for value in values.detach().cpu().double().tolist())

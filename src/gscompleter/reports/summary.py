@@ -1,4 +1,4 @@
-"""What the rows of a run come to: means over its tasks, which tables and plots show."""
+"""Means over the tasks of a run, for tables and plots."""
 
 from __future__ import annotations
 
@@ -16,50 +16,47 @@ from gscompleter.runs.steps import scale_drift
 from gscompleter.runs.store import check_run, read_json, row_paths
 
 Row = dict[str, Any]
-"""What `evaluate` writes for a task and a method."""
+"""Output of `evaluate` for a task and a method."""
 
 Step = dict[str, Any]
-"""One of its steps: `steps.Step` as JSON."""
+"""A `steps.Step` as JSON."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A number about a step, as a table shows it."""
+    """A column of a table."""
 
     key: str
     title: str
     digits: int
     of: Callable[[Step], float | None]
-    """None where no truth exists."""
+    """Value of a step; None without ground truth."""
     over_steps: Callable[[Sequence[float]], float | None] = statistics.fmean
-    """What is made of the steps of a task."""
     over_tasks: Callable[[Sequence[float]], float] = statistics.fmean
-    """What is made of the tasks."""
 
     def of_row(self, row: Row) -> float | None:
-        """The number of a task; None where no step has one."""
+        """Compute the value of a task, or None if no step has one."""
         values = [value for step in row["steps"] if (value := self.of(step)) is not None]
         return self.over_steps(values) if values else None
 
 
 def psnr_before(step: Step) -> float:
-    """PSNR at the target just before a step, in dB."""
+    """Return the PSNR at the target before a step, in dB."""
     return float(step["scores"]["target_before"]["psnr"])
 
 
 def psnr_after(step: Step) -> float:
-    """PSNR at the target just after a step, in dB."""
+    """Return the PSNR at the target after a step, in dB."""
     return float(step["scores"]["target_after"]["psnr"])
 
 
 def gain_of(step: Step) -> float:
-    """PSNR at the target after less before, in dB."""
+    """Compute the ΔPSNR at the target of a step, in dB."""
     return psnr_after(step) - psnr_before(step)
 
 
 def _at(*path: str) -> Callable[[Step], float | None]:
-    """What lies there in the scores of a step; None where a score on the way is None, or is not
-    there because an earlier version scored the step."""
+    """Make a getter of a score by its path; None if missing, as in rows of earlier versions."""
     return lambda step: reduce(
         lambda found, key: None if found is None else found.get(key), path, step["scores"]
     )
@@ -102,8 +99,7 @@ IMAGES = (
     Column("context_ssim", "SSIM (context)", 3, _views("context_ssim")),
     Column("context_change", "min ΔPSNR (context)", 2, _worst_view, min, min),
 )
-"""PSNR in dB: at the target; there in and outside of the holes of the scene before; beside the
-target; at the known views. The worst change is that of the known view that lost most."""
+"""PSNR in dB at the target, in its hole and observed part, at neighbour and context views."""
 
 LOOKS = (
     Column("hole_flip", "FLIP (hole)", 3, _at("hole_looks", "flip")),
@@ -125,22 +121,24 @@ LOOKS = (
         over_tasks=statistics.median,
     ),
 )
-"""At the target, by what does not reward blur: 0 is best of FLIP, 1 of HaarPSI, and a gradient
-energy of 1 is as sharp as the photograph. Of these ratios the median over the tasks: where a
-photograph is nearly flat they are anything."""
+"""Scores at the target that do not reward blur.
+
+The best FLIP is 0 and the best HaarPSI 1; a gradient energy of 1 is as sharp as the photograph. The
+energy is a median over the tasks, since a flat photograph gives arbitrary ratios.
+"""
 
 MIN_PIXELS = 500
-"""Fewest pixels that a number of a column of geometry has to be measured over to count in it."""
+"""Smallest number of pixels over which a geometry score counts."""
 
 
 def _measured(key: str, pixels: str) -> Callable[[Step], float | None]:
-    """Return a getter of the score `key`; None if it was measured over too few `pixels`."""
+    """Make a getter of the score `key`; None if it has too few `pixels`."""
     number, count = _at(key), _at(pixels)
     return lambda step: number(step) if (count(step) or 0) >= MIN_PIXELS else None
 
 
 def _mean_and_median(key: str, title: str, digits: int, pixels: str) -> tuple[Column, Column]:
-    """Columns of the mean and the median over the tasks, where enough pixels were measured."""
+    """Make columns of the mean and median over the tasks with enough pixels."""
     mean = Column(key, title, digits, _measured(key, pixels))
     median = replace(
         mean, key=f"{key}_median", title=f"{title} (median)", over_tasks=statistics.median
@@ -149,7 +147,7 @@ def _mean_and_median(key: str, title: str, digits: int, pixels: str) -> tuple[Co
 
 
 def _pixels(key: str, title: str) -> Column:
-    """Column of the median number of pixels over all tasks, those with too few included."""
+    """Make a column of the median number of pixels over all tasks."""
     return Column(key, title, 0, _at(key), over_tasks=statistics.median)
 
 
@@ -159,7 +157,6 @@ GEOMETRY = (
     *_mean_and_median("depth_hole", "AbsRel in holes", 3, "depth_hole_pixels"),
     _pixels("depth_hole_pixels", "pixels in holes"),
 )
-"""Against true depth where it is known."""
 
 ADDED = (
     *_mean_and_median("depth_rim", "depth step at seam", 4, "align_pixels"),
@@ -168,7 +165,7 @@ ADDED = (
     *_mean_and_median("align_f_score", "F-score to context", 3, "align_pixels"),
     _pixels("align_pixels", "pixels of overlap"),
 )
-"""Added Gaussians against the scene before. All lengths are shares of the depth."""
+"""Added Gaussians against the context; lengths are relative to the depth."""
 
 LIFTED = (
     *_mean_and_median("registered_abs_rel", "AbsRel of all lifted", 4, "registered_pixels"),
@@ -176,7 +173,7 @@ LIFTED = (
     *_mean_and_median("registered_f_score", "F-score of all lifted", 3, "registered_pixels"),
     _pixels("registered_pixels", "pixels of all lifted"),
 )
-"""The same of all lifted Gaussians, as registered and before any of them were filtered."""
+"""The same for all lifted Gaussians after registration, before the hole filter."""
 
 SEQUENCE = (
     Column("psnr_before", "PSNR before", 2, psnr_before),
@@ -184,43 +181,37 @@ SEQUENCE = (
     Column("depth_scale", "depth scale", 3, _of_step("depth_scale")),
     Column("scale_drift", "scale drift", 3, _of_step("depth_scale"), scale_drift),
 )
-"""What tells steps apart that build on each other: PSNR in dB at the target of each step, just
-before it and in the scene that the last one leaves; the scale of what was added."""
 
 GROUPS = {
     "Images": IMAGES,
-    "Looks": LOOKS,
+    "Perceptual quality": LOOKS,
     "Geometry": GEOMETRY,
-    "Geometry of what was added": ADDED,
-    "Geometry of all that was lifted": LIFTED,
+    "Geometry of added Gaussians": ADDED,
+    "Geometry of all lifted Gaussians": LIFTED,
     "Sequences": SEQUENCE,
 }
-"""By the title of their table, all columns."""
 
 NOTES = {
     "reggs": (
-        "reggs starts from our metric lift and from the true poses. RegGS as the paper has it gets "
-        "neither, so the row of reggs is not the paper's."
+        "reggs gets our metric lift and the true poses. RegGS in its paper gets neither, so this "
+        "row is not comparable with that paper."
     ),
 }
-"""Notes on the rows of methods, by method."""
 
 FEW_PIXELS = (
-    f"A number of geometry counts where it was measured over at least {MIN_PIXELS} pixels; the "
-    "columns of pixels are medians over all cases."
+    f"A geometry score counts if it is measured over at least {MIN_PIXELS} pixels; the columns of "
+    "pixels are medians over all cases."
 )
-"""Note on the tables of geometry."""
 
 NO_PIXELS = (
-    "Some rows are of an earlier version, which counted no pixels, so their geometry is left out; "
-    "scoring again adds it."
+    "Some rows are from an earlier version, which counted no pixels, so their geometry is left "
+    "out; score the run again to add it."
 )
-"""Note on tables with such rows."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A mean (or the lowest value) over the tasks that have the number."""
+    """A reduced value over the tasks that have one."""
 
     value: float | None
     count: int
@@ -228,27 +219,26 @@ class Cell:
 
 @dataclass(frozen=True)
 class Summary:
-    """All that the tables show."""
+    """All data of the tables."""
 
     methods: tuple[str, ...]
     tasks: tuple[str, ...]
-    """Names of the tasks that there are rows of."""
     common: tuple[str, ...]
-    """Names of the tasks that all methods finished."""
+    """Tasks that all methods finished."""
     rows: Mapping[str, tuple[Row, ...]]
-    """By method, its rows of these tasks, in their order."""
+    """Rows of the common tasks in their order, by method."""
     sequences: Mapping[str, Mapping[str, Sequence[Step]]]
-    """By task of several steps and method, the steps as far as it came."""
+    """Finished steps by task of several steps and by method."""
     gains: Mapping[int, Mapping[str, Cell]]
-    """By distance to the known views in frames, and by method: the mean gain in dB of a step."""
+    """Mean ΔPSNR of a step in dB, by frames to the nearest context frame and by method."""
     finished: Mapping[str, int]
-    """By method, the tasks it finished."""
+    """Number of finished tasks by method."""
     failures: tuple[tuple[str, str, str], ...]
     """Task, method, reason."""
 
     @property
     def groups(self) -> dict[str, tuple[Column, ...]]:
-        """By the title of their table, the columns that may have a value."""
+        """Columns that may have a value, by the title of their table."""
         return {
             title: columns
             for title, columns in GROUPS.items()
@@ -257,12 +247,12 @@ class Summary:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Those of all groups."""
+        """Columns of all groups."""
         return tuple(column for group in self.groups.values() for column in group)
 
     @property
     def notes(self) -> list[str]:
-        """Notes on the tables, a sentence or two each."""
+        """Notes on the tables."""
         scores = [s["scores"] for rows in self.rows.values() for row in rows for s in row["steps"]]
         geometry = {
             FEW_PIXELS: bool(self.present((*GEOMETRY, *ADDED, *LIFTED))),
@@ -273,21 +263,21 @@ class Summary:
 
     @property
     def num_steps(self) -> int:
-        """How many steps the tasks that all methods finished have together."""
+        """Number of steps in the common tasks."""
         return sum(len(row["steps"]) for row in next(iter(self.rows.values())))
 
     def cell(self, method: str, column: Column) -> Cell:
-        """The entry of a table."""
+        """Compute the entry of a table."""
         return cell_of((column.of_row(row) for row in self.rows[method]), column)
 
     def present(self, columns: Iterable[Column]) -> list[Column]:
-        """Those of `columns` that any method has a value in."""
+        """Return the columns in which any method has a value."""
         return [c for c in columns if any(self.cell(m, c).count for m in self.methods)]
 
     def seconds(self, method: str) -> dict[str, float]:
-        """By stage, the median wall time over the steps.
+        """Compute the median wall time over the steps by stage.
 
-        `reconstruct` is Ψ of the photographs, once for all methods of a task; `total` is without.
+        `reconstruct` is Ψ on the photographs, once per task; `total` does not include it.
         """
         rows = self.rows[method]
         if not rows:
@@ -298,26 +288,24 @@ class Summary:
         return {"reconstruct": statistics.median(r["reconstruct_seconds"] for r in rows), **medians}
 
     def peak_bytes(self, method: str) -> int | None:
-        """The most memory that any step took; None where no system told."""
+        """Return the peak memory of all steps, or None if it is unknown."""
         peaks = (step["peak_bytes"] for row in self.rows[method] for step in row["steps"])
         return max((peak for peak in peaks if peak is not None), default=None)
 
 
 def read_rows(out: Path) -> list[Row]:
-    """The rows of a run, in the order of tasks and methods.
-
-    Raises:
-        InputError: where there are none, or one is damaged.
-    """
+    """Read the rows of a run in the order of tasks and methods."""
     check_run(out)
     rows = [read_row(path) for path in row_paths(out)]
     if not rows:
-        raise InputError(f"The run in {out} has no rows yet; let `evaluate` finish a case first.")
+        raise InputError(
+            f"The run in {out} has no finished case; run `gscompleter evaluate` first."
+        )
     return sorted(rows, key=lambda row: (row["task"]["name"], *place_of(row["method"])))
 
 
 def read_row(path: Path) -> Row:
-    """What `evaluate` wrote for a task and a method; an InputError where it is damaged."""
+    """Read the row of a task and a method."""
     row = read_json(path)
     try:
         row["task"]["name"], row["error"], row["reconstruct_seconds"]
@@ -330,12 +318,12 @@ def read_row(path: Path) -> Row:
 
 
 def place_of(method: str) -> tuple[int, str]:
-    """What sorts methods into the order of the tables."""
+    """Return the sort key of a method in tables."""
     return _place(method, list(METHODS))
 
 
 def stage_place(stage: str) -> tuple[int, str]:
-    """What sorts stages into the order in which they run."""
+    """Return the sort key of a stage in running order."""
     return _place(stage, ["reconstruct", *STAGES, "optimize"])
 
 
@@ -344,7 +332,7 @@ def _place(name: str, order: Sequence[str]) -> tuple[int, str]:
 
 
 def summarize(rows: Sequence[Row]) -> Summary:
-    """Means over the tasks that all methods finished, so that they compare the same ones."""
+    """Average over the tasks that all methods finished, for a fair comparison."""
     methods = tuple(sorted({row["method"] for row in rows}, key=place_of))
     tasks = tuple(sorted({row["task"]["name"] for row in rows}))
     by_task: dict[str, dict[str, Row]] = {name: {} for name in tasks}
@@ -373,13 +361,13 @@ def summarize(rows: Sequence[Row]) -> Summary:
 
 
 def cell_of(numbers: Iterable[float | None], column: Column) -> Cell:
-    """What `column` makes of the numbers that are known."""
+    """Reduce the known numbers as `column` says."""
     values = [value for value in numbers if value is not None]
     return Cell(column.over_tasks(values) if values else None, len(values))
 
 
 def steps_with_gaps(row: Row) -> Iterator[tuple[int, Step]]:
-    """Each step with the frames from its target to the nearest known frame: k of n-k."""
+    """Yield each step with the frames from its target to the nearest known frame: k of n-k."""
     known = list(row["task"]["context"])
     for step in row["steps"]:
         yield min(abs(step["frame"] - frame) for frame in known), step
@@ -387,7 +375,7 @@ def steps_with_gaps(row: Row) -> Iterator[tuple[int, Step]]:
 
 
 def gains_by_gap(rows: Mapping[str, Sequence[Row]]) -> dict[int, dict[str, Cell]]:
-    """The mean gain of each method at each distance from the known views."""
+    """Average the ΔPSNR of each method by distance to the known views."""
     found = {
         method: [pair for row in chosen for pair in steps_with_gaps(row)]
         for method, chosen in rows.items()

@@ -1,7 +1,6 @@
-"""Tables from the rows of a run: scores in one set of files, timings in another.
+"""Tables of a run: scores in one set of files, timings in another.
 
-The tables of scores depend on nothing but scores, so that a run that was stopped and went on gives
-the same bytes as one that was not.
+Score files contain no timings, so an interrupted and resumed run gives the same bytes.
 """
 
 from __future__ import annotations
@@ -32,35 +31,35 @@ from gscompleter.reports.summary import (
 from gscompleter.runs.store import step_path, task_folder, truth_path
 
 LPIPS_MISSING = (
-    "LPIPS: weights not available. `gscompleter.metrics.lpips.load_lpips()` fetches them; then "
-    "scoring again adds the column.\n"
+    "LPIPS: weights not available. `gscompleter.metrics.lpips.load_lpips()` downloads them; then "
+    "score the run again to add the column.\n"
 )
 FLIP_MISSING = (
-    "FLIP: not at hand. `pip install 'gscompleter[evaluation]'` brings it; then scoring again adds "
-    "the columns.\n"
+    "FLIP: not installed. Run `pip install 'gscompleter[evaluation]'`; then score the run again to "
+    "add the columns.\n"
 )
 
 
 @dataclass(frozen=True)
 class Fid:
-    """Fréchet inception distance of each method's pictures, or the reason why there is none."""
+    """Fréchet inception distance of each method, or the reason why there is none."""
 
     values: dict[str, float]
     reason: str | None = None
 
 
 def tables(out: Path, with_fid: bool = False) -> Summary:
-    """Read all rows below `out` and write tables.md, .tex and .json, and timings.md and .json.
+    """Write tables.md, .tex and .json, and timings.md and .json of a run.
 
     Args:
-        out: Folder of results.
-        with_fid: Compare the pictures of each method with the photographs by FID, too.
+        out: Folder of the run.
+        with_fid: Also compute the FID of each method against the photographs.
 
     Raises:
-        InputError: where `out` is no folder of results, or has no rows or a damaged one.
+        InputError: if `out` has no run, no rows, or a damaged one.
     """
     summary = summarize(read_rows(out))
-    fids = fid_of(out, summary) if with_fid else Fid({}, "not asked for")
+    fids = fid_of(out, summary) if with_fid else Fid({}, "not requested")
     texts = {
         "tables.md": score_markdown(summary, fids),
         "tables.tex": score_latex(summary),
@@ -75,7 +74,7 @@ def tables(out: Path, with_fid: bool = False) -> Summary:
 
 
 def fid_of(out: Path, summary: Summary) -> Fid:
-    """FID between what each method shows at the targets and the photographs."""
+    """Compute the FID of each method at the targets against the photographs."""
     steps = [
         (task_folder(out, row["task"]["name"]), number)
         for row in summary.rows[summary.methods[0]]
@@ -85,26 +84,26 @@ def fid_of(out: Path, summary: Summary) -> Fid:
         truths = [read_image(truth_path(folder, number)) for folder, number in steps]
         values = {}
         for method in summary.methods:
-            drawn = [step_path(folder, method, n).with_suffix(".png") for folder, n in steps]
-            values[method] = fid([read_image(path) for path in drawn], truths)
+            paths = [step_path(folder, method, n).with_suffix(".png") for folder, n in steps]
+            values[method] = fid([read_image(path) for path in paths], truths)
     except InputError as error:
         return Fid({}, f"not available ({error})")
     return Fid(values)
 
 
 def shown(value: float | None, digits: int) -> str:
-    """The number, or a dash where there is none."""
+    """Format a number, with a dash for None."""
     return "–" if value is None else f"{value:.{digits}f}"
 
 
 def shown_cell(cell: Cell, digits: int, count: int) -> str:
-    """The number, and of how many it is where that is not all `count`."""
+    """Format an entry, with its number of tasks if that is not `count`."""
     number = shown(cell.value, digits)
     return number if cell.count in (0, count) else f"{number} ({cell.count})"
 
 
 def score_cells(summary: Summary, columns: Sequence[Column]) -> list[list[str]]:
-    """A table of scores as text, a row per method."""
+    """Format a table of scores, one row per method."""
     n = len(summary.common)
     return [
         [method, *(shown_cell(summary.cell(method, c), c.digits, n) for c in columns)]
@@ -113,13 +112,13 @@ def score_cells(summary: Summary, columns: Sequence[Column]) -> list[list[str]]:
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table, its first column to the left and the others to the right."""
+    """Format a Markdown table with numbers aligned to the right."""
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 def score_markdown(summary: Summary, fids: Fid) -> str:
-    """Scores, what they are over, what failed, and each step of tasks of several."""
+    """Format scores, notes, failures and the steps of sequences."""
     parts = [scope(summary)]
     for title, columns in summary.groups.items():
         chosen = summary.present(columns)
@@ -142,32 +141,34 @@ def score_markdown(summary: Summary, fids: Fid) -> str:
 
 
 def scope(summary: Summary) -> str:
-    """What the numbers are over, in a paragraph."""
+    """Describe which cases the numbers cover."""
     text = (
-        f"Over the {len(summary.common)} of {len(summary.tasks)} cases that all methods finished. "
-        "A number in brackets is how many of them have the score, where not all have it.\n"
+        f"Means over the {len(summary.common)} of {len(summary.tasks)} cases that all methods "
+        "finished. A number in brackets is the number of cases with the score, if some have "
+        "none.\n"
     )
     if not summary.sequences:
         return text
     return text + (
-        f"They have {summary.num_steps} steps in all: means over the steps of each, then over the "
-        "cases. A depth scale of 1 is metric; its drift over a sequence is max(ln s) - min(ln s).\n"
+        f"They have {summary.num_steps} steps in total: means are over the steps of each case, "
+        "then over the cases. A depth scale of 1 is metric; its drift over a sequence is "
+        "max(ln s) - min(ln s).\n"
     )
 
 
 def fid_markdown(summary: Summary, fids: Fid) -> str:
-    """FID of each method, or the reason why there is none."""
+    """Format the FID of each method, or the reason why there is none."""
     if fids.reason is not None:
         return f"FID: {fids.reason}.\n"
     rows = [[method, f"{value:.2f}"] for method, value in fids.values.items()]
     return (
-        f"### FID\n\nOf {summary.num_steps} pictures against as many photographs; biased for "
-        "few pictures.\n\n" + markdown(["method", "FID"], rows)
+        f"### FID\n\n{summary.num_steps} images against as many photographs; FID is biased for "
+        "few images.\n\n" + markdown(["method", "FID"], rows)
     )
 
 
 def gain_markdown(summary: Summary) -> str:
-    """The gain against the distance from the known views."""
+    """Format the ΔPSNR by distance from the known views."""
     counts = {gap: max(c.count for c in cells.values()) for gap, cells in summary.gains.items()}
     head = ["method", *(f"{gap} ({counts[gap]})" for gap in summary.gains)]
     gains = summary.gains.items()
@@ -176,20 +177,20 @@ def gain_markdown(summary: Summary) -> str:
         for method in summary.methods
     ]
     return (
-        "### Gain by distance\n\nMean gain in dB by the frames between the target and the nearest "
-        "context frame (k of n-k), and how many cases that is.\n\n" + markdown(head, rows)
+        "### ΔPSNR by distance\n\nMean ΔPSNR in dB by the frames between the target and the "
+        "nearest context frame (k of n-k), with the number of cases.\n\n" + markdown(head, rows)
     )
 
 
 def step_markdown(name: str, by_method: Mapping[str, Sequence[Step]]) -> str:
-    """Each step of a task."""
+    """Format the steps of a task."""
     head = ["method", "frame", "anchor", "before", "after", "end", "depth scale", "added"]
     rows = [[method, *step_cells(step)] for method, steps in by_method.items() for step in steps]
     return f"### {name}\n\n" + markdown(head, rows)
 
 
 def step_cells(step: Step) -> list[str]:
-    """A step as a line of a table."""
+    """Format a step as cells of a table."""
     numbers = [psnr_before(step), psnr_after(step), step["psnr_end"]]
     return [
         str(step["frame"]),
@@ -201,8 +202,10 @@ def step_cells(step: Step) -> list[str]:
 
 
 def score_latex(summary: Summary) -> str:
-    """The tables of scores for LaTeX with booktabs."""
-    blocks = [f"% Over the {len(summary.common)} of {len(summary.tasks)} cases that all finished."]
+    """Format the tables of scores for LaTeX with booktabs."""
+    blocks = [
+        f"% Over the {len(summary.common)} of {len(summary.tasks)} cases that all methods finished."
+    ]
     blocks += [f"% {note}" for note in summary.notes]
     for group in summary.groups.values():
         columns = summary.present(group)
@@ -224,7 +227,7 @@ def _tabular(summary: Summary, columns: Sequence[Column]) -> str:
 
 
 def score_content(summary: Summary, fids: Fid) -> dict[str, Any]:
-    """The same with all digits, for JSON."""
+    """Return all scores with full precision, for JSON."""
     content: dict[str, Any] = {
         "cases": len(summary.tasks),
         "common": list(summary.common),
@@ -256,12 +259,11 @@ def score_content(summary: Summary, fids: Fid) -> dict[str, Any]:
 
 
 def without_cost(step: Step) -> Step:
-    """A step without what differs from run to run."""
+    """Drop the values of a step that differ from run to run."""
     return {key: step[key] for key in step if key not in ("seconds", "peak_bytes")}
 
 
 def _steps(summary: Summary, of: Callable[[Step], Any]) -> dict[str, dict[str, list[Any]]]:
-    """What `of` takes of each step, by task of several steps and method."""
     return {
         name: {method: [of(step) for step in steps] for method, steps in by_method.items()}
         for name, by_method in summary.sequences.items()
@@ -269,7 +271,7 @@ def _steps(summary: Summary, of: Callable[[Step], Any]) -> dict[str, dict[str, l
 
 
 def timing_markdown(summary: Summary) -> str:
-    """Median seconds by stage, and the most memory."""
+    """Format median seconds by stage and peak memory."""
     stages = sorted({s for m in summary.methods for s in summary.seconds(m)}, key=stage_place)
     rows = []
     for method in summary.methods:
@@ -278,13 +280,13 @@ def timing_markdown(summary: Summary) -> str:
         rows.append([method, *(shown(seconds.get(stage), 2) for stage in stages), shown(memory, 2)])
     return (
         f"Median seconds of a step over the {len(summary.common)} cases that all methods finished, "
-        "and the most memory (GiB) of any. The total is without the reconstruction of the context, "
-        "which is done once for all methods.\n\n" + markdown(["method", *stages, "memory"], rows)
+        "and peak memory (GiB). The total excludes the reconstruction of the context, which all "
+        "methods share.\n\n" + markdown(["method", *stages, "memory"], rows)
     )
 
 
 def timing_content(summary: Summary) -> dict[str, Any]:
-    """The same with all digits, for JSON, and of sequences the seconds of each step."""
+    """Return all timings with full precision, for JSON, and the seconds of sequence steps."""
     content: dict[str, Any] = {
         method: {"seconds": summary.seconds(method), "peak_bytes": summary.peak_bytes(method)}
         for method in summary.methods

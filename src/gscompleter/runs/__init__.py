@@ -1,1 +1,1 @@
-"""Cases times methods: what is run, resumed and kept."""
+"""Runs of methods over tasks: protocols, resuming, saved results and scores."""

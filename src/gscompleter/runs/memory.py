@@ -1,4 +1,4 @@
-"""The most memory that a computation held."""
+"""Peak memory of a computation."""
 
 from __future__ import annotations
 
@@ -11,19 +11,15 @@ import torch
 
 
 class Peak:
-    """What `peak_memory` found, once it is over."""
+    """Result of `measure_peak_memory`, filled in when its body ends."""
 
     bytes: int | None = None
-    """None where the system does not tell."""
+    """Peak memory in bytes, or None if the system does not report it."""
 
 
 @contextmanager
 def peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
-    """Measure the most memory held while the body ran.
-
-    On a GPU, what torch held there. Else the resident memory of the whole process, which counts
-    the program and all that was loaded before; Linux alone tells its peak over a span of time.
-    """
+    """Measure peak memory while the body runs: torch's on a GPU, the whole process's on a CPU."""
     peak = Peak()
     on_gpu = torch.device(device).type == "cuda"
     if on_gpu:
@@ -31,17 +27,17 @@ def peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
         yield peak
         peak.bytes = torch.cuda.max_memory_allocated()
         return
-    told = False
+    is_reset = False
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-        told = True
+        is_reset = True
     yield peak
-    if told:
+    if is_reset:
         peak.bytes = peak_of_process()
 
 
 def peak_of_process() -> int | None:
-    """The most resident memory that this process held; None where the system does not tell."""
+    """Read the peak resident memory of this process, or None if the system does not report it."""
     try:
         status = Path("/proc/self/status").read_text()
     except OSError:

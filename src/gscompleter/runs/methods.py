@@ -1,5 +1,4 @@
-"""Methods to compare, by name. All of them begin with the same scene, and all that need a
-synthesized image take the one that `full` takes."""
+"""Methods to compare by name; all share the initial scene and the reference image."""
 
 from __future__ import annotations
 
@@ -22,75 +21,73 @@ from gscompleter.types import Camera, Completion, Gaussians, InitialContext, mer
 
 @dataclass(frozen=True)
 class Models:
-    """The models that every method shares."""
+    """The models that all methods share."""
 
     reconstructor: Reconstructor
     generator: Generator
     renderer: Renderer
     seed: int = 0
-    """Of everything random."""
     baseline_iterations: int | None = None
-    """Most iterations of the baselines; their own numbers if None."""
+    """Maximum number of iterations of the baselines; None keeps their own numbers."""
 
     def completer(self, config: str = "default") -> GSCompleter:
-        """Our method with the settings called `config`."""
+        """Return our method with the named config."""
         return GSCompleter(
             self.reconstructor, self.generator, self.renderer, named_config(config), self.seed
         )
 
     def iterations(self, wanted: int) -> int:
-        """`wanted`, or the most that is allowed."""
+        """Limit a number of iterations to `baseline_iterations`."""
         return wanted if self.baseline_iterations is None else min(wanted, self.baseline_iterations)
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a method, ours or another, makes of a scene for one target."""
+    """The scene that a method leaves for one target."""
 
     scene: Gaussians
-    """The scene afterwards."""
+    """The scene after the method has run."""
     added: Gaussians | None
-    """What stands in `scene` beside the scene before; None where that itself was changed."""
+    """Gaussians that the method added, or None if it changed existing ones."""
     seconds: Mapping[str, float]
     """Wall time by stage, without the reconstruction of the context, and `total`."""
     anchor: int | None = None
-    """Which view made the stereo pair with the target; None where nothing was lifted."""
+    """Index of the anchor view, or None for a method that lifts nothing."""
     anchor_fallback: bool = False
-    """True where every view was turned too far and the least-turned one was taken."""
+    """True if all views were rotated too far and the least rotated one was chosen."""
     notes: tuple[str, ...] = ()
-    """Fallbacks that were taken, a sentence each."""
+    """Fallbacks that were used, one sentence each."""
     peak_bytes: int | None = None
-    """The most memory that was held meanwhile; None where the system does not tell."""
+    """Peak memory in bytes, or None if the system does not report it."""
     registered: Gaussians | None = None
-    """All that was lifted, as it was registered, before any of it was filtered; None for a method
-    that lifts nothing."""
+    """All lifted Gaussians after registration and before filtering; None if nothing is lifted."""
 
 
 Method = Callable[[Completion, Camera, Models], Prediction]
-"""Takes the scene as it stands, with the photographs that are known, and the target."""
+"""Function of the current scene with its photographs, the target and the models."""
 
 
 def nothing_added(state: Completion, target: Camera, models: Models) -> Prediction:
-    """The scene alone."""
+    """Return the scene unchanged."""
     return Prediction(state.scene, state.scene[:0], {"total": 0.0})
 
 
 def completed_with(config: str) -> Method:
-    """Our method with the settings called `config`."""
+    """Make a method of our completer with the named config."""
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         completer = replace(models.completer(config), keep_registered=True)
         context = InitialContext(state.scene, state.views)
         done = completer.advance(completer.begin_with(context), target)
         (made,) = done.targets
-        told = (made.anchor, made.anchor_fallback, made.notes)
-        return Prediction(done.scene, made.added, done.seconds, *told, registered=made.registered)
+        notes = (made.anchor, made.anchor_fallback, made.notes)
+        return Prediction(done.scene, made.added, done.seconds, *notes, registered=made.registered)
 
     return method
 
 
 def optimized_with(config: OptimizationConfig) -> Method:
-    """3DGS fitted to the photographs and the synthesized image, from the scene on."""
+    """Make a method that optimizes the scene on the photographs and the reference."""
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         clock = Clock(())
@@ -105,7 +102,7 @@ def optimized_with(config: OptimizationConfig) -> Method:
 
 
 def registered_by_similarity(state: Completion, target: Camera, models: Models) -> Prediction:
-    """RegGS: all that was lifted, brought to the scene by one similarity."""
+    """Add all lifted Gaussians, registered to the scene by one similarity (RegGS)."""
     clock = Clock(())
     with clock("generate"):
         reference = models.completer().reference(state, target)
@@ -122,7 +119,7 @@ def registered_by_similarity(state: Completion, target: Camera, models: Models) 
 
 
 def numbered(prediction: Prediction, number: int, before: Gaussians) -> Prediction:
-    """`prediction` with what it added to the scene `before` marked as made for target `number`."""
+    """Mark the Gaussians added to `before` as generated for target `number`."""
     if prediction.added is None:
         return prediction
     generated = torch.full_like(prediction.added.generated, number)
@@ -136,14 +133,14 @@ BASELINES: dict[str, Method] = {
     "distill": optimized_with(OptimizationConfig(iterations=800, density_rounds=0)),
     "reggs": registered_by_similarity,
 }
-"""Methods that are not ours."""
+"""Methods of others."""
 
 SCENE_CHANGING = ("densify-100", "densify-800", "distill")
-"""Methods that change the scene that is there, so that their steps cannot be compared."""
+"""Methods that change existing Gaussians and therefore cannot run a sequence."""
 
 _ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABLATIONS}
-# By the name of the method, that of its settings. Three degrees of freedom are no ablation but
-# what the paper compares the ray constraint with.
+# Method name to config name. Three degrees of freedom are no ablation: the paper compares the ray
+# constraint with them.
 
 SETTINGS: dict[str, str] = {
     "full": "default",
@@ -151,14 +148,14 @@ SETTINGS: dict[str, str] = {
     **_ABLATIONS,
     **{f"paper/{title}": f"paper/{name}" for title, name in _ABLATIONS.items()},
 }
-"""Methods that are ours, and what `named_config` calls their settings."""
+"""Our methods, with the name of their config for `named_config`."""
 
 METHODS: dict[str, Method] = {
     "context": nothing_added,
     **{title: completed_with(name) for title, name in SETTINGS.items()},
     **BASELINES,
 }
-"""Every method by its name, in the order of the tables."""
+"""All methods by name, in the order of the tables."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "ablations": tuple(_ABLATIONS),
@@ -169,11 +166,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 
 def methods_named(names: Sequence[str]) -> tuple[str, ...]:
-    """The methods that `names`, of methods or of groups, stand for, each once.
-
-    Raises:
-        InputError: as `check_methods`.
-    """
+    """Replace groups by their methods and drop duplicates; raise as `check_methods`."""
     found = [method for name in names for method in GROUPS.get(name, (name,))]
     chosen = tuple(dict.fromkeys(found))
     check_methods(chosen)
@@ -181,20 +174,20 @@ def methods_named(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def check_methods(names: Sequence[str], steps: int = 1) -> None:
-    """Raise an InputError for names of no method, none, one twice, and what cannot do `steps`."""
+    """Raise InputError for no, unknown or repeated names and methods that cannot do `steps`."""
     known = ", ".join([*GROUPS, *(name for name in METHODS if not name.startswith("paper/"))])
     if not names:
         raise InputError(f"No method was named; choose one or more of {known}.")
     for name in names:
         if name not in METHODS:
             raise InputError(
-                f"There is no method '{quoted(name)}'; choose of {known} (paper/no-sa for an "
+                f"There is no method '{quoted(name)}'; choose one of {known} (paper/no-sa for an "
                 "ablation of the paper's settings)."
             )
         if steps > 1 and name in SCENE_CHANGING:
             raise InputError(
-                f"The method {name!r} changes the scene that is there, and in a sequence each step "
-                "has to add to it; choose of context, full, paper, an ablation of these, and reggs."
+                f"The method {name!r} changes existing Gaussians, and a sequence can only add new "
+                "ones; choose one of context, full, paper, an ablation of these, and reggs."
             )
     if len(set(names)) < len(names):
         raise InputError(f"A method is named twice ({' '.join(names)}); name each once.")

@@ -1,9 +1,7 @@
-"""Which frames of a clip are given and which are to be synthesized.
+"""Evaluation protocols: which frames of a clip are context and which are targets.
 
-A published evaluation index (`{scene: {"context", "target"} or null}`), the extrapolation `n-k`
-(frames n and n + k show what frame n + 2k is completed from, and the same backwards), a stress test
-far outside of what the context sees, and `sequence-k`, whose targets depend on each other: they are
-completed one after the other.
+There are published indices (`{scene: {"context", "target"} or null}`), the extrapolation `n-k`, a
+stress test, and `sequence-k`, which completes its targets one after the other into one scene.
 """
 
 from __future__ import annotations
@@ -23,41 +21,38 @@ from gscompleter.io.files import replacing
 from gscompleter.io.json_file import read_json
 
 VERSION = 1
-"""Of the files that `write_evaluation_index` writes."""
+"""Version of the files that `write_evaluation_index` writes."""
 
 
 @dataclass(frozen=True)
 class Split:
-    """Frames of one clip."""
+    """Context and target frames of one clip."""
 
     context: tuple[int, ...]
-    """What is given."""
     targets: tuple[int, ...]
-    """What is to be synthesized."""
     in_sequence: bool = False
-    """True where the scene is completed for one target after the other; else each stands by
-    itself."""
+    """True if all targets are completed into one scene, one after the other."""
 
 
 @runtime_checkable
 class EvaluationProtocol(Protocol):
-    """A rule that chooses frames. It is deterministic."""
+    """A deterministic rule that chooses frames."""
 
     @property
     def name(self) -> str:
-        """What `parse_protocol` or a table calls it."""
+        """Name of the protocol for `parse_protocol` and the tables."""
 
     def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
-        """The splits of a clip; none where it is skipped."""
+        """Return the splits of a clip; none if it is skipped."""
 
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """n, n + k → n + 2k and n + 2k, n + k → n, for n = 0, stride, 2 stride, …"""
+    """Frames n, n + k → n + 2k and n + 2k, n + k → n, for n = 0, stride, 2 stride, …."""
 
     k: int
     stride: int | None = None
-    """From one n to the next; 2k + 1 if left out, so that no two n share a frame."""
+    """Step of n; None means 2k + 1, so that the cases share no frame."""
 
     def __post_init__(self) -> None:
         if self.k < 1 or (self.stride is not None and self.stride < 1):
@@ -68,9 +63,11 @@ class Extrapolation:
 
     @property
     def name(self) -> str:
+        """Name of the protocol."""
         return f"n-{self.k}" + ("" if self.stride is None else f"-stride-{self.stride}")
 
     def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+        """Return the splits of a clip."""
         k, stride = self.k, self.stride or 2 * self.k + 1
         return tuple(
             split
@@ -81,58 +78,61 @@ class Extrapolation:
 
 @dataclass(frozen=True)
 class StressTest:
-    """Frames 0 and 30 → 99: most of the target lies outside of what the context sees."""
+    """Frames 0, 30 → 99: most of the target is outside the context."""
 
     name: str = "stress"
 
     def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+        """Return the split of a clip; none if it is too short."""
         split = Split((0, 30), (99,))
         return (split,) if len(clip) > max(split.targets) else ()
 
 
 @dataclass(frozen=True)
 class EvaluationIndex:
-    """The splits of each scene, written down."""
+    """The splits of each scene, from a file."""
 
     name: str
-    """Of the protocol; for a published file, its stem."""
+    """Name of the protocol; the stem of a published file."""
     scenes: Mapping[str, tuple[Split, ...]]
     skipped: tuple[str, ...] = ()
-    """Scenes with no split: null in a published file, clips that are too short in ours."""
+    """Scenes without a split: null in a published file, clips that are too short in ours."""
 
     def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
-        """The splits of a clip; none where the index skips or lacks its scene."""
+        """Return the splits of a clip; none if the index skips or lacks its scene."""
         return self.scenes.get(clip.name, ())
 
 
 @dataclass(frozen=True)
 class ViewByView:
-    """0, k → 2k, 3k, 4k, …: one target after the other, all into one scene."""
+    """Frames 0, k → 2k, 3k, 4k, …: targets completed one after the other into one scene."""
 
     k: int
-    """Frames from one photograph to the next."""
+    """Step between frames."""
     steps: int | None = None
-    """Most targets; if left out, all that the clip has, up to `MAX_TARGETS`."""
+    """Maximum number of targets; None takes all frames of the clip, up to `MAX_TARGETS`."""
 
     def __post_init__(self) -> None:
         if self.k < 1:
             raise InputError("A sequence of every 0th frame is impossible; give at least 1.")
         if self.steps is not None and not 1 <= self.steps <= MAX_TARGETS:
             raise InputError(
-                f"A sequence of {self.steps} steps is impossible; give 1 to {MAX_TARGETS}, which "
-                "is how many a .ply can tell apart."
+                f"A sequence of {self.steps} steps is impossible; give 1 to {MAX_TARGETS}, the "
+                "number of targets that a .ply can tell apart."
             )
 
     @property
     def name(self) -> str:
+        """Name of the protocol."""
         return f"sequence-{self.k}" + ("" if self.steps is None else f"-steps-{self.steps}")
 
     def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+        """Return the split of a clip; none if it is too short."""
         targets = tuple(range(2 * self.k, len(clip), self.k))[: self.steps or MAX_TARGETS]
         return (Split((0, self.k), targets, in_sequence=True),) if targets else ()
 
     def reason_to_skip(self, clip: PosedPhotographs) -> str | None:
-        """Why a clip has no split; None where it has one."""
+        """Explain why a clip has no split, or return None if it has one."""
         needed = 2 * self.k + 1
         if len(clip) >= needed:
             return None
@@ -146,12 +146,7 @@ _PATTERNS: dict[str, type[Extrapolation | ViewByView]] = {
 
 
 def parse_protocol(text: str) -> EvaluationProtocol:
-    """The protocol of that name: `n-10`, `n-10-stride-5`, `stress`, `sequence-4`,
-    `sequence-4-steps-6`, or the path of an index.
-
-    Raises:
-        InputError: where it is none of these, or the index is damaged.
-    """
+    """Parse a protocol: `n-10`, `n-10-stride-5`, `stress`, `sequence-4` or the path of an index."""
     for pattern, kind in _PATTERNS.items():
         if match := re.fullmatch(pattern, text):
             return kind(*(int(number) for number in match.groups() if number is not None))
@@ -166,15 +161,11 @@ def parse_protocol(text: str) -> EvaluationProtocol:
 
 
 def index_of(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) -> EvaluationIndex:
-    """What a protocol chooses in each of `clips`, written down.
-
-    Raises:
-        InputError: where two clips have the same name, or targets depend on each other.
-    """
+    """Write down the splits of each clip; raise InputError for equal names or a sequence."""
     if isinstance(protocol, ViewByView):
         raise InputError(
-            f"{protocol.name} has no index, as its targets are not apart from each other; give it "
-            "to `evaluate` itself."
+            f"{protocol.name} has no index, because its targets depend on each other; give the "
+            "protocol to `evaluate` instead."
         )
     scenes: dict[str, tuple[Split, ...]] = {}
     for clip in clips:
@@ -186,11 +177,7 @@ def index_of(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) ->
 
 
 def read_evaluation_index(path: Path | str) -> EvaluationIndex:
-    """An evaluation index, as published or as `write_evaluation_index` writes it.
-
-    Raises:
-        InputError: where it is missing or damaged, or from a later version.
-    """
+    """Read an evaluation index, published or of `write_evaluation_index`."""
     path = Path(path)
     content = read_json(path, "download it again")
     if not isinstance(content, dict):
@@ -212,11 +199,7 @@ def read_evaluation_index(path: Path | str) -> EvaluationIndex:
 
 
 def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
-    """Write an index that `read_evaluation_index` reads back as it was, all at once.
-
-    Raises:
-        InputError: where the file cannot be written.
-    """
+    """Write an index atomically, in the format that `read_evaluation_index` reads."""
     scenes: dict[str, list[dict[str, list[int]]] | None] = {
         name: [{"context": list(s.context), "target": list(s.targets)} for s in splits]
         for name, splits in index.scenes.items()
@@ -240,7 +223,7 @@ def _index(name: str, content: Mapping[str, Any], path: Path) -> EvaluationIndex
 
 
 def _splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
-    """A scene has one split in a published file, and a list of them in ours."""
+    """Parse the entry of a scene: one split in a published file, a list of splits in ours."""
     rows = entry if isinstance(entry, list) else [entry]
     if not rows or not all(isinstance(row, dict) for row in rows):
         raise InputError(

@@ -1,7 +1,4 @@
-"""Tasks times methods: predict, save, score. A run that was stopped goes on where it was.
-
-Rows of scores are made from what is saved, so that to score again needs no method to run again.
-"""
+"""Runs of methods over tasks: predict, save, then score the saved; a stopped run resumes."""
 
 from __future__ import annotations
 
@@ -43,40 +40,39 @@ from gscompleter.stages.context import exposed_alike, sort_by_frame
 from gscompleter.types import View
 
 RETRIES = 2
-"""How often a task is tried again whose worker was killed."""
+"""How often a task is repeated if its worker was killed."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What decides the numbers, beside the tasks."""
+    """Settings that determine the numbers, together with the tasks."""
 
     reconstructor: str = "plane-sweep"
     weights: str | None = None
-    """The file of the reconstructor's weights; None takes the published ones."""
+    """File with the weights of the reconstructor; None selects the published ones."""
     generator: str = "warp-inpaint"
     generator_settings: GeneratorSettings | None = None
-    """What the generator is told; None leaves all as it is."""
+    """Settings of the generator; None keeps its defaults."""
     device: Literal["cpu", "cuda"] = "cpu"
     seed: int = 0
-    """Of everything random."""
     baseline_iterations: int | None = None
-    """Most iterations of the baselines; their own numbers if None."""
+    """Maximum number of iterations of the baselines; None keeps their own numbers."""
     source: Mapping[str, Any] = field(default_factory=dict)
-    """Where the tasks come from, so that no folder mixes two sources."""
+    """Origin of the tasks, so that no folder mixes two sources."""
 
     def load_reconstructor(self) -> Reconstructor:
-        """Ψ. One with weights is kept from one task to the next."""
+        """Load Ψ; a model with weights is cached between tasks."""
         weights = None if self.weights is None else Path(self.weights)
         return load_reconstructor(self.reconstructor, weights, self.device)
 
     def load_generator(self, targets: Sequence[View] = ()) -> Generator:
-        """Φ. One with weights is kept from one task to the next."""
+        """Load Φ; a model with weights is cached between tasks."""
         return load_generator(
             self.generator, self.seed, targets, self.device, self.generator_settings
         )
 
     def models(self, targets: Sequence[View]) -> Models:
-        """The models for a task. Only the generator `oracle` looks at the images of `targets`."""
+        """Load the models of a task; only the generator `oracle` uses the images of `targets`."""
         return Models(
             self.load_reconstructor(),
             self.load_generator(targets),
@@ -87,19 +83,18 @@ class RunConfig:
 
 
 Again = Literal["nothing", "failures", "scores"]
-"""What an earlier call did that is to be done once more: tasks that failed, or all scores, from
-what is saved."""
+"""Earlier results to redo: none, failed tasks, or all scores from saved predictions."""
 
 
 @dataclass(frozen=True)
 class RowCounts:
-    """What a call of `evaluate` did, in rows: pairs of a task and a method."""
+    """Numbers of rows (pairs of a task and a method) after a call of `evaluate`."""
 
     done: int
     failed: int
-    """Of those that are done now, how many say why they have no more steps."""
+    """Rows of this call that hold an error."""
     skipped: int
-    """Done by an earlier call."""
+    """Rows of earlier calls."""
 
 
 def evaluate(
@@ -111,47 +106,46 @@ def evaluate(
     again: Again = "nothing",
     engine: Engine = in_this_process,
 ) -> RowCounts:
-    """Run every method on every task of the shard, and write a row of scores for each.
+    """Run methods on tasks and write a row of scores for each pair.
 
-    What is there already stays: rows, and of a task that was stopped its whole steps. A task that
-    fails gives rows that say why, and the others go on.
+    Existing rows and completed steps are kept. A failed task leaves rows with its error.
 
     Args:
-        tasks: The tasks of all shards.
+        tasks: Tasks of all shards.
         methods: Names of methods.
-        out: Folder of results: a new one, or that of an earlier call, or of another shard.
-        config: What decides the numbers; the same as in earlier calls.
-        shard: (i, n) takes the tasks i, i + n, i + 2n, …; n calls with i from 0 do them all.
-        again: What of an earlier call is done once more.
-        engine: Who does it. Calls at the same time share the tasks, whatever engine they have.
+        out: Folder of results: new, or of an earlier call or another shard.
+        config: Settings that determine the numbers; the same as in earlier calls.
+        shard: (i, n) selects the tasks i, i + n, i + 2n, ….
+        again: Results of an earlier call to redo.
+        engine: Runs the jobs; simultaneous calls share the tasks.
 
     Raises:
-        InputError: a wrong name or shard, a folder that holds something else, a full disk.
+        InputError: Invalid name or shard, other content in `out`, or a full disk.
     """
     check_evaluation(tasks, methods, config, shard)
     claim(out, deciding(config))
     share = tasks[shard[0] :: shard[1]]
-    done = Evaluating(out, tuple(methods), config, again)
-    todo = {row: task for task in share for row in done.missing(task)}
+    runner = Evaluating(out, tuple(methods), config, again)
+    todo = {row: task for task in share for row in runner.missing(task)}
     jobs = [job_of(task) for task in {task.name: task for task in todo.values()}.values()]
-    rounds = Rounds(FolderPlace(out), done, jobs, RETRIES)
+    rounds = Rounds(FolderPlace(out), runner, jobs, RETRIES)
     activity = Activity("evaluating", len(todo))
     with going_on(activity) if todo else nullcontext():
-        for outcome in rounds.outcomes(engine, done):
-            for _ in done.rows_of(outcome.job.options["task"]) & set(todo):
+        for outcome in rounds.outcomes(engine, runner):
+            for _ in runner.rows_of(outcome.job.options["task"]) & set(todo):
                 activity.stepped()
     failed = sum(read_json(row).get("error") is not None for row in todo)
     return RowCounts(len(todo) - failed, failed, len(share) * len(methods) - len(todo))
 
 
 def job_of(task: Task) -> Job:
-    """A task as a job, which all methods of the task are."""
+    """Make a job of a task, with all its methods."""
     return Job(slug(task.name), {"task": task})
 
 
 @dataclass(frozen=True)
 class Evaluating:
-    """Does the jobs of an evaluation, and knows what became of them."""
+    """Runs the jobs of an evaluation and finds their results."""
 
     out: Path
     methods: tuple[str, ...]
@@ -159,32 +153,28 @@ class Evaluating:
     again: Again = "nothing"
 
     def rows_of(self, task: Task) -> set[Path]:
-        """Where the rows of a task lie."""
+        """Return the paths of the rows of a task."""
         return {row_path(self.out, task.name, method) for method in self.methods}
 
     def missing(self, task: Task) -> dict[Path, str]:
-        """The rows of a task that are to be made, and of which method they are."""
+        """Return the rows of a task that have to be computed, with their methods."""
         rows = {row_path(self.out, task.name, method): method for method in self.methods}
         return {row: method for row, method in rows.items() if is_missing(row, self.again)}
 
     def ended(self, job: Job) -> Outcome | None:
-        """What became of a task that others did."""
+        """Return the outcome of a task that another process completed, or None."""
         there = all(row.exists() for row in self.rows_of(job.options["task"]))
         return Outcome(job, "done") if there else None
 
     def give_up(self, job: Job, reason: str) -> Outcome:
-        """Write rows that say why there is nothing."""
+        """Write rows with the reason why there is no result."""
         task = job.options["task"]
         for row, method in self.missing(task).items():
             write_json(row, row_of(task, method, reason, task_folder(self.out, task.name)))
         return Outcome(job, "failed", reason)
 
     def __call__(self, job: Job) -> Outcome:
-        """Run every method on the task that has no row yet, unless somebody else does it.
-
-        Raises:
-            OutputError: where a result cannot be written.
-        """
+        """Compute the missing rows of a task, unless another process does it."""
         with FolderPlace(self.out).claimed(f"{CLAIMS}/{job.name}") as lost:
             if lost is None:
                 return Outcome(job, "elsewhere")
@@ -192,10 +182,10 @@ class Evaluating:
             return Outcome(job, "done")
 
     def run(self, task: Task) -> None:
-        """Make the rows of a task that are missing."""
+        """Compute the missing rows of a task."""
         prepared, folder = None, task_folder(self.out, task.name)
         for row, method in self.missing(task).items():
-            # What goes on inside would fill a log.
+            # Progress inside a task would flood a log.
             with stage(f"{task.name}, {method}"), shown_on(None):
                 if prepared is None:
                     prepared = attempt(partial(prepare, task, folder, self.config))
@@ -204,20 +194,14 @@ class Evaluating:
 
 
 def is_missing(path: Path, again: Again) -> bool:
-    """Whether a row is to be made."""
+    """Return True if a row has to be computed."""
     if again == "scores" or not path.exists():
         return True
     return again == "failures" and read_json(path).get("error") is not None
 
 
 def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
-    """Read the photographs of a task, and read, or compute, the scene that all methods begin with.
-
-    Raises:
-        InputError: where a photograph is damaged, other than that of a later target, or there is
-            not enough memory.
-        OutputError: where the scene cannot be saved.
-    """
+    """Load the photographs of a task, and load or reconstruct its initial scene."""
     views = sort_by_frame(photographs(task, task.context, config))
     neighbours = photographs(task, task.neighbours, config)
     targets, error = readable_targets(task, config)
@@ -228,14 +212,14 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
     models = config.models(targets)
     context = context_at(folder / "context.npz", views, models)
 
-    def ranged(view: View) -> View:
+    def set_range(view: View) -> View:
         return replace(view, camera=replace(view.camera, near=context.near, far=context.far))
 
     return Prepared(
         context.gaussians,
-        tuple(map(ranged, exposed_alike(views, context.gains))),
-        tuple(map(ranged, targets)),
-        tuple(map(ranged, neighbours)),
+        tuple(map(set_range, exposed_alike(views, context.gains))),
+        tuple(map(set_range, targets)),
+        tuple(map(set_range, neighbours)),
         models,
         context.seconds,
         error,
@@ -243,7 +227,7 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
 
 
 def photographs(task: Task, frames: tuple[int, ...], config: RunConfig) -> list[View]:
-    """Photographs of `frames`, numbered by them; an InputError where one is damaged."""
+    """Load photographs and number them by their frames."""
     return [
         replace(view.to(config.device), frame=frame)
         for view, frame in zip(task.load(frames), frames, strict=True)
@@ -251,7 +235,7 @@ def photographs(task: Task, frames: tuple[int, ...], config: RunConfig) -> list[
 
 
 def readable_targets(task: Task, config: RunConfig) -> tuple[list[View], str | None]:
-    """The targets up to the first whose photograph is damaged, and what is wrong with that."""
+    """Load the targets up to the first damaged photograph, and return its error."""
     targets: list[View] = []
     for frame in task.targets:
         loaded = attempt(partial(photographs, task, (frame,), config))
@@ -262,10 +246,7 @@ def readable_targets(task: Task, config: RunConfig) -> tuple[list[View], str | N
 
 
 def context_at(path: Path, views: Sequence[View], models: Models) -> SavedContext:
-    """The scene that is saved at `path`, else what Ψ makes of the views, as by `kept`.
-
-    Raises InputError for fewer than two views, or none that make a stereo pair.
-    """
+    """Load the scene saved at `path`, or reconstruct and save it."""
     device = views[0].image.device if views else "cpu"
 
     def save() -> None:
@@ -280,7 +261,7 @@ def context_at(path: Path, views: Sequence[View], models: Models) -> SavedContex
 
 
 def row_of(task: Task, method: str, prepared: Prepared | str, folder: Path) -> dict[str, Any]:
-    """What a method came to on a task; `prepared` may be the reason why it came to nothing."""
+    """Build the row of a method on a task; `prepared` may be an error instead of a task."""
     steps: tuple[Step, ...] = ()
     error: str | None
     if isinstance(prepared, str):
@@ -306,7 +287,7 @@ def row_of(task: Task, method: str, prepared: Prepared | str, folder: Path) -> d
 def check_evaluation(
     tasks: Sequence[Task], methods: Sequence[str], config: RunConfig, shard: tuple[int, int]
 ) -> None:
-    """Raise an InputError, before anything is written, where a run is impossible."""
+    """Raise InputError before anything is written if a run is impossible."""
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
     checked_shard(shard)
     check_tasks(tasks)
@@ -315,10 +296,10 @@ def check_evaluation(
 
 
 def check_tasks(tasks: Sequence[Task]) -> None:
-    """Raise an InputError for no task at all, and for two that would be written to one place."""
+    """Raise InputError if there is no task, or if two tasks share a folder."""
     if not tasks:
         raise InputError(
-            "There is no case to run: no clip has the frames that the protocol asks for; choose a "
+            "There is no case to run: no clip has the frames that the protocol needs; choose a "
             "protocol with a smaller step, or other data."
         )
     names: dict[str, str] = {}
@@ -332,11 +313,8 @@ def check_tasks(tasks: Sequence[Task]) -> None:
 
 
 def deciding(config: RunConfig) -> dict[str, Any]:
-    """All that decides the numbers, by the names of the command line.
-
-    Where the parts of a generator wait is not among it.
-    """
+    """Collect all settings that determine the numbers, named as on the command line."""
     values = asdict(config)
     settings = values.pop("generator_settings") or {}
-    settings.pop("offload", None)
+    settings.pop("offload", None)  # it changes where the model waits, not what it computes
     return {**values, **{f"generator_{name}": value for name, value in settings.items()}}

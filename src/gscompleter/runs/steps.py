@@ -1,9 +1,7 @@
-"""A method on a task: target after target, each time into the scene as it stands by then.
+"""Steps of a method on a task: one target after the other, into the same scene.
 
-A step is what the method does with any target. Once it is done, the photograph of its target is
-known: whatever the method, later steps may choose it for their anchor. The paper gives the true
-image to the generator as well (our generator `oracle`), which leaves nothing but registration to
-compare.
+After each step the photograph of its target is known and may be the anchor of a later step. In the
+paper the generator gets it too (our `oracle`), so that only registration is compared.
 """
 
 from __future__ import annotations
@@ -39,76 +37,60 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Prepared:
-    """All about a task that its methods share. The cameras have the depth range of the scene."""
+    """A task with the data that all methods share; cameras have the depth range of the scene."""
 
     context: Gaussians
-    """What Ψ makes of the views."""
+    """Gaussians that Ψ reconstructed from the views."""
     views: tuple[View, ...]
-    """The photographs that are known from the beginning."""
     targets: tuple[View, ...]
-    """Photographs to complete the scene for, in this order, up to the first that is damaged."""
+    """Target photographs in order, up to the first that is damaged."""
     neighbours: tuple[View, ...]
     """Photographs beside the target, for scoring only."""
     models: Models
     seconds: float
-    """What Ψ took."""
+    """Wall time of the reconstruction."""
     error: str | None = None
-    """Why there are no more targets; None where all can be read."""
+    """Reason why there are no more targets, or None if all are readable."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """What a method did for one target."""
+    """Result of a method for one target."""
 
     frame: int
-    """The target."""
     anchor: int | None
-    """Frame that made the stereo pair with it; None for a method that lifts nothing."""
+    """Anchor frame, or None for a method that lifts nothing."""
     anchor_fallback: bool
-    """True where every view was turned too far and the least-turned one was taken."""
     scores: Scores
-    """Of the scene just before the step and just after it."""
+    """Scores of the scene before and after the step."""
     psnr_end: float | None
-    """PSNR at the target, in dB, of the scene that the whole task leaves: below that just after
-    the step where later ones spoiled it. None while the task goes on."""
+    """PSNR at the target, in dB, of the final scene of the task; None while the task runs."""
     depth_scale: float | None
-    """See `depth_scale`; None in a task of one step, and where too little was added to tell."""
+    """See `compute_depth_scale`; None in a task of one step or if too few pixels are covered."""
     added: int
-    """Gaussians by which the scene grew."""
     gaussians: int
-    """Gaussians of the scene after it."""
+    """Number of Gaussians in the scene after the step."""
     notes: tuple[str, ...]
-    """Fallbacks that were taken, a sentence each."""
     seconds: dict[str, float]
     """Wall time by stage, and `total`."""
     peak_bytes: int | None
-    """The most memory that was held; None where the system does not tell."""
+    """Peak memory in bytes, or None if the system does not report it."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """A task as far as a method came."""
+    """The steps of a task so far."""
 
     scene: Gaussians
-    """The context and what was made of it."""
+    """The context and all added Gaussians."""
     views: tuple[View, ...]
-    """The photographs that are known by now."""
     steps: tuple[Step, ...] = ()
     error: str | None = None
-    """Why it went no further; None where nothing failed."""
+    """Reason why the task stopped, or None."""
 
 
 def complete_task(task: Prepared, method: str, folder: Path) -> Progress:
-    """Complete a scene for one target after the other; a step that fails is the last.
-
-    Args:
-        task: The scene and its targets.
-        method: Name of a method.
-        folder: Of the task, where each step is saved and, where it is there already, read back.
-
-    Raises:
-        OutputError: where a step cannot be saved.
-    """
+    """Complete targets in order until a step fails; saved steps in `folder` are read back."""
     progress = Progress(task.context, task.views, error=task.error)
     for target in task.targets:
         following = attempt(partial(advanced, progress, target, task, method, folder))
@@ -122,7 +104,7 @@ def complete_task(task: Prepared, method: str, folder: Path) -> Progress:
 def advanced(
     progress: Progress, target: View, task: Prepared, method: str, folder: Path
 ) -> Progress:
-    """`progress` after the step at `target`."""
+    """Complete one more target and save its prediction and images."""
     number = len(progress.steps) + 1
     state = task.models.completer().begin_with(InitialContext(progress.scene, progress.views))
     path = step_path(folder, method, number)
@@ -142,7 +124,7 @@ def advanced(
 def predicted(
     method: str, state: Completion, target: Camera, number: int, models: Models, path: Path
 ) -> Prediction:
-    """What is saved at `path`, else what `method` makes of the step, as by `kept`."""
+    """Load the prediction at `path`, or compute and save it."""
 
     def save() -> None:
         with peak_memory(state.scene.means.device) as peak:
@@ -154,26 +136,23 @@ def predicted(
 
 
 def kept(path: Path, load: Callable[[], T | None], save: Callable[[], None]) -> T:
-    """What `load` finds at `path`, where `save` computes and writes it first if need be.
+    """Load a result from `path`, after computing and saving it if it is missing.
 
-    It is read back in any case, so that a run that was stopped goes on with the very same tensors.
-
-    Raises:
-        OutputError: where it cannot be saved.
+    It is always read back, so that a resumed run continues with the same tensors.
     """
     found = load()
     if found is None:
         save()
         found = load()
     if found is None:
-        raise OutputError(f"{path} cannot be read back; look whether the disk is sound.")
+        raise OutputError(f"{path} cannot be read back; check the disk.")
     return found
 
 
 def step_of(
     prediction: Prediction, state: Completion, target: View, task: Prepared
 ) -> tuple[Step, Drawings]:
-    """What a step came to, and what its camera sees."""
+    """Score a step and render its target camera."""
     truth = Truth(state.views, target, task.neighbours)
     before, after = state.scene, prediction.scene
     scores, seen = score(
@@ -204,17 +183,13 @@ def step_of(
 
 
 def number_of(view: View) -> int:
-    """The number of a frame of a clip."""
+    """Return the frame number of a view."""
     assert view.frame is not None
     return view.frame
 
 
 def metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
-    """The measured depth of `target` where the data has it, in scene units.
-
-    Elsewhere it is what Ψ says of the two photographs, before any registration, valid where the
-    model measured it.
-    """
+    """Return the measured depth of `target`, or an estimate of Ψ if the data have none."""
     if target.depth is not None:
         return DepthMap(target.depth, target.depth > 0)
     return lift(models.reconstructor, target, anchor).reference_depth
@@ -227,12 +202,10 @@ def depth_scale(
     expected: DepthMap,
     renderer: Renderer,
 ) -> float | None:
-    """How far away what was added stands, as a multiple of how far it should: 1 is metric.
+    """Compute the median of D_added / D_expected over the holes: 1 means metric scale.
 
-    The median of D_added / D_expected over the pixels of `holes` where both are known, with
-    D_added the z-depth of `added`, drawn alone, where it covers at least half of the pixel. Only
-    the holes of the scene as it was count, because a method that adds there alone and one that
-    covers the whole image are to be compared. None of fewer than `MIN_PIXELS`.
+    D_added is the z-depth of `added` rendered alone. Only holes count, so that methods covering the
+    whole image are comparable. None for fewer than `MIN_PIXELS` pixels.
     """
     alone = renderer.render(added, target).depth_map()
     both = holes & alone.valid & expected.valid
@@ -242,15 +215,12 @@ def depth_scale(
 
 
 def scale_drift(scales: Sequence[float]) -> float | None:
-    """How much the depth scale s varies over a sequence: max(ln s) - min(ln s).
-
-    0.1 means that its largest is 10 % above its smallest. None of fewer than two.
-    """
+    """Compute max(ln s) - min(ln s) of the depth scales s; None for fewer than two."""
     return math.log(max(scales)) - math.log(min(scales)) if len(scales) > 1 else None
 
 
 def ended(progress: Progress, targets: Sequence[View], renderer: Renderer) -> Progress:
-    """`progress`, each of its steps with the PSNR that the last scene has there."""
+    """Set the PSNR of the final scene at each step."""
     steps = []
     for step, target in zip(progress.steps, targets, strict=False):  # the last may have failed
         image = renderer.render(progress.scene, target.camera).image
@@ -259,11 +229,7 @@ def ended(progress: Progress, targets: Sequence[View], renderer: Renderer) -> Pr
 
 
 def attempt(compute: Callable[[], T]) -> T | str:
-    """What `compute` returns, or why it failed, in one line.
-
-    Raises:
-        OutputError: where a result could not be written, which no other task could either.
-    """
+    """Return the result of `compute` or the reason of its failure; only OutputError is raised."""
     try:
         return compute()
     except OutputError:

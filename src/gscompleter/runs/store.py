@@ -1,14 +1,12 @@
-"""The folder of a run: where things lie in it, and how they are written and read.
+"""The folder of a run: its files and how they are written (atomically) and read.
 
-    run.json                            what decided the numbers
-    tasks/TASK/context.npz              the scene that all methods begin with
-    tasks/TASK/truth-001.png            the photograph of the first target
-    tasks/TASK/METHOD.json              the row of a method: its steps, and why there are no more
-    tasks/TASK/METHOD/step-001.npz      what it made of the scene for the first target
-    tasks/TASK/METHOD/step-001.png      what the camera of that target sees afterwards
-    tasks/TASK/METHOD/before-001.png    the same before
-
-Everything appears under its name once it is complete.
+run.json                            settings that determine the numbers
+tasks/TASK/context.npz              initial scene of all methods
+tasks/TASK/truth-001.png            photograph of the first target
+tasks/TASK/METHOD.json              row of a method: its steps and its error
+tasks/TASK/METHOD/step-001.npz      prediction for the first target
+tasks/TASK/METHOD/step-001.png      render at the first target after completion
+tasks/TASK/METHOD/before-001.png    render at the first target before completion
 """
 
 from __future__ import annotations
@@ -37,16 +35,16 @@ from gscompleter.runs.methods import Prediction
 from gscompleter.types import Gaussians, merge
 
 RUN = "run.json"
-"""The file that says what decided the numbers of a folder."""
+"""Name of the file with the settings of a run."""
 
 TASKS = "tasks"
-"""Where the folders of the tasks are."""
+"""Name of the folder that holds the tasks."""
 
 VERSION = 3
-"""Of the files in a folder of results."""
+"""Version of the files of a run."""
 
 REGISTERED = "registered_"
-"""Before the names of the arrays of what was registered, in the file of a prediction."""
+"""Prefix of the arrays of registered Gaussians in the file of a prediction."""
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 
@@ -54,44 +52,39 @@ Arrays = dict[str, np.ndarray]
 
 
 def slug(name: str) -> str:
-    """`name` as the name of a file."""
+    """Turn a name into a valid file name."""
     return re.sub(r"[^\w.+-]+", "-", name.replace(">", "-to-"))
 
 
 def task_folder(out: Path, task: str) -> Path:
-    """Where everything about the task of that name lies."""
+    """Return the folder of a task."""
     return out / TASKS / slug(task)
 
 
 def row_path(out: Path, task: str, method: str) -> Path:
-    """Where the row of a task and a method lies."""
+    """Return the path of the row of a task and a method."""
     return task_folder(out, task) / f"{slug(method)}.json"
 
 
 def step_path(folder: Path, method: str, number: int) -> Path:
-    """What a method made of the step `number`, counted from 1, of the task in `folder`."""
+    """Return the path of the prediction of step `number`, counted from 1."""
     return folder / slug(method) / f"step-{number:03d}.npz"
 
 
 def truth_path(folder: Path, number: int) -> Path:
-    """The photograph of the target of the step `number` of the task in `folder`."""
+    """Return the path of the target photograph of step `number`, counted from 1."""
     return folder / f"truth-{number:03d}.png"
 
 
 def row_paths(out: Path) -> list[Path]:
-    """All rows of a run."""
+    """List all rows of a run."""
     return sorted((out / TASKS).glob("*/*.json"))
 
 
 def claim(out: Path, settings: Mapping[str, Any]) -> None:
-    """Make `out` the folder of the run with these settings, or see that it is.
+    """Create the folder of a run, or check that it holds a run with the same settings.
 
-    Of any number of processes that claim a folder at the same time one makes it, and the others
-    compare. Only a file system without hard links cannot tell at the very same moment that two of
-    them differ in their settings.
-
-    Raises:
-        InputError: where it holds something else, or a run with other settings.
+    If several processes claim it simultaneously, one creates it and the others compare.
     """
     wanted = json.loads(json.dumps({"version": VERSION, **settings}))
     if not is_run(out):
@@ -101,26 +94,21 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     found = settings_of(out)
     for key in {**wanted, **found}:
         if found.get(key) != wanted.get(key):
-            there, asked = quoted(repr(found.get(key))), quoted(repr(wanted.get(key)))
+            old, new = quoted(repr(found.get(key))), quoted(repr(wanted.get(key)))
             raise InputError(
-                f"{out} holds a run with {key} {there}, and {asked} is asked for; name another "
-                "folder."
+                f"{out} holds a run with {key} {old}, and this run has {new}; name another folder."
             )
 
 
 def check_run(out: Path) -> None:
-    """See that `out` is the folder of a run.
-
-    Raises:
-        InputError: where it is none, or one of another version.
-    """
+    """Raise InputError if `out` holds no run, or one of another version."""
     if not is_run(out):
         raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
     settings_of(out)
 
 
 def settings_of(out: Path) -> dict[str, Any]:
-    """What `out` says of its run; an InputError where that is damaged or of another version."""
+    """Read the settings of a run; raise InputError if they are damaged or of another version."""
     found = read_json(out / RUN, "name another folder")
     version = found.get("version") if isinstance(found, dict) else None
     if version != VERSION:
@@ -132,16 +120,12 @@ def settings_of(out: Path) -> dict[str, Any]:
 
 
 def is_run(out: Path) -> bool:
-    """Whether `out` is the folder of a run."""
+    """Return True if `out` is the folder of a run."""
     return (out / RUN).is_file()
 
 
 def holds_something_else(out: Path) -> bool:
-    """Whether `out` is there and is neither empty nor the folder of a run.
-
-    What another process is writing does not count; and where it has written more than that, it has
-    claimed the folder before.
-    """
+    """Return True if `out` exists and is neither empty, unfinished, nor a run."""
     if not os.path.lexists(out):
         return False
     if not out.is_dir():
@@ -152,21 +136,19 @@ def holds_something_else(out: Path) -> bool:
 
 @dataclass(frozen=True)
 class SavedContext:
-    """What Ψ makes of the photographs of a task."""
+    """The reconstruction of a task."""
 
     gaussians: Gaussians
     near: float
-    """Depth range in scene units that it was made with."""
+    """Depth range of the reconstruction in scene units."""
     far: float
     seconds: float
-    """What it took."""
     gains: Float[Tensor, "v 3"] | None = None
-    """By how much each photograph is brighter, by channel; None where exposures were not evened
-    out."""
+    """Exposure gain of each photograph by channel, or None without exposure normalization."""
 
 
 def save_context(path: Path, context: SavedContext) -> None:
-    """Write the scene that all methods begin with, as by `write_arrays`."""
+    """Write the initial scene of a task."""
     numbers = np.array([context.seconds, context.near, context.far], dtype=np.float64)
     arrays = {**_arrays_of(context.gaussians), "seconds_near_far": numbers}
     if context.gains is not None:
@@ -175,7 +157,7 @@ def save_context(path: Path, context: SavedContext) -> None:
 
 
 def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
-    """What `save_context` wrote; None where there is nothing whole."""
+    """Read the initial scene of a task, or return None if there is no complete file."""
     arrays = load_arrays(path)
     if arrays is None:
         return None
@@ -185,8 +167,7 @@ def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
-    """Write what differs from the scene before, what was added or else the whole scene, and what
-    was registered."""
+    """Write the added Gaussians, or the whole scene if it was changed, and the registered ones."""
     registered = prediction.registered
     whole = prediction.added is None
     write_arrays(
@@ -206,7 +187,7 @@ def save_prediction(path: Path, prediction: Prediction) -> None:
 
 
 def load_prediction(path: Path, before: Gaussians) -> Prediction | None:
-    """What `save_prediction` wrote of the scene `before`; None where there is nothing whole."""
+    """Read the prediction for the scene `before`, or return None if there is no complete file."""
     arrays = load_arrays(path)
     if arrays is None:
         return None
@@ -229,7 +210,6 @@ def load_prediction(path: Path, before: Gaussians) -> Prediction | None:
 
 
 def _optional(number: int | None) -> np.ndarray:
-    """A number that is not negative, or its absence."""
     return np.array(-1 if number is None else number, dtype=np.int64)
 
 
@@ -244,47 +224,47 @@ def _arrays_of(gaussians: Gaussians, prefix: str = "") -> Arrays:
 def _gaussians_of(
     arrays: Mapping[str, np.ndarray], device: torch.device | str, prefix: str = ""
 ) -> Gaussians:
-    """Copies, which lie in memory as torch's own tensors do: how a sum is rounded depends on it."""
+    """Copy arrays to tensors with torch's own memory layout, on which rounding of sums depends."""
     found = (arrays[f"{prefix}{name}"] for name in _FIELDS)
     tensors: list[Any] = [torch.from_numpy(array).clone().to(device) for array in found]
     return Gaussians(*tensors)
 
 
 def load_arrays(path: Path) -> Arrays | None:
-    """The arrays of a file; None where there is none that is whole."""
+    """Read the arrays of a file, or return None if there is no complete file."""
     try:
         with np.load(path, allow_pickle=False) as saved:
             return dict(saved)
     except (OSError, ValueError, EOFError, BadZipFile):
-        return None  # a part of a file that another program left is computed again
+        return None  # an incomplete file is computed again
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
-    """All at once, so that no reader sees half a file; an OutputError where that cannot be."""
+    """Write arrays atomically; raise OutputError if that fails."""
     with _writing(path), replacing(path) as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def write_json(path: Path, content: Any, first_stays: bool = False) -> None:
-    """All at once, like `write_arrays`; arguments as those of `replacing`."""
+    """Write JSON atomically; the arguments are those of `replacing`."""
     with _writing(path), replacing(path, first_stays) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
-    """A picture among the results; an OutputError where it cannot be written."""
+    """Write an image; raise OutputError if that fails."""
     with _writing(path):
         write_image(path, image)
 
 
 def read_json(path: Path, advice: str = "delete it and run again") -> Any:
-    """`json_file.read_json` of a file of results."""
+    """Read a JSON file of results."""
     return json_file.read_json(path, advice)
 
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Make the folder of `path`; what then cannot be written ends the run."""
+    """Create the folder of `path` and turn write errors into OutputError, which ends the run."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield

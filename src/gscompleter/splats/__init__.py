@@ -1,4 +1,4 @@
-"""Scenes of Gaussians in the formats that people hold, one file for each of them."""
+"""Readers and writers of Gaussian splats, one file per format."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""The compressed .ply of SuperSplat: 16 bytes for each Gaussian, and one for each harmonic.
+"""The compressed .ply of SuperSplat: 16 bytes per Gaussian, and one per SH coefficient.
 
-256 Gaussians are a chunk, which holds the bounds of its positions, log-scales and colours; within
-them a Gaussian has 11, 10 and 11 bits of position and of scale, 8 bits for each channel and its
-opacity, and a rotation in 2 + 3 x 10 bits. Harmonics lie in an element of their own, as bytes over
-[-4, 4].
+256 Gaussians form a chunk, which stores the bounds of its positions, log-scales and colours.
+Relative to them, a Gaussian has 11, 10 and 11 bits of position and of scale and 8 bits per
+channel and opacity; its rotation has 2 + 3 x 10 bits. SH of degree 1 and above are a separate
+element of bytes over [-4, 4].
 """
 
 from __future__ import annotations
@@ -29,19 +29,15 @@ BOUNDS = (
     *(f"{end}_scale_{axis}" for end in ("min", "max") for axis in AXES),
     *(f"{end}_{channel}" for end in ("min", "max") for channel in CHANNELS),
 )
-"""What a chunk holds. Early files have no bounds of colours, which then are those of [0, 1]."""
+"""Properties of a chunk. Early files lack the bounds of colours, which are then [0, 1]."""
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 NUM_REST = (0, 9, 24, 45)
 WIDEST_LOG_SCALE = 20.0
-"""Log-scales beyond it are written as this one, as other writers do."""
+"""Largest absolute log-scale that is written, as in other writers."""
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
-    """The Gaussians of a compressed .ply, of SH degree 0 to 3.
-
-    Raises:
-        InputError: where it cannot be read, is truncated, or contradicts itself.
-    """
+    """Read a compressed .ply of SH degree 0 to 3."""
     tables, is_antialiased = _tables(path)
     if not {"chunk", "vertex"} <= tables.keys():
         raise damaged(path, "it has no chunks or no vertices")
@@ -64,8 +60,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
 
 
 def _tables(path: Path) -> tuple[dict[str, ndarray], bool]:
-    """The elements of a binary little-endian .ply of plain properties, by name, and if its
-    Gaussians are antialiased."""
+    """Read the elements of a binary .ply by name, and if its Gaussians are antialiased."""
     with path.open("rb") as file:
         file_format, elements = read_header(file, path)
         is_antialiased = read_mode(file)
@@ -76,7 +71,7 @@ def _tables(path: Path) -> tuple[dict[str, ndarray], bool]:
     for element in elements:
         row = _row(path, element)
         check_size(path, len(data), start + element.count * row.itemsize)
-        # An element without properties takes no bytes, whatever it says it counts.
+        # An element without properties has no bytes, whatever count it claims.
         count = element.count if row.itemsize else 0
         tables[element.name] = np.frombuffer(data, row, count, start) if count else np.empty(0, row)
         start += count * row.itemsize
@@ -99,7 +94,7 @@ def _fractions_of_three(packed: UInt32[ndarray, "n"]) -> Float[ndarray, "n 3"]:
 def _within(
     chunk: ndarray, kind: str, axes: tuple[str, ...], fractions: Float[ndarray, "n 3"]
 ) -> Float[ndarray, "n 3"]:
-    """Fractions of the bounds that the chunk of each Gaussian has, `kind` "" or "scale_"."""
+    """Map fractions to the bounds of each Gaussian's chunk; `kind` is "" or "scale_"."""
     of_chunk = np.arange(len(fractions)) // CHUNK
     low = np.stack([chunk[f"min_{kind}{axis}"] for axis in axes], axis=1)[of_chunk]
     high = np.stack([chunk[f"max_{kind}{axis}"] for axis in axes], axis=1)[of_chunk]
@@ -112,7 +107,7 @@ def _quats(packed: UInt32[ndarray, "n"]) -> Float[ndarray, "n 4"]:
 
 
 def _rest(path: Path, table: ndarray | None, count: int) -> Float[ndarray, "n k 3"] | None:
-    """Harmonics of degree 1 and above, from the middle of what each byte stands for."""
+    """Unpack SH of degree 1 and above; a byte stands for the middle of its interval."""
     if table is None:
         return None
     names = table.dtype.names or ()
@@ -127,15 +122,11 @@ def _rest(path: Path, table: ndarray | None, count: int) -> Float[ndarray, "n k 
     return values.reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
 
 
-# --------------------------------------------------------------------------------------- write
+# --------------------------------------------------------------------------------- writing
 
 
 def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write a compressed .ply of the Gaussians in their order (see `near_together`).
-
-    Raises:
-        InputError: where the file cannot be written.
-    """
+    """Write a compressed .ply; the Gaussians should be sorted with `sort_along_morton`."""
     encoded = encode(gaussians).numpy()
     log_scales = np.clip(encoded[:, :3], -WIDEST_LOG_SCALE, WIDEST_LOG_SCALE)
     rgb = 0.5 + SH_C0 * gaussians.sh[:, 0].numpy()
@@ -193,7 +184,7 @@ def _packed_rgba(fractions: Float[ndarray, "n 4"]) -> UInt32[ndarray, "n"]:
 
 
 def _packed_rest(gaussians: Gaussians) -> UInt8[ndarray, "n m"]:
-    """Harmonics of degree 1 and above in bytes, all of red, then green, then blue."""
+    """Pack SH of degree 1 and above into bytes: all of red, then green, then blue."""
     rest = gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), -1).numpy()
     return np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
 
@@ -212,5 +203,5 @@ def _header(gaussians: Gaussians, chunks: int, num_rest: int) -> bytes:
 
 
 def is_compressed(head: bytes) -> bool:
-    """Whether a file that begins with `head` is a compressed .ply."""
+    """Return True if a file with the first bytes `head` is a compressed .ply."""
     return head.startswith(b"ply") and b"packed_position" in head

@@ -1,4 +1,4 @@
-"""What all readers of splats share: bytes in, whole Gaussians out, a sentence where not."""
+"""Checks and conversions shared by all readers of splats."""
 
 from __future__ import annotations
 
@@ -13,15 +13,11 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.types import SH_C0, Gaussians, observed
 
 SLACK = 1 << 20
-"""Bytes that any file may unpack to, however small it is."""
+"""Unpacked size in bytes that is allowed for any file, however small."""
 
 
 def check_growth(path: Path, unpacked: int, packed: int, most: int) -> None:
-    """Refuse what says that it unpacks to more than `most` times its size, in bytes.
-
-    Raises:
-        InputError: where it does, before anything is unpacked.
-    """
+    """Raise InputError if a file claims to unpack to over `max_growth` times its size in bytes."""
     if unpacked > SLACK + most * packed:
         raise InputError(
             f"{quoted(path)} is damaged: its {packed:,} bytes claim to hold {unpacked:,}; fetch "
@@ -30,11 +26,7 @@ def check_growth(path: Path, unpacked: int, packed: int, most: int) -> None:
 
 
 def check_size(path: Path, found: int, needed: int) -> None:
-    """Refuse a file that ends too early.
-
-    Raises:
-        InputError: where fewer bytes were found than are needed.
-    """
+    """Raise InputError if a file has fewer bytes than needed."""
     if found < needed:
         raise InputError(
             f"{quoted(path)} is truncated: {found:,} of {needed:,} bytes are there; fetch or write "
@@ -43,7 +35,7 @@ def check_size(path: Path, found: int, needed: int) -> None:
 
 
 def damaged(path: Path, what: str) -> InputError:
-    """The sentence for a file whose parts contradict each other."""
+    """Make the error for a file that contradicts itself."""
     return InputError(f"{quoted(path)} is damaged: {what}; fetch or write the file again.")
 
 
@@ -54,7 +46,7 @@ def gaussians_of(
     opacities: Float[ndarray, "n"],
     sh: Float[ndarray, "n k 3"],
 ) -> Gaussians:
-    """Observed Gaussians from arrays in our conventions, as float32."""
+    """Build observed Gaussians (`generated` is 0) from arrays, as float32."""
     arrays = (means, quats, scales, opacities, sh)
     return observed(
         *(torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays)
@@ -64,6 +56,6 @@ def gaussians_of(
 def harmonics(
     rgb: Float[ndarray, "n 3"], rest: Float[ndarray, "n k 3"] | None = None
 ) -> Float[ndarray, "n m 3"]:
-    """Spherical harmonics that show `rgb`, with those of degree 1 and above behind."""
+    """Assemble SH from the RGB of their constant term and the coefficients of higher degree."""
     constant = (rgb[:, None] - 0.5) / SH_C0
     return constant if rest is None else np.concatenate([constant, rest], axis=1)

@@ -1,4 +1,4 @@
-"""The table of formats: a file is known by how it begins, and written by how its name ends."""
+"""The table of splat formats: read by the first bytes of a file, written by its extension."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from gscompleter.splats.spz import is_spz, read_spz, write_spz
 from gscompleter.types import Gaussians
 
 ROUNDING = 1e-3
-"""By how much an opacity may lie outside of [0, 1]."""
+"""Distance from [0, 1] up to which an opacity is clamped instead of refused."""
 HEAD = 8192
-"""Bytes that tell what a file is: the header of a compressed .ply fits."""
+"""Bytes read to detect a format; the header of a compressed .ply fits."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """How one kind of file is known, read and written."""
+    """Functions that detect, read and write one file format."""
 
     extensions: tuple[str, ...]
     begins: Callable[[bytes], bool] | None
-    """Whether a file with these first bytes is one; None where nothing but the name tells."""
+    """Test on the first bytes of a file, or None if only the extension identifies the format."""
     read: Callable[[Path], Gaussians]
     write: Callable[[Path, Gaussians], None] | None = None
     arrange: Callable[[Gaussians], Gaussians] | None = None
-    """The order that files of this kind hold their Gaussians in; None keeps the given one."""
+    """Sorts Gaussians as the format needs them; None keeps their order."""
     has_mode: bool = False
-    """True if files of this kind can mark Gaussians as antialiased."""
+    """True if the format can mark Gaussians as antialiased."""
 
 
 FORMATS = {
@@ -64,27 +64,28 @@ FORMATS = {
     "splat": Format((".splat",), None, read_splat, write_splat),
     "ksplat": Format((".ksplat",), None, read_ksplat),
 }
-"""By name, in the order in which a file is tried."""
+"""Formats by name, in the order in which they are tried."""
 
 
 def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
-    """The Gaussians of a file of any format of `FORMATS`, in the axes of a 3DGS .ply.
+    """Load the Gaussians of a file in any format of `FORMATS`, in the axes of a 3DGS .ply.
 
-    What was generated is known from a .ply itself, of other formats from the labels beside them.
+    The labels of generated Gaussians are read from a .ply itself, and for other formats from the
+    file `NAME.generated.json` beside it.
 
     Args:
         path: The file, or the folder of a .sog.
-        drop_nonfinite: Leave out Gaussians that hold NaN or infinity, or a rotation of zeros,
-            instead of refusing the file.
+        drop_nonfinite: Drop Gaussians with NaN, infinity or a zero quaternion instead of refusing
+            the file.
 
     Raises:
-        InputError: no such file, of no format that is known, truncated, damaged or empty.
+        InputError: The file is missing, empty, truncated or damaged, or its format is unknown.
     """
     path = Path(path)
     format_ = FORMATS[format_of(path)]
     if format_.read is load_ply:
         return load_ply(path, drop_nonfinite)
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
         gaussians = format_.read(path)
     if len(gaussians) == 0:
         raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
@@ -94,14 +95,10 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
 
 
 def within_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
-    """Refuse negative scales and impossible opacities; opacities off by rounding are clamped.
-
-    Raises:
-        InputError: if `gaussians` of the file `path` have some.
-    """
+    """Refuse negative scales and invalid opacities, and clamp opacities off by rounding."""
     opacities = gaussians.opacities
     bad = (gaussians.scales < 0).any(1) | ((opacities - 0.5).abs() > 0.5 + ROUNDING)
-    bad &= opacities.isfinite()  # others are counted as what is not finite
+    bad &= opacities.isfinite()  # others are refused as non-finite
     if bad.any():
         raise InputError(
             f"{quoted(path)} has {int(bad.sum()):,} of {len(bad):,} Gaussians with a negative "
@@ -111,14 +108,13 @@ def within_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
 
 
 def save_splat(path: Path | str, gaussians: Gaussians) -> None:
-    """Write Gaussians in the format that the end of the name asks for.
+    """Write Gaussians in the format given by the extension of `path`.
 
-    A .ply holds everything. The others round, and what was generated goes into a file beside
-    them, `NAME.generated.json`.
+    A .ply stores everything. Other formats round, and the labels of generated Gaussians go to
+    `NAME.generated.json` beside the file.
 
     Raises:
-        InputError: where the format is unknown or only read, there is nothing to write, or the
-            file cannot be written.
+        InputError: The format is unknown or read-only, there are no Gaussians, or writing fails.
     """
     path = Path(path)
     format_ = writable_format(path)
@@ -136,23 +132,18 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
 
 
 def loss_of_mode(path: Path, gaussians: Gaussians) -> str | None:
-    """Say in a sentence that the format of `path` cannot mark antialiased Gaussians; None where it
-    can, or they are not."""
+    """Describe that the format of `path` cannot mark antialiased Gaussians, or return None."""
     format_ = writable_format(path)
     if format_.has_mode or not gaussians.is_antialiased:
         return None
     return (
-        f"A {format_.extensions[0]} file cannot mark Gaussians as antialiased: viewers will draw "
-        "these as classic ones, which makes small ones too opaque."
+        f"A {format_.extensions[0]} file cannot mark Gaussians as antialiased: viewers will "
+        "render them as classic ones, which makes small ones too opaque."
     )
 
 
 def format_of(path: Path) -> str:
-    """The name of the format of what lies at `path`.
-
-    Raises:
-        InputError: where nothing lies there, or it is of no format that is known.
-    """
+    """Detect the format of a file or folder, by name."""
     if path.is_dir():
         if (path / META).is_file():
             return "sog"
@@ -174,15 +165,11 @@ def format_of(path: Path) -> str:
 
 
 def writable_format(path: Path) -> Format:
-    """The format that `path` would be written in.
-
-    Raises:
-        InputError: where there is none, or it is only read.
-    """
+    """Get the format for the extension of `path`, which must be one that is written."""
     name = _by_name(path)
     if name is None or FORMATS[name].write is None:
         raise InputError(
-            f"{quoted(path)} cannot be written in the format its name asks for; name it "
+            f"{quoted(path)} cannot be written in the format of its extension; end it in "
             f"{', '.join(f.extensions[0] for f in FORMATS.values() if f.write)}."
         )
     return FORMATS[name]

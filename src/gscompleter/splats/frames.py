@@ -1,8 +1,7 @@
-"""The same Gaussians in another frame, view-dependent colours included.
+"""Gaussians transformed to another frame, including view-dependent colour.
 
-A 3DGS .ply, and all formats but two, are read in the frame they were written in. SPZ is x right,
-y up, z back where a .ply is x right, y down, z forward: a half turn about x. glTF is x left, y up,
-z forward: a half turn about z.
+The axes of a .ply and of most formats are x right, y down, z forward. SPZ has x right, y up,
+z back, which is half a turn about x; glTF has x left, y up, z forward, half a turn about z.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ ABOUT_Z = (-1.0, -1.0, 1.0)
 
 
 def half_turned(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
-    """The Gaussians after half a turn about an axis. Exact: only signs change."""
+    """Rotate Gaussians by half a turn about an axis; exact, because only signs change."""
     flip = torch.tensor(signs)
     return replace(
         gaussians,
@@ -34,13 +33,13 @@ def half_turned(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaus
 
 
 def _signs_of_harmonics(signs: tuple[float, float, float], k: int) -> Float[Tensor, "k"]:
-    """Every basis function is even or odd under half a turn about an axis."""
+    """Compute the sign of each SH basis function, all even or odd under half a turn."""
     direction = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.7]]), dim=1)
     return (sh_basis(direction * torch.tensor(signs), k) / sh_basis(direction, k))[0].round()
 
 
 def moved(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:
-    """The Gaussians after a rotation, a uniform scale and a shift: `x' = s R x + t`."""
+    """Transform Gaussians by a similarity `x' = s R x + t`."""
     scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
     rotation = similarity[:3, :3] / scale
     return replace(
@@ -56,7 +55,7 @@ def moved(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:
 def _turned_harmonics(
     sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "n k 3"]:
-    """Harmonics that show along `R d` what `sh` shows along d, by least squares."""
+    """Rotate SH by least squares, so that they show along `R d` what `sh` shows along d."""
     k = sh.shape[1]
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(
@@ -68,7 +67,7 @@ def _turned_harmonics(
 
 
 def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
-    """wxyz of a rotation: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
+    """Convert a rotation to wxyz: the largest eigenvector of Bar-Itzhack's matrix."""
     (a, b, c), (d, e, f), (g, h, i) = rotation.double().tolist()
     matrix = torch.tensor(
         [
@@ -83,7 +82,7 @@ def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
 
 
 def _product(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """Hamilton product of wxyz quaternions: first the turns `b`, then the turn `a`."""
+    """Compute the Hamilton product of wxyz quaternions: rotation `b` first, then `a`."""
     vector = (
         a[0] * b[:, 1:] + b[:, :1] * a[1:] + torch.linalg.cross(a[1:].expand(len(b), 3), b[:, 1:])
     )

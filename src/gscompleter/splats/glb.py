@@ -1,8 +1,8 @@
 """Gaussians in binary glTF (.glb) with the extension KHR_gaussian_splatting, read only.
 
-A primitive of points has an attribute for each property: linear scales, opacities in [0, 1],
-rotations as xyzw, and a harmonic of three channels in each `SH_DEGREE_d_COEF_i`. Nodes place it in
-the scene. Axes are x left, y up, z forward.
+A primitive of points has one attribute per property: linear scales, opacities in [0, 1], xyzw
+rotations, and a `SH_DEGREE_d_COEF_i` of three channels for each SH coefficient. Nodes give its
+transform to the scene. Axes are x left, y up, z forward.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ CHUNK = struct.Struct("<II")
 JSON, BINARY = 0x4E4F534A, 0x004E4942
 EXTENSION = "KHR_gaussian_splatting"
 COLOURS = "srgb_rec709_display"
-"""The space of colours that all trainers of splats work in."""
+"""The colour space in which all splat trainers work."""
 KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-"""numpy's names of the component types."""
+"""numpy names of the component types."""
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 FEWEST_BYTES = 8
-"""Every Gaussian takes more than so many; fewer would mean that a scene repeats itself."""
+"""Lower bound on the bytes of a Gaussian; with fewer, the file repeats its data."""
 DEEPEST = 100
-"""Nodes below one another. A tree has an end, a circle has not."""
+"""Largest depth of the node tree; a deeper one contains a cycle."""
 
 
 @dataclass(frozen=True)
 class Document:
-    """The two parts of a .glb."""
+    """The JSON and binary parts of a .glb."""
 
     path: Path
     table: dict[str, Any]
@@ -51,16 +51,12 @@ class Document:
 
 
 def is_glb(head: bytes) -> bool:
-    """Whether a file that begins with `head` is binary glTF."""
+    """Return True if a file with the first bytes `head` is binary glTF."""
     return head.startswith(MAGIC)
 
 
 def read_glb(path: Path) -> Gaussians:
-    """All Gaussians of the scene in a .glb, in the axes of a .ply.
-
-    Raises:
-        InputError: where it cannot be read, holds no Gaussians, or holds them in another way.
-    """
+    """Read all Gaussians of the scene in a .glb, in the axes of a .ply."""
     document = _document(path, read_bytes(path))
     try:
         placed = list(_placed_primitives(document))
@@ -69,7 +65,7 @@ def read_glb(path: Path) -> Gaussians:
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise damaged(path, f"its description means nothing ({quoted(str(error))})") from error
+        raise damaged(path, f"its JSON part is invalid ({quoted(str(error))})") from error
     if not parts:
         raise InputError(f"{quoted(path)} holds no Gaussians: nothing in it uses {EXTENSION}.")
     return half_turned(merge(parts), ABOUT_Z)
@@ -96,7 +92,7 @@ def _document(path: Path, data: bytes) -> Document:
 def _placed_primitives(
     document: Document,
 ) -> Iterator[tuple[dict[str, Any], Float[Tensor, "4 4"]]]:
-    """The primitives of Gaussians in the scene, each with its transform into the scene."""
+    """Find the primitives of Gaussians in the scene, each with its transform to the scene."""
     table = document.table
     scenes = table.get("scenes")
     roots = scenes[table.get("scene", 0)]["nodes"] if scenes else range(len(table["nodes"]))
@@ -115,7 +111,7 @@ def _placed_primitives(
 
 
 def _place(document: Document, node: dict[str, Any]) -> Float[Tensor, "4 4"]:
-    """The transform of a node: a rotation, a uniform scale and a shift."""
+    """Read the transform of a node; only similarities are accepted."""
     if "matrix" in node:
         place = torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
     else:
@@ -146,17 +142,17 @@ def _check_repeats(document: Document, primitives: list[dict[str, Any]]) -> None
         document.table["accessors"][primitive["attributes"]["POSITION"]] for primitive in primitives
     ]
     if sum(int(a["count"]) for a in accessors) * FEWEST_BYTES > len(document.binary):
-        raise damaged(document.path, "it says that it holds more Gaussians than have room in it")
+        raise damaged(document.path, "it claims more Gaussians than fit into it")
 
 
 def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
-    """The Gaussians of a primitive, where its node finds them."""
+    """Decode the Gaussians of a primitive, in the frame of its node."""
     extension, attributes = primitive["extensions"][EXTENSION], primitive["attributes"]
     packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
     colours = extension.get("colorSpace", COLOURS)
     if packed != EXTENSION or extension.get("kernel", "ellipse") != "ellipse" or colours != COLOURS:
         raise InputError(
-            f"{document.path} holds Gaussians in a way that is not known ({quoted(packed)}, "
+            f"{document.path} stores Gaussians in an unknown way ({quoted(packed)}, "
             f"{quoted(extension.get('kernel', 'ellipse'))}, {quoted(colours)}); export it as .ply."
         )
 
@@ -186,7 +182,7 @@ def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
 
 
 def _accessor(document: Document, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
-    """The numbers that an accessor finds in the binary part; whole ones stand for fractions."""
+    """Read the numbers of an accessor from the binary part; integers may stand for fractions."""
     if "sparse" in accessor or "bufferView" not in accessor:
         raise InputError(f"{document.path} holds sparse attributes; export it as .ply.")
     view = document.table["bufferViews"][accessor["bufferView"]]
@@ -200,7 +196,7 @@ def _accessor(document: Document, accessor: dict[str, Any]) -> Float[ndarray, "n
     shape = (int(accessor["count"]), width)
     if stride < width * kind.itemsize:
         raise damaged(document.path, "its attributes overlap")
-    # numpy refuses what lies outside of the buffer.
+    # numpy refuses views that exceed the buffer.
     values = np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
     if kind.kind == "f":
         return values.astype(np.float32)

@@ -1,9 +1,9 @@
 """The .ksplat format of GaussianSplats3D, read only.
 
-A header of 4096 bytes, a header of 1024 for each section, then the sections: sizes of the buckets
-that are not full, centres of all buckets, and a row for each Gaussian. At compression level 0 rows
-are float32; from level 1 on positions are 16 bits from the centre of their bucket, scales and
-rotations half floats, and harmonics half floats or (level 2) bytes.
+A header of 4096 bytes and a header of 1024 bytes per section, then the sections: sizes of the
+partly filled buckets, centres of all buckets, and one row per Gaussian. At compression level 0
+rows are float32. From level 1 on, positions are 16-bit offsets from the centre of the bucket,
+scales and rotations are half floats, and SH are half floats or (level 2) bytes.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from gscompleter.types import Gaussians, merge
 
 HEADER, SECTION_HEADER = 4096, 1024
 COEFFICIENTS = (0, 3, 8, 15)
-"""Harmonics of degree 1 and above, for each channel, by degree."""
+"""SH coefficients per channel above degree 0, by degree."""
 CENTRE_RANGE = 32767
-"""Steps from the centre of a bucket to its side, where the file does not say."""
+"""Default number of steps from the centre of a bucket to its side."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """What the file says of all its sections."""
+    """The header of the file, valid for all sections."""
 
     sections: int
     level: int
-    """0: float32; 1: 16 bits; 2: 16 bits, and harmonics in bytes."""
+    """0: float32; 1: 16 bits; 2: 16 bits, with SH in bytes."""
     lowest: float
-    """What byte 0 of a harmonic means at level 2."""
+    """SH value of byte 0 at level 2."""
     highest: float
-    """What byte 255 means."""
+    """SH value of byte 255 at level 2."""
 
 
 @dataclass(frozen=True)
@@ -52,27 +52,23 @@ class Section:
 
     count: int
     capacity: int
-    """Rows that it has room for."""
+    """Rows that the section has space for."""
     bucket_size: int
     buckets: int
     block: float
-    """Length of the side of a bucket, in scene units."""
+    """Side length of a bucket, in scene units."""
     bucket_bytes: int
     steps: int
     """Steps from the centre of a bucket to its side."""
     full: int
-    """Buckets that are full. They come first."""
+    """Full buckets, which come first."""
     partial: int
-    """Buckets that are not."""
+    """Partly filled buckets."""
     degree: int
 
 
 def read_ksplat(path: Path) -> Gaussians:
-    """The Gaussians of a .ksplat, of SH degree 0 to 3.
-
-    Raises:
-        InputError: where it cannot be read, is truncated, or contradicts itself.
-    """
+    """Read a .ksplat of SH degree 0 to 3."""
     data = read_bytes(path)
     header = _header(path, data)
     end = HEADER + header.sections * SECTION_HEADER
@@ -99,8 +95,8 @@ def _header(path: Path, data: bytes) -> Header:
     lowest, highest = struct.unpack_from("<ff", data, 36)
     if major != 0 or minor < 1 or level > 2:
         raise InputError(
-            f"{quoted(path)} is no .ksplat that is known (version {major}.{minor}, compression "
-            f"{level}); convert it to .ply."
+            f"{quoted(path)} is .ksplat version {major}.{minor} with compression {level}, which "
+            "cannot be read; convert it to .ply."
         )
     return Header(sections, level, lowest or -1.5, highest or 1.5)
 
@@ -167,9 +163,9 @@ def _means(
 
 
 def _centres(path: Path, data: bytes, section: Section) -> Float[ndarray, "n 3"]:
-    """The centre of the bucket that each Gaussian is in."""
+    """Look up the centre of each Gaussian's bucket."""
     if section.bucket_bytes < 12 or section.full + section.partial > section.buckets:
-        raise damaged(path, "its buckets have no room for their centres")
+        raise damaged(path, "its buckets are too small for their centres")
     partial = np.frombuffer(data, "<u4", section.partial).astype(np.int64)
     ends = np.cumsum(partial) + section.full * section.bucket_size
     numbers = np.arange(section.count)
@@ -177,7 +173,7 @@ def _centres(path: Path, data: bytes, section: Section) -> Float[ndarray, "n 3"]
     of_partial = section.full + np.searchsorted(ends, numbers, side="right")
     bucket = np.where(numbers < full, numbers // max(section.bucket_size, 1), of_partial)
     if bucket.max() >= section.full + section.partial:
-        raise damaged(path, "its buckets hold fewer Gaussians than it says")
+        raise damaged(path, "its buckets hold fewer Gaussians than it claims")
     centres = np.ndarray(
         (section.buckets, 3), "<f4", data, section.partial * 4, (section.bucket_bytes, 4)
     )
@@ -185,7 +181,7 @@ def _centres(path: Path, data: bytes, section: Section) -> Float[ndarray, "n 3"]
 
 
 def _by_coefficient(rest: Float[ndarray, "n m"], degree: int) -> Float[ndarray, "n k 3"]:
-    """Harmonics degree by degree and in each channel by channel, as [n, k, 3]."""
+    """Reorder SH, stored by degree and then by channel, to [n, k, 3]."""
     bands, start = [np.empty((len(rest), 0, 3))], 0
     for band in range(1, degree + 1):
         width = 3 * (2 * band + 1)

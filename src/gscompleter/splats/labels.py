@@ -1,8 +1,7 @@
-"""Which Gaussians were generated, beside files that have no room to say so.
+"""Labels of generated Gaussians, in a file beside formats that cannot store them.
 
-`scene.spz.generated.json` holds the labels of `scene.spz` as runs, `[label, count]` each, and the
-sha256 of the file they belong to: labels of a file that another tool has changed since would
-stand at the wrong Gaussians.
+`scene.spz.generated.json` stores the labels of `scene.spz` as runs `[label, count]`, and the
+sha256 of the file that they belong to, because another tool may have changed it since.
 """
 
 from __future__ import annotations
@@ -24,16 +23,12 @@ from gscompleter.io.json_file import read_json
 
 
 def place_of_labels(path: Path) -> Path:
-    """Where the labels of a file lie."""
+    """Get the path of the labels file for a splat file."""
     return path.with_name(f"{path.name}.generated.json")
 
 
 def save_labels(path: Path, generated: UInt8[Tensor, "n"]) -> None:
-    """Write the labels of the file at `path` beside it; none where nothing was generated.
-
-    Raises:
-        InputError: where they cannot be written.
-    """
+    """Write the labels of the file at `path` beside it; remove them if nothing was generated."""
     place = place_of_labels(path)
     if not (generated > 0).any():
         with contextlib.suppress(FileNotFoundError):
@@ -48,11 +43,7 @@ def save_labels(path: Path, generated: UInt8[Tensor, "n"]) -> None:
 
 
 def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
-    """The labels of the `count` Gaussians in the file at `path`; zeros where none lie beside it.
-
-    Raises:
-        InputError: where they belong to another state of the file, or are damaged.
-    """
+    """Load the labels of the `count` Gaussians in the file at `path`; zeros if there are none."""
     place = place_of_labels(path)
     if not path.is_file() or not place.exists():
         return torch.zeros(count, dtype=torch.uint8)
@@ -71,7 +62,7 @@ def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
 
 
 def _covers(runs: Int64[ndarray, "m 2"], count: int) -> bool:
-    """Whether the runs are the labels of exactly `count` Gaussians."""
+    """Return True if the runs are valid labels of exactly `count` Gaussians."""
     in_range = ((runs >= 0) & (runs <= [255, count])).all()
     return bool(in_range) and sum(runs[:, 1].tolist()) == count
 

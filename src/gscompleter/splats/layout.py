@@ -1,7 +1,7 @@
-"""A .ply as its program wrote it: header, columns of its own and order of properties kept.
+"""A .ply with the layout of its writer: header, extra columns and property order.
 
-A scene that was given is completed in its own file: its rows stay byte for byte, `uchar generated`
-stands behind them, rows are appended. Taking these out again leaves the file that was given.
+An input splat is completed in its own file: its rows stay byte for byte, `uchar generated` is
+appended to them, and new rows follow. Removing both restores the input file.
 """
 
 from __future__ import annotations
@@ -28,34 +28,31 @@ _LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
 
 @dataclass(frozen=True)
 class Layout:
-    """A binary .ply whose first element are Gaussians."""
+    """A binary .ply whose first element contains Gaussians."""
 
     header: bytes
-    """As far as and with `end_header`."""
+    """Everything up to and including `end_header`."""
     byte_order: str
     """"<" or ">"."""
     vertex: Element
     rows: ndarray
-    """One structured row for each Gaussian, [n]."""
+    """One structured row per Gaussian, [n]."""
     behind: bytes
     """Everything after the last row."""
 
     @property
     def is_labelled(self) -> bool:
+        """True if there is a column `generated`."""
         return LABEL in (self.rows.dtype.names or ())
 
     @property
     def num_rest(self) -> int:
-        """Properties for harmonics of degree 1 and above."""
+        """Number of properties for SH of degree 1 and above."""
         return sum(name.startswith("f_rest_") for name in self.rows.dtype.names or ())
 
 
 def read_layout(path: Path) -> Layout | None:
-    """A file that `load_ply` reads, as it is; None where it is ASCII or begins with another table.
-
-    Raises:
-        InputError: where its header is broken.
-    """
+    """Read the layout of a .ply, or None if it is ASCII or begins with another element."""
     with path.open("rb") as file:
         file_format, (vertex, *_) = read_header(file, path)
         if file_format == "ascii" or vertex.name != "vertex":
@@ -70,26 +67,18 @@ def read_layout(path: Path) -> Layout | None:
 
 
 def given_layout(given: Path | None) -> Layout | None:
-    """The layout of the file that a scene was read from, where it is a .ply that has one.
-
-    Raises:
-        InputError: where its header is broken.
-    """
+    """Read the layout of the file of a scene, or None if it is no binary .ply."""
     is_ply = given is not None and given.name.lower().endswith(".ply")
     return read_layout(given) if given is not None and is_ply else None
 
 
 def write_layout(path: Path, layout: Layout) -> None:
-    """Write the file, its header with the count of the rows that are there.
-
-    Raises:
-        InputError: where the file cannot be written.
-    """
+    """Write a .ply, with the number of its rows in the header."""
     write_rows(path, layout, len(layout.rows), [layout.rows])
 
 
 def write_rows(path: Path, layout: Layout, count: int, rows: Iterable[ndarray]) -> None:
-    """The same with other `rows` of its kind, `count` altogether, a part at a time."""
+    """Write a .ply with other `rows` of the same type, `count` in total, block by block."""
     with replacing(path) as file:
         file.write(_COUNT.sub(rb"\g<1>" + str(count).encode(), layout.header, count=1))
         for part in rows:
@@ -98,7 +87,7 @@ def write_rows(path: Path, layout: Layout, count: int, rows: Iterable[ndarray]) 
 
 
 def unlabelled(layout: Layout) -> Layout:
-    """What was not generated, without the column that says so."""
+    """Remove the generated rows and the column `generated`."""
     if not layout.is_labelled:
         return layout
     kept = [p for p in layout.vertex.properties if p.name != LABEL]
@@ -110,10 +99,7 @@ def unlabelled(layout: Layout) -> Layout:
 
 
 def with_rows(layout: Layout, others: Layout, places: Int[Tensor, "m"]) -> Layout | None:
-    """The rows of `others` put in, so that they get the numbers `places`.
-
-    None where theirs have other columns.
-    """
+    """Insert the rows of `others` at the indices `row_numbers`; None if their columns differ."""
     if others.rows.dtype != layout.rows.dtype:
         return None
     total = len(layout.rows) + len(others.rows)
@@ -131,21 +117,11 @@ def save_like(
     given: Path,
     kept: Bool[Tensor, "n"] | None = None,
 ) -> None:
-    """Write a completed scene as the file of its context, labelled and longer.
+    """Write a completed scene in the layout of the input file `given`.
 
-    Where that file has no rows to keep (it is ASCII or no .ply, labels by other numbers than
-    bytes, has fewer harmonics than what is added, or is not what the context was read from) the
-    scene is written in our layout.
-
-    Args:
-        path: The file.
-        context: The Gaussians of `given`, in their order.
-        added: Others, which come behind them.
-        given: The file that the context was read from.
-        kept: Which rows of `given` the context has; all if left out.
-
-    Raises:
-        InputError: where `given` cannot be read or the file cannot be written.
+    The standard layout is used if `given` is ASCII or no .ply, has a column `generated` of another
+    type, fewer SH coefficients than `added`, or rows that do not match `context`. `kept` marks the
+    rows of `given` that the context has; None for all.
     """
     context, layout = context.to("cpu"), given_layout(given)
     added = merge([context[:0], added.to("cpu")])
@@ -173,7 +149,6 @@ def save_like(
 
 
 def _can_hold(layout: Layout, scene: Gaussians) -> bool:
-    """Whether rows of that layout have room for the scene's harmonics and labels."""
     labels = not layout.is_labelled or layout.rows.dtype[LABEL] == np.uint8
     return labels and layout.num_rest == 3 * (scene.sh.shape[1] - 1)
 
@@ -181,7 +156,7 @@ def _can_hold(layout: Layout, scene: Gaussians) -> bool:
 def _rows_of(
     context: Gaussians, layout: Layout, kept: Bool[Tensor, "n"] | None
 ) -> Int[ndarray, "m"] | None:
-    """The rows of a file that its context is of; None where that stands elsewhere than they say."""
+    """Find the rows of a file that its context was read from, or None if positions differ."""
     numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
     if len(numbers) != len(context):
         return None
@@ -195,9 +170,9 @@ def _rows_of(
 
 
 def _fill(rows: ndarray, values: ndarray) -> None:
-    """Set those columns of `rows` that `values` has, too."""
+    """Copy the columns that both tables have from `values` to `rows`."""
     if values.dtype.descr == rows.dtype.descr[: len(values.dtype.descr)]:
-        # A column at a time takes ten times as long where there are many.
+        # Copying column by column takes ten times as long with many columns.
         _as_bytes(rows)[:, : values.dtype.itemsize] = _as_bytes(np.ascontiguousarray(values))
         return
     for name in set(rows.dtype.names or ()) & set(values.dtype.names or ()):
@@ -205,17 +180,16 @@ def _fill(rows: ndarray, values: ndarray) -> None:
 
 
 def _taken(rows: ndarray, numbers: Int[ndarray, "m"]) -> ndarray:
-    """`rows[numbers]`. numpy copies a row of columns one after the other, and its bytes at once."""
+    """Return `rows[numbers]`, copied as bytes, which is faster than column by column."""
     return _as_bytes(rows)[numbers].view(rows.dtype)[:, 0]
 
 
 def _as_bytes(rows: ndarray) -> UInt8[ndarray, "n bytes"]:
-    """The bytes of each row, where they lie."""
     return rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)
 
 
 def _labelled_header(layout: Layout) -> bytes:
-    """The header with a line for the label behind the last property of the vertices."""
+    """Add a line for `generated` after the last vertex property of the header."""
     lines = layout.header.splitlines(keepends=True)
     start = next(i for i, line in enumerate(lines) if _COUNT.match(line))
     after = [i for i, line in enumerate(lines) if i > start and line.startswith(b"element")]

@@ -1,4 +1,4 @@
-"""Numbers in few bits, and rotations as the three smaller components of a quaternion."""
+"""Numbers in few bits, and rotations as the three smallest components of a quaternion."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from numpy import ndarray
 
 
 def fraction(packed: UInt32[ndarray, "*n"], shift: int, bits: int) -> Float[ndarray, "*n"]:
-    """`bits` bits of each number from bit `shift` on, as a fraction in [0, 1]."""
+    """Unpack `bits` bits of each number from bit `shift` on, as a fraction in [0, 1]."""
     most = (1 << bits) - 1
     return ((packed >> np.uint32(shift)) & np.uint32(most)).astype(np.float32) / np.float32(most)
 
 
 def quantized(fractions: Float[ndarray, "*n"], bits: int) -> UInt32[ndarray, "*n"]:
-    """The nearest of the numbers that `fraction` makes fractions of."""
+    """Quantize fractions to integers of `bits` bits; the inverse of `unpack_fraction`."""
     most = (1 << bits) - 1
     return np.rint(np.clip(fractions, 0, 1) * most).astype(np.uint32)
 
@@ -22,7 +22,7 @@ def quantized(fractions: Float[ndarray, "*n"], bits: int) -> UInt32[ndarray, "*n
 def with_largest(
     largest: Integer[ndarray, "n"], smaller: Float[ndarray, "n 3"]
 ) -> Float[ndarray, "n 4"]:
-    """Unit quaternions whose component number `largest` is positive and was left out."""
+    """Restore unit quaternions whose positive component `largest` was dropped."""
     quats = np.empty((len(smaller), 4), np.float32)
     places = np.arange(3) + (np.arange(3) >= largest[:, None])
     np.put_along_axis(quats, places, smaller.astype(np.float32), axis=1)
@@ -34,7 +34,7 @@ def with_largest(
 def without_largest(
     quats: Float[ndarray, "n 4"],
 ) -> tuple[Integer[ndarray, "n"], Float[ndarray, "n 3"]]:
-    """Which component is the largest, and the others once it is made positive; the inverse."""
+    """Drop the largest component, made positive; return its number and the other three."""
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.abs(unit).argmax(1)
     unit = unit * np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)

@@ -1,7 +1,6 @@
-"""Gaussians that were set aside from a scene, and where they belong in it.
+"""Pruned Gaussians, stored with their row numbers in the input scene.
 
-`removed.ply` is a 3DGS .ply whose vertices are followed by an element `place` with a property
-`uint row`: the rows that they had in the scene as it was given.
+`removed.ply` is a 3DGS .ply with a further element `place` that has one property `uint row`.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from gscompleter.splats.layout import given_layout, write_layout
 from gscompleter.types import Gaussians, merge
 
 NAME = "removed.ply"
-"""How the file is called, beside the completed scene."""
+"""Name of the file, beside the completed scene."""
 
 
 def save_removed(
@@ -32,18 +31,11 @@ def save_removed(
     given: Path | None = None,
     kept: Bool[Tensor, "m"] | None = None,
 ) -> None:
-    """Write Gaussians that were set aside.
+    """Write pruned Gaussians with their ascending row numbers in the input scene.
 
-    Args:
-        path: The file.
-        removed: The Gaussians.
-        rows: Their numbers in the scene as it was given, from 0, ascending.
-        given: The file that the scene was read from. Of a binary .ply the rows are taken as they
-            are, with all of their properties.
-        kept: Which rows of `given` the scene has; all if left out.
-
-    Raises:
-        InputError: where `given` cannot be read or the file cannot be written.
+    The rows of a binary .ply `given` are copied with all of their properties. `kept` marks the rows
+    of
+    `given` that the scene has; None for all.
     """
     layout = given_layout(given)
     with tempfile.TemporaryDirectory() as folder:
@@ -61,11 +53,7 @@ def save_removed(
 
 
 def load_removed(path: Path) -> tuple[Gaussians, Int[Tensor, "n"]]:
-    """Gaussians that were set aside, and their rows in the scene as it was given.
-
-    Raises:
-        InputError: where it cannot be read, or does not say where they belong.
-    """
+    """Load pruned Gaussians and their row numbers in the input scene."""
     removed = load_ply(path)
     with path.open("rb") as file:
         _, (vertex, *others) = read_header(file, path)
@@ -85,11 +73,7 @@ def load_removed(path: Path) -> tuple[Gaussians, Int[Tensor, "n"]]:
 
 
 def put_back(kept: Gaussians, removed: Gaussians, rows: Int[Tensor, "n"], path: Path) -> Gaussians:
-    """The scene as it was before `removed` were taken out of it.
-
-    Raises:
-        InputError: where the rows lie beyond the scene, so that `path` belongs to another one.
-    """
+    """Insert pruned Gaussians at their rows; `path` names their file in errors."""
     total = len(kept) + len(removed)
     if len(rows) and int(rows.max()) >= total:
         raise InputError(

@@ -1,10 +1,10 @@
 """The .sog format of PlayCanvas, a folder or a bundle (a zip of the same files), read only.
 
-`meta.json` names lossless WebP images that hold a Gaussian in each pixel: two images for 16 bits
-of position in a logarithmic scale, one for the rotation (2 + 3 x 8 bits), one of scales, one of
-colour and opacity; harmonics are rows of a palette. Bytes stand for entries of a codebook
-(version 2) or for steps between a lowest and a highest value (version 1). Antialiased Gaussians are
-marked by `"model": "antialiased"`, in early files of version 2 by `"antialias": true`.
+`meta.json` names lossless WebP images with one Gaussian per pixel: two images for 16 bits of
+position on a logarithmic scale, one for the rotation (2 + 3 x 8 bits), one for scales, one for
+colour and opacity. SH of degree 1 and above are rows of a palette. Bytes are entries of a
+codebook (version 2) or steps between a minimum and a maximum (version 1). Antialiased Gaussians
+are marked by `"model": "antialiased"`, in early files of version 2 by `"antialias": true`.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ META = "meta.json"
 ZIP = b"PK\x03\x04"
 COEFFICIENTS = (0, 3, 8, 15)
 PALETTE_WIDTH = 64
-"""Entries of the palette of harmonics in each row of its image."""
+"""Entries of the SH palette in each row of its image."""
 MOST_GROWTH = 256
-"""How many times its size an image may unpack to. Real ones reach ten."""
+"""Largest ratio of unpacked to packed size of an image. Real ones reach 10."""
 MOST_DEFLATED = 8
-"""How many times its size an entry of a bundle may unpack to; images do not shrink at all."""
+"""Largest ratio of unpacked to packed size of a zip entry; images do not shrink."""
 ZIP_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,
@@ -53,23 +53,18 @@ ZIP_ERRORS = (
     RuntimeError,
     ValueError,
 )
-"""What a damaged or encrypted bundle makes Python's reader raise."""
+"""Exceptions that Python raises for a damaged or encrypted bundle."""
 
 
 @dataclass(frozen=True)
 class Parts:
-    """The files of a scene, wherever they lie."""
+    """The files of a scene, in a folder or a bundle."""
 
     path: Path
-    """What the user named."""
     read: Callable[[str], bytes]
 
     def pixels(self, name: object, needed: int) -> UInt8[ndarray, "h w 4"]:
-        """An image of at least `needed` pixels.
-
-        Raises:
-            InputError: where it is absent, no lossless WebP, too small, or absurdly large.
-        """
+        """Read an image of at least `needed` pixels."""
         data = self.read(_plain(self.path, name))
         width, height = _webp_size(self.path, data)
         check_growth(self.path, 4 * width * height, len(data), MOST_GROWTH)
@@ -82,16 +77,12 @@ class Parts:
 
 
 def is_sog(head: bytes) -> bool:
-    """Whether a file that begins with `head` is a bundle or the `meta.json` of a folder."""
+    """Return True if a file with the first bytes `head` is a bundle or a `meta.json`."""
     return head.startswith(ZIP) or head.lstrip()[:1] == b"{"
 
 
 def read_sog(path: Path) -> Gaussians:
-    """The Gaussians of a bundle, of a folder, or of the folder that a `meta.json` lies in.
-
-    Raises:
-        InputError: where something is absent, damaged, or of a version that is not known.
-    """
+    """Read a bundle, a folder, or the folder of a `meta.json`."""
     if path.is_dir():
         return _read(Parts(path, lambda name: read_bytes(path / name)))
     data = read_bytes(path)
@@ -114,21 +105,21 @@ def _entry(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
     except KeyError as error:
         raise damaged(path, f"it has no {quoted(name)}") from error
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise damaged(path, f"its {quoted(name)} is packed in a way that bundles are not")
+        raise damaged(path, f"its {quoted(name)} has an unsupported compression")
     check_growth(path, entry.file_size, entry.compress_size, MOST_DEFLATED)
     with bundle.open(entry) as file:
         return file.read(entry.file_size)
 
 
 def _plain(path: Path, name: object) -> str:
-    """The name of a file right beside `meta.json`; nothing else is opened."""
+    """Check that `name` is a file directly beside `meta.json`."""
     if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable():
-        raise damaged(path, f"it names a file '{quoted(name)}', which is none of its own")
+        raise damaged(path, f"it names a file '{quoted(name)}' that is not beside it")
     return name
 
 
 def _webp_size(path: Path, data: bytes) -> tuple[int, int]:
-    """Width and height of a lossless WebP, before anything is unpacked."""
+    """Parse width and height of a lossless WebP without decoding it."""
     if data[:4] == b"RIFF" and data[8:15] == b"WEBPVP8" and len(data) >= 30:
         if data[15:16] == b"L":
             (bits,) = struct.unpack_from("<I", data, 21)
@@ -152,7 +143,7 @@ def _read(parts: Parts, meta: str = META) -> Gaussians:
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise damaged(parts.path, f"its {meta} means nothing ({quoted(str(error))})") from error
+        raise damaged(parts.path, f"its {meta} is invalid ({quoted(str(error))})") from error
 
 
 def _decoded(parts: Parts, table: dict[str, Any], version: int) -> Gaussians:
@@ -190,14 +181,14 @@ def _between(
 def _quats(packed: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     smaller = (packed[:, :3].astype(np.float32) / 255 - 0.5) * np.float32(np.sqrt(2))
     quats = with_largest(packed[:, 3] & 3, smaller)
-    quats[packed[:, 3] < 252] = (1, 0, 0, 0)  # no rotation, as other readers have it
+    quats[packed[:, 3] < 252] = (1, 0, 0, 0)  # the identity, as in other readers
     return quats
 
 
 def _values(
     parts: Parts, table: dict[str, Any], count: int, version: int, k: int
 ) -> Float[ndarray, "n k"]:
-    """The first `k` channels of an image, decoded; a fourth of version 2 is a fraction."""
+    """Decode the first `k` channels of an image; in version 2 the fourth is a fraction."""
     (name,) = table["files"]
     packed = parts.pixels(name, count).reshape(-1, 4)[:count, :k]
     if version == 1:
@@ -213,7 +204,7 @@ def _codebook(table: dict[str, Any]) -> Float[ndarray, "256"]:
 def _rest(
     parts: Parts, table: dict[str, Any], count: int, version: int
 ) -> Float[ndarray, "n k 3"] | None:
-    """Harmonics of degree 1 and above: each Gaussian has the number of a row of the palette."""
+    """Decode SH of degree 1 and above from the palette."""
     centroids, labels = table["files"]
     palette = parts.pixels(centroids, 1)
     k = palette.shape[1] // PALETTE_WIDTH

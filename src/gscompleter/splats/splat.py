@@ -1,7 +1,7 @@
-"""The .splat format: 32 bytes for each Gaussian, no header, no view-dependent colour.
+"""The .splat format: 32 bytes per Gaussian, no header, no view-dependent colour.
 
-Position and scale are float32 (the scale linear), colour and opacity a byte each, and so are the
-components of the rotation, wxyz, from -1 at 0 to 1 at 256.
+Position and linear scale are float32, colour and opacity one byte each. The wxyz rotation has one
+byte per component, from -1 at 0 to 1 at 256.
 """
 
 from __future__ import annotations
@@ -20,11 +20,7 @@ ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("qu
 
 
 def read_splat(path: Path) -> Gaussians:
-    """The Gaussians of a .splat.
-
-    Raises:
-        InputError: where it cannot be read, or does not consist of whole rows.
-    """
+    """Read a .splat."""
     data = read_bytes(path)
     if len(data) % ROW.itemsize:
         raise InputError(
@@ -38,11 +34,7 @@ def read_splat(path: Path) -> Gaussians:
 
 
 def write_splat(path: Path, gaussians: Gaussians) -> None:
-    """Write a .splat; harmonics of degree 1 and above have no room in it.
-
-    Raises:
-        InputError: where the file cannot be written.
-    """
+    """Write a .splat, without SH of degree 1 and above."""
     rows = np.empty(len(gaussians), ROW)
     rows["mean"] = gaussians.means.numpy()
     rows["scale"] = gaussians.scales.numpy()

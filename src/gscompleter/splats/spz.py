@@ -1,9 +1,9 @@
-"""The .spz format of Niantic, versions 2, 3 and 4 read, version 3 written.
+"""The .spz format of Niantic: versions 2, 3 and 4 are read, version 3 is written.
 
-Attribute after attribute: positions of 24 bits fixed point, opacities, colours and log-scales of a
-byte, rotations (version 2: three bytes; later: 2 + 3 x 10 bits), harmonics of a byte. Versions 2
-and 3 are one gzip stream with a header of 16 bytes; version 4 is a header of 32 bytes and a zstd
-stream for each attribute. Axes are x right, y up, z back.
+One attribute after the other: positions in 24-bit fixed point, opacities, colours and log-scales
+in one byte, rotations (version 2: three bytes; later: 2 + 3 x 10 bits), SH in one byte. Versions
+2 and 3 are one gzip stream with a header of 16 bytes. Version 4 has a header of 32 bytes and one
+zstd stream per attribute. Axes are x right, y up, z back.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams."""
 TABLE = struct.Struct("<I12x")
-"""Version 4 goes on with the offset of its table of sizes."""
+"""In version 4, the offset of the table of stream sizes follows."""
 ANTIALIASED = 0x1
-"""The flag of antialiased Gaussians."""
+"""Flag of antialiased Gaussians."""
 COEFFICIENTS = (0, 3, 8, 15)
 MOST_GROWTH = 256
-"""How many times its size a file may unpack to. Real ones reach two."""
+"""Largest ratio of unpacked to packed size. Real files reach 2."""
 LARGEST_WINDOW = 1 << 27
-"""Bytes that zstd may look back, and needs to keep."""
+"""Largest window of zstd, in bytes, which it keeps in memory."""
 COLOUR_SCALE = 0.15
-"""Constant harmonics are held as `0.5 + 0.15 sh`."""
+"""The constant SH coefficient is stored as `0.5 + 0.15 sh`."""
 MOST_FRACTIONAL_BITS = 16
-"""As few as positions need are before the point, but at most so many behind it."""
+"""Largest number of fractional bits of a position."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a .spz says of itself."""
+    """The header of a .spz."""
 
     version: int
     count: int
@@ -65,23 +65,19 @@ class Header:
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes of positions, opacities, colours, scales, rotations and harmonics."""
+        """Bytes of positions, opacities, colours, scales, rotations and SH."""
         rotation = 3 if self.version == 2 else 4
         widths = [9, 1, 3, 3, rotation, 3 * COEFFICIENTS[self.degree]]
         return [width * self.count for width in widths]
 
 
 def is_spz(head: bytes) -> bool:
-    """Whether a file that begins with `head` is a .spz."""
+    """Return True if a file with the first bytes `head` is a .spz."""
     return head.startswith((MAGIC, GZIP))
 
 
 def read_spz(path: Path) -> Gaussians:
-    """The Gaussians of a .spz, of SH degree 0 to 3, in the axes of a .ply.
-
-    Raises:
-        InputError: where it cannot be read, is truncated, or of a version that is not known.
-    """
+    """Read a .spz of SH degree 0 to 3, in the axes of a .ply."""
     data = read_bytes(path)
     if data.startswith(GZIP):
         header, streams = _from_gzip(path, data)
@@ -97,7 +93,7 @@ def _header(path: Path, data: bytes) -> Header:
     check_size(path, len(data), HEADER.size)
     magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(data)
     if magic != MAGIC:
-        raise InputError(f"{quoted(path)} is no .spz: it holds something else that is compressed.")
+        raise InputError(f"{quoted(path)} is no .spz but other compressed data.")
     if version not in (2, 3, 4):
         raise InputError(
             f"{quoted(path)} is .spz version {version}; versions 2, 3 and 4 are known."
@@ -117,11 +113,11 @@ def _from_gzip(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
     try:
         header = _header(path, unpacker.decompress(data, HEADER.size))
         if header.version > 3:
-            raise damaged(path, f"version {header.version} is not packed as a whole")
+            raise damaged(path, f"version {header.version} is no gzip stream")
         size = sum(header.sizes)
         check_growth(path, size, len(data), MOST_GROWTH)
         body = unpacker.decompress(unpacker.unconsumed_tail, size)
-        more = unpacker.decompress(unpacker.unconsumed_tail, 1)  # which compares the checksum
+        more = unpacker.decompress(unpacker.unconsumed_tail, 1)  # reads the checksum
     except zlib.error as error:
         raise damaged(path, "it cannot be unpacked") from error
     if not (more or unpacker.eof):
@@ -136,7 +132,7 @@ def _split(path: Path, header: Header, body: bytes) -> list[bytes]:
 
 
 def _from_zstd(path: Path, data: bytes) -> list[bytes]:
-    """The attributes of version 4, each from its own stream."""
+    """Decompress the attributes of version 4, each from its own stream."""
     header = _header(path, data)
     check_size(path, len(data), HEADER.size + TABLE.size)
     (place,) = TABLE.unpack_from(data, HEADER.size)
@@ -158,7 +154,7 @@ def _from_zstd(path: Path, data: bytes) -> list[bytes]:
 
 
 def _unpacked(path: Path, data: bytes, size: int) -> bytes:
-    import zstandard  # here, because only this version of one format needs it
+    import zstandard  # only version 4 needs it
 
     unpacker = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
     try:
@@ -170,7 +166,7 @@ def _unpacked(path: Path, data: bytes, size: int) -> bytes:
 
 
 def _decoded(header: Header, streams: list[bytes]) -> Gaussians:
-    """The Gaussians as the file has them, in its own axes."""
+    """Decode the Gaussians, in the axes of the file."""
     positions, opacities, colours, scales, rotations, rest = (
         np.frombuffer(stream, np.uint8).reshape(header.count, len(stream) // header.count)
         for stream in streams
@@ -189,7 +185,7 @@ def _decoded(header: Header, streams: list[bytes]) -> Gaussians:
 
 
 def _signed(positions: UInt8[ndarray, "n 9"]) -> Int[ndarray, "n 3"]:
-    """Three signed numbers of 24 bits in each row of 9 bytes."""
+    """Decode three signed 24-bit numbers from each row of 9 bytes."""
     a, b, c = np.moveaxis(positions.reshape(-1, 3, 3).astype(np.int32), 2, 0)
     return ((a | (b << 8) | (c << 16)) ^ (1 << 23)) - (1 << 23)
 
@@ -201,7 +197,7 @@ def _first_three(rotations: UInt8[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
 
 
 def _smallest_three(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
-    """Sign and 9 bits for each of three components of xyzw, the number of the fourth on top."""
+    """Decode the number of the dropped component and three of 10 bits (xyzw, sign and size)."""
     packed = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     fields = np.stack([packed >> np.uint32(shift) for shift in (20, 10, 0)], axis=1)
     sizes = (fields & np.uint32(511)).astype(np.float32) / 511 * np.float32(np.sqrt(0.5))
@@ -209,30 +205,18 @@ def _smallest_three(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     return np.roll(with_largest(packed >> np.uint32(30), smaller), 1, axis=1)
 
 
-# --------------------------------------------------------------------------------------- write
+# --------------------------------------------------------------------------------- writing
 
 
 def write_spz(path: Path, gaussians: Gaussians) -> None:
-    """Write a .spz of version 3.
-
-    Raises:
-        InputError: where Gaussians lie too far out for it, or the file cannot be written.
-    """
+    """Write a .spz of version 3."""
     content = packed_spz(path, gaussians)
     with replacing(path) as file:
         file.write(content)
 
 
 def packed_spz(path: Path, gaussians: Gaussians) -> bytes:
-    """The bytes of a .spz of version 3, positions as fine as their range leaves room for.
-
-    Args:
-        path: What the file is called, for error messages.
-        gaussians: In the axes of a .ply; at least one.
-
-    Raises:
-        InputError: where Gaussians lie too far out for it.
-    """
+    """Encode a .spz of version 3 in the finest possible steps; `path` is for errors."""
     turned = half_turned(gaussians, ABOUT_X)
     bits = _fractional_bits(path, turned)
     flags = ANTIALIASED if gaussians.is_antialiased else 0
@@ -255,7 +239,7 @@ def packed_spz(path: Path, gaussians: Gaussians) -> bytes:
 
 
 def _fractional_bits(path: Path, gaussians: Gaussians) -> int:
-    """How many of 23 bits the farthest coordinate leaves behind the point."""
+    """Choose the fractional bits that the farthest coordinate leaves of 23."""
     farthest = gaussians.means.abs().max().item()
     bits = 23 - int(np.ceil(np.log2(farthest + 1)))
     if bits < 0:

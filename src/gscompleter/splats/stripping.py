@@ -1,4 +1,4 @@
-"""From a completed scene back to the one that was given."""
+"""Restores the input scene from a completed one."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from gscompleter.types import Gaussians
 
 
 def strip(path: Path, out: Path) -> tuple[int, int]:
-    """Write the scene that the completed one at `path` was made of.
+    """Write the input scene of the completed scene at `path`.
 
-    Where both are .ply the file keeps its layout, else what is in it is written anew.
-
-    Returns:
-        How many Gaussians were written, and how many generated ones were left out.
+    If both are .ply, the layout of the file is kept. Returns the numbers of Gaussians written and
+    left
+    out.
 
     Raises:
-        InputError: where nothing of it was given, or a file cannot be read or written.
+        InputError: All Gaussians are generated, or a file cannot be read or written.
     """
     completed = load_splat(path)
     given = as_given(completed, path)
@@ -35,25 +34,20 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
 
 
 def as_given(completed: Gaussians, path: Path) -> Gaussians:
-    """The Gaussians of the completed scene at `path` as they were given, in their order.
-
-    Raises:
-        InputError: where all are generated, or the removed.ply beside it is damaged.
-    """
+    """Restore the input Gaussians of the completed scene at `path`, in their order."""
     given = without_padding(completed)
     place = path.parent / NAME
     if place.is_file():
         given = put_back(given, *load_removed(place), place)
     if len(given) == 0:
-        raise InputError(f"{quoted(path)} holds nothing that was given: all of it was generated.")
+        raise InputError(
+            f"{quoted(path)} holds only generated Gaussians: there is no input scene to restore."
+        )
     return given
 
 
 def without_padding(completed: Gaussians) -> Gaussians:
-    """What was observed, without the harmonics that only what was generated has.
-
-    A scene of fewer harmonics is padded with zeros when Gaussians with more are added to it.
-    """
+    """Select the observed Gaussians, without the SH padding of a scene of lower degree."""
     observed = completed[completed.generated == 0]
     generated = completed[completed.generated > 0]
     k = completed.sh.shape[1]
@@ -65,10 +59,7 @@ def without_padding(completed: Gaussians) -> Gaussians:
 
 
 def file_as_given(path: Path, given: Gaussians) -> Layout | None:
-    """The completed .ply at `path` without the rows and the column that completing it added.
-
-    None where it is no .ply whose rows can be kept, or they were widened for more harmonics.
-    """
+    """Remove what completing added to the .ply at `path`; None if its rows cannot be restored."""
     layout = read_layout(path) if format_of(path) == "ply" else None
     if layout is None or layout.num_rest != 3 * (given.sh.shape[1] - 1):
         return None

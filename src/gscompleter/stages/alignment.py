@@ -1,4 +1,4 @@
-"""Stage 3, coarse: one affine depth correction for all that was lifted (paper, Sec. III-E)."""
+"""Stage 3, coarse: one affine depth correction for all lifted Gaussians (paper, Sec. III-E)."""
 
 from __future__ import annotations
 
@@ -14,35 +14,32 @@ from gscompleter.types import DepthAffine, DepthMap, Lift, Render
 MAX_TRIALS = 512
 """Two-point hypotheses."""
 AT_ONCE = 32
-"""Of them that are scored at once: so few that their residuals stay in the cache."""
+"""Hypotheses that are scored together, so few that their residuals stay in the cache."""
 MAX_PIXELS = 8192
-"""Pixels the hypotheses are scored on, drawn at random where there are more."""
+"""Pixels that hypotheses are scored on; of more, a random sample is used."""
 RESIDUAL_THRESHOLD = 0.05
 """Largest residual of an inlier, relative to the context depth."""
 MIN_INLIERS = 0.3
-"""Smallest share of inliers that makes a fit trustworthy."""
+"""Smallest inlier fraction of a reliable fit."""
 MIN_PIXELS = 64
-"""Fewest comparable pixels; under it there is nothing to fit."""
+"""Fewest comparable pixels that a fit needs."""
 MIN_SEEN = 0.01
-"""Share of its image that the target must see of the scene, before this can refute an affine."""
+"""Fraction of its image that the target must see of the scene to reject an affine."""
 MIN_DEPTH_SPREAD = 0.05
-"""Smallest spread of the predicted depths ((p95 - p5) / median) that tells scale and shift apart;
-under it only a scale is fitted."""
+"""Smallest depth spread that separates scale and shift; below, only a scale is fitted."""
 
 
 def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> DepthAffine:
-    """Robust `context ≈ scale * predicted + shift` over pixels valid in both (paper, Eq. 8).
+    """Fit `context ≈ scale * predicted + shift` by RANSAC over valid pixels (paper, Eq. 8).
 
-    Where RANSAC cannot be trusted (few pixels, hardly any range of depth, few inliers) the median
-    ratio with shift 0 takes its place, and the identity where there is nothing to compare; which
-    of them was used is part of the result.
+    The fallback is the median ratio with shift 0, and the identity if nothing can be compared.
     """
     x, y = compared(predicted, context)
     if len(x) < MIN_PIXELS:
         return DepthAffine()
     if len(x) > MAX_PIXELS:
-        drawn = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
-        x, y = x[drawn], y[drawn]
+        sample = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
+        x, y = x[sample], y[sample]
 
     if depth_spread(x) >= MIN_DEPTH_SPREAD:
         scale, shift = ransac_line(x, y, rng)
@@ -58,13 +55,13 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
 def compared(
     predicted: DepthMap, context: DepthMap
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Both z-depths at the pixels where both are known."""
+    """Return both z-depths at the pixels where both are valid."""
     comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
     return predicted.depth[comparable].double(), context.depth[comparable].double()
 
 
 def depth_spread(depth: Float[Tensor, "n"]) -> float:
-    """(p95 - p5) / median: how much range of depth there is to fit a line through."""
+    """Compute (p95 - p5) / median of depths."""
     low, median, high = depth.quantile(depth.new_tensor([0.05, 0.5, 0.95])).tolist()
     return (high - low) / median
 
@@ -72,16 +69,17 @@ def depth_spread(depth: Float[Tensor, "n"]) -> float:
 def affine_inliers(
     x: Float[Tensor, "n"], y: Float[Tensor, "n"], scale: float, shift: float
 ) -> Bool[Tensor, "n"]:
+    """Find pixels with a small residual, relative to `y`."""
     return (scale * x + shift - y).abs() < RESIDUAL_THRESHOLD * y
 
 
 def ransac_line(
     x: Float[Tensor, "n"], y: Float[Tensor, "n"], rng: torch.Generator
 ) -> tuple[float, float]:
-    """Scale and shift with the most inliers among two-point hypotheses, refitted on its inliers.
+    """Fit scale and shift to the most inliers of two-point hypotheses, then refit them.
 
-    Residuals count relative to depth, so that the far end of the scene does not outvote the near
-    one, and the refit weighs them alike. (0, 0) where no hypothesis has a positive scale.
+    Residuals are relative to depth, so that distant pixels do not dominate. Returns (0, 0) if no
+    hypothesis has a positive scale.
     """
     i, j = torch.randint(len(x), (2, MAX_TRIALS), generator=rng).to(x.device)
     scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
@@ -89,8 +87,8 @@ def ransac_line(
     points = torch.stack([x / y, 1 / y])
     counts = torch.cat(
         [
-            ((some @ points).sub_(1).abs_() < RESIDUAL_THRESHOLD).sum(dim=1)
-            for some in torch.stack([scales, shifts], dim=1).split(AT_ONCE)
+            ((batch @ points).sub_(1).abs_() < RESIDUAL_THRESHOLD).sum(dim=1)
+            for batch in torch.stack([scales, shifts], dim=1).split(AT_ONCE)
         ]
     )
     best = counts.where(scales > 0, -1).argmax()
@@ -102,9 +100,9 @@ def ransac_line(
         agree = affine_inliers(x, y, scale, shift)
         weight = 1 / y[agree]
         design = torch.stack([x[agree], torch.ones_like(x[agree])], dim=-1) * weight[:, None]
-        # The normal equations have a closed form on any device, which lstsq has not.
+        # Unlike lstsq, the normal equations are solved in closed form on any device.
         normal = design.T @ design
-        # Its second column is in inverse depths: measured by their own size, no unit matters.
+        # The second column is in inverse depths; scaling makes the condition independent of units.
         even = torch.stack([torch.ones_like(x[0]), y.median()])
         if torch.linalg.cond(normal * even * even[:, None]) > 1e12:
             break
@@ -120,10 +118,10 @@ def fit_bridge(
     config: AlignmentConfig = AlignmentConfig(),
     reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> DepthAffine:
-    """The affine that brings the lifted depths to the scene's, compared in the bridge view.
+    """Fit the affine depth correction at the anchor (the paper's bridge) or at the target.
 
-    The anchor is the paper's bridge: the scene is dense there, while at the target it has the very
-    holes that are to be filled. What the target sees nevertheless may contradict it.
+    The context has holes at the target, but the part that is visible there can contradict the
+    anchor.
     """
     if config.align_at == "none":
         return DepthAffine()
@@ -143,11 +141,10 @@ def unless_contradicted(
     config: AlignmentConfig,
     reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> DepthAffine:
-    """`affine`, unless the scene that the target sees has other depths and one other affine.
+    """Replace an affine that contradicts the context at the target by a fit at the target.
 
-    Where a pair shares too little for stereo (hardly any overlap, poses that drift), Ψ's depths of
-    its two views need not be of one scale, and what fits the anchor is wrong at the target. Where
-    no other fits there either, the paper's choice stands, and is refuted if hardly anything agrees.
+    With little overlap or pose drift, Ψ's two depth maps differ in scale. If no fit at the target
+    is better, the paper's choice stays, and is rejected if hardly any depth agrees.
     """
     x, y = compared(predicted, context)
     if config.min_agreement is None or len(x) < MIN_PIXELS:
@@ -156,8 +153,8 @@ def unless_contradicted(
     affine = replace(affine, agreement=agree)
     if agree >= config.min_agreement:
         return affine
-    own = fit_affine(predicted, context, rng)
-    if own.inliers >= max(MIN_INLIERS, 2 * agree):
-        return replace(own, agreement=own.inliers, contradicted=True)
+    refitted = fit_affine(predicted, context, rng)
+    if refitted.inliers >= max(MIN_INLIERS, 2 * agree):
+        return replace(refitted, agreement=refitted.inliers, contradicted=True)
     enough = len(x) >= MIN_SEEN * context.depth.numel()
     return replace(affine, refuted=enough and agree < (reject_below or 0.0))

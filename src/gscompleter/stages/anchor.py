@@ -1,5 +1,4 @@
-"""Stage 2: synthesize the target image, select the stereo anchor, lift the pair to Gaussians
-(paper, Sec. III-D)."""
+"""Stage 2: synthesize, select the stereo anchor, lift the pair (paper, Sec. III-D)."""
 
 from __future__ import annotations
 
@@ -19,16 +18,15 @@ from gscompleter.types import Camera, Lift, SceneContext, View
 
 @dataclass(frozen=True)
 class AnchorChoice:
-    """Which context view forms the stereo pair with the target."""
+    """The context view that forms the stereo pair with the target."""
 
     index: int
-    """Index among the context views."""
     fallback: bool
-    """True where every view was turned too far and the least-turned one was taken."""
+    """True if every view exceeded the rotation limit, so that the smallest rotation won."""
 
 
 def nearest_view(target: Camera, views: Sequence[View]) -> int:
-    """Index of the view taken closest to `target`; of equals, the one turned least."""
+    """Return the index of the view closest to `target`; a tie goes to the smaller rotation."""
 
     def remoteness(index: int) -> tuple[float, float]:
         camera = views[index].camera
@@ -43,16 +41,12 @@ def select_anchor(
     config: AnchorConfig = AnchorConfig(),
     overlaps: Sequence[float] | None = None,
 ) -> AnchorChoice:
-    """Choose the observed view that makes the best stereo pair with `target`.
+    """Choose the context view that makes the best stereo pair with `target` (paper, Fig. 3).
 
-    Among views turned by less than `max_rotation`, the one farthest away wins, because a wide
-    baseline makes triangulation precise. When every view is turned further than that, overlap
-    matters more than precision, and the least-turned view wins (paper, Fig. 3).
-
-    A view that stands too close to the target (`min_baseline`) is left out, unless all do. Where it
-    is known which share of what the target observes each view sees, those that see too little are
-    left out, too: of a long path the widest baseline shows something else. If all do, the one that
-    sees most wins.
+    Among views rotated by less than `max_rotation`, the widest baseline wins, since it triangulates
+    best; if none qualifies, the smallest rotation wins. Beyond the paper, a view needs
+    `min_baseline` and `min_overlap` (fraction of the target's visible surfaces) unless no view has
+    them.
     """
     if not views:
         raise ValueError("select_anchor needs at least one observed view, got none")
@@ -76,35 +70,35 @@ def select_anchor(
 
 @dataclass(frozen=True)
 class Synthesized(View):
-    """The image at the target, as a view, and what its generator tells of it."""
+    """The image synthesized at the target, with the notes of its generator."""
 
     notes: tuple[str, ...] = ()
-    """A sentence each; empty for a generator that tells nothing."""
+    """One sentence each, for the results."""
     disagrees: bool = False
-    """Whether the photographs say that it shows something else."""
+    """True if the image is photometrically inconsistent with the photographs."""
 
 
 def synthesize(
     generator: Generator | ImageFunction, target: Camera, context: SceneContext
 ) -> Synthesized:
-    """`Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 6)."""
+    """Synthesize `Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 6)."""
     return synthesize_all(generator, [(target, context)])[0]
 
 
 def synthesize_all(
     generator: Generator | ImageFunction, asked: Sequence[tuple[Camera, SceneContext]]
 ) -> list[Synthesized]:
-    """The same for several targets at once, each with what is known of the scene for it."""
+    """Synthesize the images of several targets in one call of Φ."""
     requests = [
         Request(context.views[nearest_view(target, context.views)], target, context)
         for target, context in asked
     ]
-    answers = as_generator(generator).synthesize(requests)
-    return [as_view(answer, r.target) for answer, r in zip(answers, requests, strict=True)]
+    outputs = as_generator(generator).synthesize(requests)
+    return [as_view(output, r.target) for output, r in zip(outputs, requests, strict=True)]
 
 
 def as_view(answer: Synthesis, target: Camera) -> Synthesized:
-    """What a generator answered, once it is seen to be an image of the target's size."""
+    """Convert the output of a generator to a view, after checking its size and values."""
     expected = (target.height, target.width, 3)
     if tuple(answer.image.shape) != expected or not torch.isfinite(answer.image).all():
         raise ValueError(
@@ -120,11 +114,9 @@ def lift(
     anchor: View,
     wanted: Bool[Tensor, "h w"] | None = None,
 ) -> Lift:
-    """`Ψ((Ĩ_t, P_t), (I_s, P_s))`, of which the target's Gaussians are kept (paper, Eq. 7).
+    """Lift `Ψ((Ĩ_t, P_t), (I_s, P_s))` and keep the target's Gaussians (paper, Eq. 7).
 
-    A pixel-aligned Ψ says which Gaussians are the reference's. Of another Ψ all those are taken
-    that the target camera sees. Where pixels of the reference are `wanted`, those of others are
-    left out if their pixels are known.
+    These are all that the target sees if Ψ is not pixel-aligned, else those inside `pixel_mask`.
     """
     pair = reconstructed(reconstructor, [reference, anchor], wanted)
     reference_depth, anchor_depth = pair.depths

@@ -1,9 +1,7 @@
-"""Where a scene may be completed from, where nobody says: cameras a move away from the photographs.
+"""Candidate target cameras: moves of the photographs' cameras, as in ExploreGS.
 
-The moves are those of ExploreGS around each training camera: six translations, four turns, and
-four orbits about what the camera looks at. A step is as long as the photographs stand apart, and no
-longer than a share of the depth they see, so that most of what a candidate sees was observed. No
-move tilts the horizon more than the photographs do.
+Each camera is translated in six directions, turned in four, and moved on four orbits. Steps are so
+short that most of what a candidate sees was observed; horizons stay as level as in photographs.
 """
 
 from __future__ import annotations
@@ -21,9 +19,9 @@ from gscompleter.geometry import project, rotation_about
 from gscompleter.types import Camera, Render
 
 MARGIN = 0.1
-"""Share of its depth by which a point has to lie before a surface to be in the open."""
+"""Distance in front of a surface, relative to depth, from which a point is in free space."""
 MIN_SEEN = 0.05
-"""Share of its image of which a camera must see the scene for its depth to be known."""
+"""Fraction of its image that must show the scene for a camera to have a known depth."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +30,9 @@ class Candidate:
 
     camera: Camera
     base: int
-    """Index of the given camera that it was derived from."""
+    """Index of the camera that it was derived from."""
     nearest: float
-    """z-depth of the nearest twentieth of what that camera sees, in scene units."""
+    """5 % quantile of the z-depths that this camera sees, in scene units."""
 
 
 def candidates(
@@ -43,13 +41,9 @@ def candidates(
     step: float,
     config: NextBestViewConfig = NextBestViewConfig(),
 ) -> list[Candidate]:
-    """The moves of each of `bases` that end in free space.
+    """Propose the moves of each base camera that end in free space.
 
-    Args:
-        bases: Cameras of photographs.
-        renders: What these see of the scene, in images of any size.
-        step: How far a camera moves at most, in scene units; 0 where the photographs do not tell.
-        config: How far it moves otherwise.
+    `renders` show the scene at `bases`. `step` is the longest move in scene units, 0 if unknown.
     """
     depths, nearest = depths_at(renders, 0.5), depths_at(renders, 0.05)
     up = upward(bases)
@@ -67,14 +61,10 @@ def candidates(
 def moves(
     camera: Camera, depth: float, step: float, turn: float, up: Float[Tensor, "3"]
 ) -> list[Camera]:
-    """Fourteen cameras a move away from `camera`.
+    """Make fourteen cameras one move away from `camera`.
 
-    Args:
-        camera: Where the moves begin.
-        depth: z-depth of what it looks at, in scene units.
-        step: Length of a translation, and about that of the arc of an orbit, in scene units.
-        turn: Angle of a turn, as a share of the opening angle.
-        up: The direction that turns to the side turn about [3], of length 1.
+    `depth` (of the viewed point) and `step` are in scene units; `turn` is a fraction of the field
+    of view; `up` is the unit axis of turns to the side.
     """
     axes = camera.c2w[:3, :3].T
     shifts = [sign * step * axis for axis in axes for sign in (1, -1)]
@@ -91,8 +81,7 @@ def moves(
 def swung(
     camera: Camera, pivot: Float[Tensor, "3"], angles: tuple[float, float], up: Float[Tensor, "3"]
 ) -> list[Camera]:
-    """`camera` turned about a point to either side, about `up`, and up and down, about its own
-    x-axis; by so many radians."""
+    """Turn a camera about a point by two angles in radians, about `up` and about its x axis."""
     axes = (up, camera.c2w[:3, 0])
     arm = camera.center - pivot
     turns = [
@@ -104,7 +93,7 @@ def swung(
 
 
 def moved(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]) -> Camera:
-    """`camera` turned in world axes, its centre moved by `shift`."""
+    """Rotate a camera in world axes and shift its centre."""
     c2w = camera.c2w.clone()
     c2w[:3, :3] = turn @ camera.c2w[:3, :3]
     c2w[:3, 3] += shift
@@ -112,14 +101,14 @@ def moved(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"])
 
 
 def opening(camera: Camera) -> tuple[float, float]:
-    """Opening angles of a camera to the side and upwards, in radians."""
+    """Compute the horizontal and vertical field of view in radians."""
     half = torch.tensor([camera.width, camera.height]) / 2 / camera.K.diagonal()[:2].cpu()
     wide, high = (2 * torch.atan(half)).tolist()
     return wide, high
 
 
 def upward(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
-    """The direction that is up in most of the images, of length 1."""
+    """Estimate the unit up direction that most images share."""
     ups = torch.stack([-camera.c2w[:3, 1] for camera in cameras])
     likeness = (ups @ ups.T).sum(dim=1)
     return normalize(ups[(ups @ ups[likeness.argmax()]) > 0].mean(dim=0), dim=0)
@@ -128,7 +117,7 @@ def upward(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
 def in_the_open(
     point: Float[Tensor, "3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> bool:
-    """Whether a photograph sees through `point`, or at least none sees a surface before it."""
+    """Return True if a photograph sees through a point, or if none shows an occluder."""
     hidden = False
     for camera, render in zip(cameras, renders, strict=True):
         pixel, z = project(point, camera)
@@ -145,44 +134,43 @@ def in_the_open(
 
 
 def is_close(render: Render, nearest: float, config: NextBestViewConfig) -> bool:
-    """Whether surfaces before a camera fill more of its image than they may; `nearest` is how near,
-    in scene units, they are where a photograph was taken."""
+    """Return True if surfaces much closer than `nearest` fill too much of an image."""
     seen = render.depth_map()
     near = seen.valid & (seen.depth < config.clearance * nearest)
     return near.float().mean().item() > config.max_close
 
 
 def depths_at(renders: Sequence[Render], share: float) -> list[float]:
-    """The z-depth, in scene units, before which a share of what each render shows lies; of one that
-    shows next to nothing, that of all.
+    """Compute a quantile of the z-depths in each render, in scene units.
+
+    A render that shows hardly anything of the scene gets the quantile over all renders.
 
     Raises:
-        ValueError: where none shows anything.
+        ValueError: No render shows anything.
     """
     valid = [render.depth_map().valid for render in renders]
     own = [render.depth[where] for render, where in zip(renders, valid, strict=True)]
     if sum(len(values) for values in own) == 0:
-        raise ValueError("no camera sees the scene, so that nothing tells how far away it is")
+        raise ValueError("no camera sees the scene, so its distance is unknown")
     usual = torch.cat(own).quantile(share).item()
     known = [where.float().mean().item() >= MIN_SEEN for where in valid]
     return [v.quantile(share).item() if k else usual for v, k in zip(own, known, strict=True)]
 
 
 def shrunk(camera: Camera, side: int) -> Camera:
-    """`camera` with an image of at most `side` pixels along its longer side."""
+    """Reduce the image of a camera to at most `side` pixels on its longer side."""
     factor = min(side / max(camera.width, camera.height), 1.0)
     return resized(camera, *(max(round(factor * n), 1) for n in (camera.width, camera.height)))
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """`camera` with an image of another size, in pixels."""
+    """Change the image size of a camera, in pixels."""
     scale = torch.tensor([width / camera.width, height / camera.height, 1.0]).to(camera.K)
     return replace(camera, K=scale[:, None] * camera.K, width=width, height=height)
 
 
 def spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
-    """Indices of up to `count` cameras that lie far apart: the first, then always the one that
-    stands and looks most unlike those before."""
+    """Select up to `count` cameras that are far apart (farthest point sampling); return indices."""
     where = places(cameras)
     chosen = [0]
     apart = (where - where[0]).norm(dim=1)
@@ -194,15 +182,14 @@ def spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
 
 
 def places(cameras: Sequence[Camera]) -> Float[Tensor, "n 6"]:
-    """Where cameras stand, relative to how far they spread, and the directions they look in."""
+    """Embed cameras as centres, relative to their extent, and viewing directions."""
     centers = torch.stack([camera.center for camera in cameras])
     extent = (centers - centers.mean(dim=0)).norm(dim=1).max().clamp_min(1e-30)
     return torch.cat([centers / extent, torch.stack([c.forward for c in cameras])], dim=1)
 
 
 def spacing(cameras: Sequence[Camera]) -> float:
-    """How far cameras stand from their nearest neighbours in the median, in scene units; 0 where
-    most of them share their place."""
+    """Compute the median distance to the nearest other camera, in scene units."""
     centers = torch.stack([camera.center for camera in cameras]).double()
     apart = (centers[:, None] - centers).norm(dim=-1)
     apart.fill_diagonal_(torch.inf)

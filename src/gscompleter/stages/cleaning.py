@@ -1,12 +1,10 @@
-"""What a scene that somebody trained is better without: floaters, and what no photograph needs.
+"""Removal of floaters and superfluous Gaussians from a trained splat.
 
-The image is linear in the opacity of a single Gaussian, and the squared error of a photograph is a
-parabola in it. So it is known for each Gaussian, without drawing the scene anew, how each
-photograph would change if that one were not there. A Gaussian goes where some photographs gain by
-that several times what others lose, or where hardly any loses anything. What goes is judged twice,
-in the scene as it is and in one where all of it has faded, so that a wall is not blamed for the
-floater before it. At last all is judged together, by drawing: what a photograph needs is put back,
-at its own size or at half of it, for a splat that was trained on small images looks right in these.
+An image is linear in the opacity of one Gaussian, so its squared error is quadratic, and one render
+predicts the error without each. A Gaussian is removable if some photographs gain several times the
+loss of others, or hardly any loses. A second pass with these faded protects walls behind floaters.
+Finally they are removed together; those that a photograph needs, at full or half size, are put
+back.
 """
 
 from __future__ import annotations
@@ -28,10 +26,9 @@ from gscompleter.stages.support import weight_sums
 from gscompleter.types import Gaussians, View
 
 FADED = 0.02
-"""Most opacity that is left of a Gaussian that has faded. Without any it would not be drawn, and
-would tell nothing."""
+"""Largest opacity of a faded Gaussian; at zero it would have no gradient."""
 LEAST = 1e-12
-"""Squared error that counts as none, so that shares of it exist."""
+"""Smallest mean squared error that fractions refer to."""
 
 
 def superfluous(
@@ -40,25 +37,16 @@ def superfluous(
     renderer: Renderer,
     config: CleaningConfig = CleaningConfig(),
 ) -> Bool[Tensor, "n"]:
-    """Which Gaussians of `scene` can be taken out of it together.
-
-    Only what was given can; what no photograph shows stays, for nothing is known of it.
-
-    Args:
-        scene: The n Gaussians.
-        views: The photographs, whose cameras know the depth range.
-        renderer: Draws the scene.
-        config: What is taken out, and how much worse a photograph may become.
-    """
-    doubtful = torch.zeros_like(scene.generated, dtype=torch.bool)
-    doubtful = unwanted(scene, doubtful, views, renderer, config) & (scene.generated == 0)
-    doubtful = unwanted(scene, doubtful, views, renderer, config) & doubtful
-    judges = [*views, *map(halved, views)]
+    """Find Gaussians that can be removed together; generated and unobserved ones stay."""
+    removable = torch.zeros_like(scene.generated, dtype=torch.bool)
+    removable = unwanted(scene, removable, views, renderer, config) & (scene.generated == 0)
+    removable = unwanted(scene, removable, views, renderer, config) & removable
+    checks = [*views, *map(halved, views)]
     allowed = [
-        error_with_loss(error_of(scene, view, renderer).item(), config.tolerance) for view in judges
+        error_with_loss(error_of(scene, view, renderer).item(), config.tolerance) for view in checks
     ]
-    taken = without_needed(scene, doubtful, judges, allowed, renderer)
-    return guarded(scene, taken, judges, allowed, renderer)
+    removed = without_needed(scene, removable, checks, allowed, renderer)
+    return guarded(scene, removed, checks, allowed, renderer)
 
 
 def unwanted(
@@ -68,12 +56,11 @@ def unwanted(
     renderer: Renderer,
     config: CleaningConfig,
 ) -> Bool[Tensor, "n"]:
-    """Which Gaussians the photographs would not miss, each judged by itself where some of the
-    others have `faded`."""
+    """Find Gaussians that can be removed one at a time while the others in `faded` are faint."""
     generator = torch.Generator().manual_seed(0)
     gained, lost = torch.zeros_like(scene.opacities), torch.zeros_like(scene.opacities)
     equal_share = 0.0
-    for view in track(views, "Weighing"):
+    for view in track(views, "Comparing photographs"):
         change = change_without(scene, faded, view, renderer, config.probes, generator)
         gained += (-change).clamp_min(0)
         lost += change.clamp_min(0)
@@ -90,15 +77,14 @@ def change_without(
     probes: int,
     generator: torch.Generator,
 ) -> Float[Tensor, "n"]:
-    """How much larger the squared error of a photograph is without a Gaussian than with all of it,
-    as a share of the error where some have `faded`; n is the number of Gaussians."""
+    """Predict the relative change of a photograph's squared error without each Gaussian."""
     plan = renderer.freeze(scene[:0], view.camera).plan(scene)
     full = scene.opacities
     left = torch.where(faded, full.clamp_max(FADED), full)
-    error, slope = error_slope(image_of(plan), view, left)
+    error, gradient = error_slope(image_of(plan), view, left)
     square = mean_squares(plan, left, probes, generator)
-    # The parabola about `left`, at no opacity less at full opacity.
-    return (square * (left**2 - (full - left) ** 2) - slope * full) / max(error, LEAST)
+    # Difference of the parabola between zero and full opacity, expanded at `left`.
+    return (square * (left**2 - (full - left) ** 2) - gradient * full) / max(error, LEAST)
 
 
 def mean_squares(
@@ -107,10 +93,9 @@ def mean_squares(
     probes: int,
     generator: torch.Generator,
 ) -> Float[Tensor, "n"]:
-    """Mean over the image of the squared slope of its colours in each opacity.
+    """Estimate the mean squared gradient of the image's colours in each opacity.
 
-    Estimated without bias: summed with random signs, slopes of different pixels cancel in the
-    mean of the square.
+    The estimate is unbiased: with random signs, products of different pixels cancel on average.
     """
     with torch.enable_grad():
         variable = opacities.detach().clone().requires_grad_()
@@ -118,8 +103,8 @@ def mean_squares(
         squares = torch.zeros_like(opacities)
         for _ in range(probes):
             signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
-            (slope,) = torch.autograd.grad((signs * image).sum(), variable, retain_graph=True)
-            squares += slope**2
+            (gradient,) = torch.autograd.grad((signs * image).sum(), variable, retain_graph=True)
+            squares += gradient**2
     return squares / probes / image.numel()
 
 
@@ -130,9 +115,9 @@ def guarded(
     allowed: Sequence[float],
     renderer: Renderer,
 ) -> Bool[Tensor, "n"]:
-    """`taken` but for all that is shown by photographs whose error is not allowed without it.
+    """Keep Gaussians visible in photographs that exceed their error limit without them.
 
-    What is put back for one photograph may change another, so they are asked until all agree.
+    This repeats until every photograph is within its limit.
     """
     before = None
     while before is None or not torch.equal(taken, before):
@@ -144,7 +129,7 @@ def guarded(
 
 
 def halved(view: View) -> View:
-    """A photograph at half of its size."""
+    """Reduce a photograph to half its size."""
     image = avg_pool2d(view.image.permute(2, 0, 1), 2).permute(1, 2, 0)
     K = view.camera.K * view.camera.K.new_tensor([[0.5], [0.5], [1.0]])
     camera = replace(view.camera, K=K, height=image.shape[0], width=image.shape[1])

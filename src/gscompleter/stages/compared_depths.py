@@ -1,4 +1,4 @@
-"""What the coarse stage fitted its affine to: a sample of both depths, to be looked at."""
+"""A sample of the depths that the affine was fitted to, for the report."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from gscompleter.stages.alignment import affine_inliers, compared
 from gscompleter.types import DepthAffine, DepthPairs, Lift, Render
 
 MAX_PAIRS = 1000
-"""Pixels that are kept at most."""
+"""Most pixels in the sample."""
 
 
 def compared_depths(
     lift: Lift, at_target: Render, at_anchor: Render, affine: DepthAffine, config: AlignmentConfig
 ) -> DepthPairs | None:
-    """Every n-th of the pixels that `affine` was fitted to; None where there are none."""
+    """Sample the depths that `affine` was fitted to; None if there are none."""
     if config.align_at == "none":
         return None
     at_the_target = config.align_at == "target" or affine.contradicted
-    predicted, drawn = lift.anchor_depth, at_anchor
+    predicted, render = lift.anchor_depth, at_anchor
     if at_the_target:
-        predicted, drawn = lift.reference_depth, at_target
-    x, y = compared(predicted, drawn.depth_map())
+        predicted, render = lift.reference_depth, at_target
+    x, y = compared(predicted, render.depth_map())
     step = max(1, -(-len(x) // MAX_PAIRS))
     x, y = x[::step], y[::step]
     if len(x) == 0:

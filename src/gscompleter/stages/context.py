@@ -1,4 +1,4 @@
-"""Stage 1: observed views -> a scene in metric scale (paper, Sec. III-C)."""
+"""Stage 1: initialize the context in metric scale from observed views (paper, Sec. III-C)."""
 
 from __future__ import annotations
 
@@ -19,21 +19,17 @@ from gscompleter.stages.integration import falling_on
 from gscompleter.types import Camera, Gaussians, Reconstruction, View
 
 MIN_CONTRAST = 0.02
-"""Difference of brightness within 5 x 5 smoothed pixels that counts as texture; colours are in
-[0, 1]."""
+"""Brightness range in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
 MIN_VARIED = 0.01
-"""Smallest share of an image with such a difference."""
+"""Smallest textured fraction of an image."""
 
 
 def init_context(
     reconstructor: Reconstructor, views: Sequence[View]
 ) -> tuple[Gaussians, Float[Tensor, "v 3"] | None]:
-    """`G_ctx = Ψ(views)`: the Gaussians of the observed regions (paper, Eq. 5).
-
-    With them comes by how much each view is brighter, by channel, where Ψ evened out exposures.
-    """
-    made = reconstructed(reconstructor, views)
-    return without_ignored(made, views), made.gains
+    """Reconstruct `G_ctx = Ψ(V_in)`; also return exposure gains if estimated (paper, Eq. 5)."""
+    reconstruction = reconstructed(reconstructor, views)
+    return without_ignored(reconstruction, views), reconstruction.gains
 
 
 def check_texture(views: Sequence[View]) -> None:
@@ -48,7 +44,7 @@ def check_texture(views: Sequence[View]) -> None:
 
 
 def has_texture(image: Float[Tensor, "h w 3"]) -> bool:
-    """Tell whether enough of an image varies from pixel to pixel by more than noise."""
+    """Return True if enough of an image varies by more than noise."""
     smooth = avg_pool2d(image.mean(dim=-1)[None, None], 3, stride=1)
     highest = max_pool2d(smooth, 5, stride=1)
     lowest = -max_pool2d(-smooth, 5, stride=1)
@@ -57,18 +53,14 @@ def has_texture(image: Float[Tensor, "h w 3"]) -> bool:
 
 
 def sort_by_frame(views: Sequence[View]) -> list[View]:
-    """Sort photographs by frame number, so that no result depends on the order they were named in.
-
-    If one of them has no frame number, all keep their order.
-    """
+    """Sort views by frame number, so that their order does not matter; keep it if one has none."""
     if any(view.frame is None for view in views):
         return list(views)
     return sorted(views, key=lambda view: view.frame or 0)
 
 
 def without_ignored(made: Reconstruction, views: Sequence[View]) -> Gaussians:
-    """What Ψ made of pixels that count. Where it does not say which pixel a Gaussian is of, those
-    go that fall on an ignored one."""
+    """Drop Gaussians of ignored pixels; if Ψ is not pixel-aligned, those that project onto them."""
     gaussians = made.gaussians
     gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for number, view in enumerate(views):
@@ -83,15 +75,14 @@ def without_ignored(made: Reconstruction, views: Sequence[View]) -> Gaussians:
 
 
 def exposed_alike(views: Sequence[View], gains: Float[Tensor, "v 3"] | None) -> tuple[View, ...]:
-    """`views` in the exposure of the scene: what is compared with it, or added to it, has to be."""
+    """Normalize photographs to the exposure of the context."""
     return tuple(views) if gains is None else tuple(map(View.evened, views, gains))
 
 
 def working_range(
     views: Sequence[View], scene: Gaussians | None, renderer: Renderer
 ) -> tuple[float, float]:
-    """Near and far plane in scene units: as given, else told by `scene` where one was brought, or
-    by the photographs."""
+    """Find near and far plane in scene units: given, or from the input splat, or from features."""
     if scene is None:
         return depth_range_of(views)
     cameras = [view.camera for view in views]
@@ -101,13 +92,12 @@ def working_range(
 def depth_range_of_scene(
     scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer
 ) -> tuple[float, float]:
-    """Near and far plane, in scene units, that enclose what `cameras` see of a given scene.
+    """Measure near and far plane of an input splat from its rendered depths, in scene units.
 
-    Half of the nearest and twice the farthest percentile of the rendered depths leave room for
-    what the scene lacks. The Gaussians' own z-depths tell the unit to render in.
+    Half the nearest and twice the farthest percentile leave space for what the scene lacks.
 
     Raises:
-        InputError: where none of the cameras sees the scene.
+        InputError: No camera sees the scene.
     """
     depths = []
     for camera in cameras:
@@ -127,6 +117,6 @@ def depth_range_of_scene(
 
 
 def percentiles(values: torch.Tensor, *shares: float) -> list[float]:
-    """Percentiles of any number of values (torch.quantile stops at 16 million)."""
+    """Compute percentiles of any number of values (torch.quantile stops at 16 million)."""
     ordered = values.flatten().sort().values
     return [ordered[round(share * (len(ordered) - 1))].item() for share in shares]

@@ -1,9 +1,7 @@
-"""Which camera to complete next, of many.
+"""Next-best view: score candidate cameras and choose among them.
 
-A camera gains by the part of its image that is a hole, as far as this borders on what was observed:
-far from there anything may be invented. It gains in proportion to what its anchor sees of what it
-observes itself, for without overlap nothing registers. Of those that gain about as much the nearest
-to the photographs comes first: what is added there is what the next ones go on from.
+The gain is the image fraction of holes near observed pixels (farther away anything could be there)
+times the overlap with the anchor. Among similar gains, the camera nearest to the photographs wins.
 """
 
 from __future__ import annotations
@@ -39,36 +37,33 @@ from gscompleter.types import (
 )
 
 MAX_GAUSSIANS = 25_000
-"""Several for each pixel of the images that candidates are judged by."""
+"""Gaussians of a simplified scene: several per pixel of the small images."""
 SAME_DEPTH = 0.1
-"""Share of its depth by which a point may lie behind what the anchor sees, and still be that."""
+"""Tolerated distance behind the anchor's depth map, relative to depth, for the same surface."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A camera that may be completed next, and why."""
+    """A candidate with its score."""
 
     candidate: Candidate
     hole: float
-    """Share of its image that is a hole."""
+    """Fraction of its image in holes."""
     gain: float
-    """Share of its image that there is to gain."""
+    """Expected gain, as a fraction of its image."""
 
     @property
     def camera(self) -> Camera:
-        """The camera itself."""
+        """Camera of the candidate."""
         return self.candidate.camera
 
 
 def gain(
     holes: Bool[Tensor, "h w"], overlap: float, config: NextBestViewConfig = NextBestViewConfig()
 ) -> float:
-    """What there is to gain where an image has `holes`, as a share of the image.
+    """Compute the gain of completing an image, as a fraction of the image.
 
-    Args:
-        holes: True where the scene has a hole.
-        overlap: Share of what the camera observes that its anchor sees too.
-        config: How far from what was observed a hole counts.
+    `overlap` is the fraction of the observed part that the anchor sees, too.
     """
     radius = max(round(config.border_radius * max(holes.shape)), 1)
     bordering = holes & dilate(~holes, radius)
@@ -76,8 +71,7 @@ def gain(
 
 
 def overlap_of(camera: Camera, render: Render, anchor: Camera, at_anchor: Render) -> float:
-    """Share of what `camera` sees of the scene that the anchor sees too, within its image and not
-    hidden; 0 where it sees nothing."""
+    """Compute the fraction of visible surfaces that the anchor sees, too; 0 if there are none."""
     seen = render.depth_map()
     points = unproject(seen.depth, camera)[seen.valid]
     if len(points) == 0:
@@ -93,14 +87,7 @@ def best(
     step: float,
     config: NextBestViewConfig = NextBestViewConfig(),
 ) -> Choice | None:
-    """The camera to complete next; None where little is left to gain.
-
-    Args:
-        choices: Cameras and what each of them gains.
-        photographs: Cameras of the photographs that the scene comes from.
-        step: How far a camera moves, in scene units.
-        config: What is little.
-    """
+    """Choose the camera to complete next, or None if little is left; `step` is in scene units."""
     most = max((choice.gain for choice in choices), default=0.0)
     if most < config.min_gain:
         return None
@@ -113,8 +100,7 @@ def best(
 
 
 def remoteness(camera: Camera, photographs: Sequence[Camera], step: float) -> float:
-    """How far a camera is from the nearest of `photographs`: in steps, where a turn by a quarter of
-    the opening angle is a step, too."""
+    """Compute the distance to the nearest photograph in steps; a quarter field of view is one."""
     quarter = torch.rad2deg(torch.tensor(min(opening(camera)) / 4)).item()
     return min(
         baseline_between(camera, other) / max(step, 1e-30)
@@ -124,8 +110,7 @@ def remoteness(camera: Camera, photographs: Sequence[Camera], step: float) -> fl
 
 
 def stand_ins(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gaussians:
-    """Grey Gaussians that close the holes of an image, about where a completion may put them: at
-    the depth that surrounds them, continued smoothly."""
+    """Make grey Gaussians that close holes at the smoothly extrapolated depth around them."""
     seen = render.depth_map()
     depth = fill_smoothly(seen.depth, seen.valid & ~holes)
     means = unproject(depth, camera)[holes]
@@ -141,22 +126,22 @@ def stand_ins(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gau
 
 
 def miniature(completion: Completion, most: int = MAX_GAUSSIANS) -> Completion:
-    """`completion` with fewer Gaussians, which look the same in small images, and the evidence on
-    them."""
-    context, evidence, aside = completion.drawn_context, completion.evidence, completion.set_aside
+    """Simplify a completion for small images, with its photo observations."""
+    context, observations = completion.drawn_context, completion.evidence
+    pruned = completion.set_aside
     rows, growth = thinning(context, most)
     context = thinned(context, most)
-    evidence = None if evidence is None else thinned_evidence(evidence, rows, growth)
-    aside = None if aside is None else aside[rows]
-    kept = context if aside is None else context[~aside]
-    drawn = merge([kept, thinned(completion.added, most)])
-    completion = replace(completion, proxy=None, evidence=evidence, set_aside=aside)
-    return replace(completion, drawn=drawn, context=context)
+    observations = None if observations is None else thinned_evidence(observations, rows, growth)
+    pruned = None if pruned is None else pruned[rows]
+    kept = context if pruned is None else context[~pruned]
+    rendered = merge([kept, thinned(completion.added, most)])
+    completion = replace(completion, proxy=None, evidence=observations, set_aside=pruned)
+    return replace(completion, drawn=rendered, context=context)
 
 
 def thinned_evidence(
     evidence: Evidence, rows: Int64[Tensor, "r"], growth: Float[Tensor, "r"]
 ) -> Evidence:
-    """Evidence on those rows of Gaussians that stay, each grown so many times."""
+    """Keep observations of some Gaussians, whose sizes grow by a factor."""
     areas, agreement = evidence.areas[:, rows] * growth**2, evidence.agreement[:, rows]
     return Evidence(evidence.means[rows], evidence.centers, areas, agreement)

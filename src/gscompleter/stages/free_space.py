@@ -1,8 +1,7 @@
-"""Stage 3, ours: what a photograph saw through stays empty.
+"""Free space (not in the paper): nothing is added in front of observed surfaces.
 
-Inside a hole nothing tells a candidate its depth but what was lifted. The photographs do tell where
-it cannot be: a candidate that would stand before what a context camera sees of the scene slides
-back along its own ray until no camera contradicts it.
+In a hole only the lifted depth locates a Gaussian, but photographs exclude some positions: one in
+front of an observed surface slides back along its ray until no camera contradicts it.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ from gscompleter.sky import shows_sky, sky_depth
 from gscompleter.types import Camera, Gaussians, Render
 
 STEP = 0.04
-"""By how much a candidate slides each time, relative to its distance."""
+"""Step of a Gaussian along its ray, relative to its distance."""
 CLEARANCE = 0.01
-"""How far behind the scene's surface, relative to depth, a camera that sees this surface must find
-the candidate. What lies a little behind is hidden there, and still closes the hole."""
+"""Distance behind an observed surface, relative to depth, that counts as occluded.
+A Gaussian there is invisible to the camera and still closes the hole."""
 BORDER = 3
-"""Pixels beyond the border of an image at which a Gaussian still shows within it."""
+"""Pixels outside of an image at which a Gaussian is still visible."""
 
 
 def respect_free_space(
@@ -36,16 +35,10 @@ def respect_free_space(
     footprint: Literal["constant", "fixed"],
     config: FreeSpaceConfig = FreeSpaceConfig(),
 ) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-    """`gaussians` moved back along the rays of `target` to where no camera saw through them, and
-    which of them found a place [n].
+    """Slide Gaussians back along their target rays until they leave observed free space.
 
-    Args:
-        gaussians: Candidates.
-        target: Camera whose rays they slide along.
-        cameras: The context cameras.
-        renders: The scene as these see it.
-        footprint: Whether sizes follow the distance, as in `slide`.
-        config: How often they may slide.
+    Returns:
+        The Gaussians, and a mask of those that found a position [n].
     """
     if config.num_steps == 0:
         return gaussians, torch.ones_like(gaussians.opacities, dtype=torch.bool)
@@ -59,7 +52,7 @@ def respect_free_space(
             break
         ratio[waiting] = (1 + STEP) ** (step + 1)
     if any(shows_sky(render, camera) for render, camera in zip(renders, cameras, strict=True)):
-        # What is seen through all the way to the sky is sky.
+        # Gaussians that find no position up to the sky become part of the sky.
         behind = (1 + STEP) * sky_depth(target) / z_depths(gaussians.means[waiting], target)
         means = target.center + behind[:, None] * offsets[waiting]
         found = ~seen_through(means, cameras, renders)
@@ -73,18 +66,17 @@ def respect_free_space(
 def seen_through(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> Bool[Tensor, "n"]:
-    """Which points stand before what some camera sees of the scene, or where the camera itself
-    stood: nearer to its centre, in whatever direction, than anything it sees."""
-    contradicted = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    """Find points in front of an observed surface, or inside the near distance of a camera."""
+    in_free_space = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for camera, render in zip(cameras, renders, strict=True):
         pixels, z = project(points, camera)
         size = torch.tensor([camera.width, camera.height], device=pixels.device)
-        shows = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
-        nearest = torch.where(shows[:, None], pixels, 0.0).long().clamp_min(0)
+        visible = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
+        nearest = torch.where(visible[:, None], pixels, 0.0).long().clamp_min(0)
         x, y = torch.minimum(nearest, size - 1).unbind(-1)
         scene = render.depth_map()
         before = z < (1 + CLEARANCE) * scene.depth[y, x]
-        contradicted |= shows & scene.valid[y, x] & before
+        in_free_space |= visible & scene.valid[y, x] & before
         if camera.near is not None:
-            contradicted |= (points - camera.center).norm(dim=-1) < camera.near
-    return contradicted
+            in_free_space |= (points - camera.center).norm(dim=-1) < camera.near
+    return in_free_space

@@ -1,4 +1,4 @@
-"""Stage 4: what is added makes no photograph worse."""
+"""PSNR and SSIM guard of stage 4: additions make no photograph worse."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import ErrorBudget, Gaussians, View
 
 HALVINGS = 16
-"""How often harmful Gaussians lose half of their opacity, before a view that still does not hold
-loses those at its worst pixels."""
+"""Rounds of halving opacities before Gaussians at the worst pixels are removed."""
 REMOVALS = 12
-"""How often it does, before it loses all that it sees of them."""
+"""Rounds of removal before a photograph loses all generated Gaussians that it sees."""
 ROUNDING = 1e-4
-"""Decibels that a photograph may lose where it may lose nothing."""
+"""Smallest tolerated loss of PSNR in dB, for rounding."""
 REACH = 2
-"""Pixels around the worst ones within which Gaussians are lost."""
+"""Radius around the worst pixels within which Gaussians are removed, in pixels."""
 
 
 def error_budgets(
@@ -38,20 +37,18 @@ def error_budgets(
     tolerance: float,
     ssim_tolerance: float,
 ) -> tuple[ErrorBudget, ...]:
-    """Set how far the render of a photograph may be off, whatever is added.
-
-    The mean squared error counts over the whole photograph, and once more without the holes of the
-    context: what closes a hole must not make up for what was good. SSIM counts over all of it.
+    """Set the error budgets of a photograph.
 
     Args:
-        photograph: What the scene is held against.
-        image: The context as its camera sees it.
-        holes: Where the context has a hole there.
-        tolerance: Largest loss of PSNR, in dB.
+        photograph: Reference of the comparison.
+        image: Render of the context at its camera.
+        holes: Hole mask of the context there.
+        tolerance: Largest loss of PSNR in dB.
         ssim_tolerance: Largest loss of SSIM.
 
     Returns:
-        The budgets, that without the holes first.
+        Budgets of the mean squared error without the holes, then over the whole photograph, then of
+        SSIM. The first exists so that closing a hole cannot compensate for an error elsewhere.
     """
 
     def budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
@@ -69,16 +66,13 @@ def error_budgets(
 
 
 def errors(image: Float[Tensor, "h w 3"], budget: ErrorBudget) -> Float[Tensor, "h w"]:
-    """Compute what each pixel adds to the error that a budget limits; differentiable.
-
-    `mse` is the mean squared error, `dssim` is 1 - SSIM, whose windows lie within the image.
-    """
+    """Compute what each pixel adds to the error that a budget limits; differentiable."""
     view = budget.view
-    compared = view.compared(image)
+    masked = view.compared(image)
     if budget.metric == "mse":
-        return (compared - view.image).square().mean(dim=-1) / view.counted.numel()
+        return (masked - view.image).square().mean(dim=-1) / view.counted.numel()
     inner = slice(RADIUS, -RADIUS)
-    dissimilar = (1 - ssim_map(compared, view.image).mean(dim=(0, 1)))[inner, inner]
+    dissimilar = (1 - ssim_map(masked, view.image).mean(dim=(0, 1)))[inner, inner]
     return pad(dissimilar / dissimilar.numel(), (RADIUS,) * 4)
 
 
@@ -90,23 +84,14 @@ def do_no_harm(
     config: PsnrGuardConfig = PsnrGuardConfig(),
     drawings: Sequence[OpacityImage] | None = None,
 ) -> Gaussians:
-    """Lower the opacities of `added` until every photograph is within its error budgets.
+    """Fade added Gaussians until every photograph is within its error budgets.
 
-    Returns nothing of it where that takes so much that the photographs contradict all of it.
+    In a photograph over budget, opacities with a harmful gradient are halved, the most harmful
+    first and no more than needed. If that fails (two Gaussians may occlude each other), Gaussians
+    at the worst pixels are removed, finally all that the photograph sees.
 
-    In a view that got worse, a Gaussian is harmful where less opacity would bring the view nearer
-    to its photograph. The most harmful ones are halved, no more of them than it takes. Where that
-    does not help, as of two that hide each other, those at the pixels that got worse most are
-    removed; and in the end every generated Gaussian that the view sees, which restores it. Once all
-    that got worse hold, every view is asked anew.
-
-    Args:
-        added: Generated Gaussians.
-        frozen_views: The scene frozen at the camera of each photograph.
-        budgets: The budgets of each photograph.
-        config: How it is checked.
-        drawings: What draws each of the photographs with other opacities of `added`, where that is
-            known already.
+    Returns:
+        The Gaussians, or none of them if they lose more than `max_loss` of their opacity.
     """
     if config.max_drop is None or len(added) == 0:
         return added
@@ -114,10 +99,10 @@ def do_no_harm(
         drawings = [image_of(frozen.plan(added)) for frozen in frozen_views]
     before = [frozen.context.image for frozen in frozen_views]
     checks = [Check(*each) for each in zip(budgets, before, drawings, strict=True)]
-    opacities, asked = added.opacities, checks
+    opacities, active = added.opacities, checks
     for trial in range(HALVINGS + REMOVALS + 1):
-        worse = those_over(asked, opacities)
-        if not worse and len(asked) < len(checks):  # What gave way may have been in front.
+        worse = those_over(active, opacities)
+        if not worse and len(active) < len(checks):  # Faded Gaussians may have occluded others.
             worse = those_over(checks, opacities)
         if not worse:
             break
@@ -126,33 +111,31 @@ def do_no_harm(
         opacities = torch.where(torch.stack(lowered).any(dim=0), left * opacities, opacities)
         if is_undone(added.opacities, opacities, config):
             return added[:0]
-        asked = [seen.check for seen in worse] if trial + 1 < HALVINGS else checks
+        active = [seen.check for seen in worse] if trial + 1 < HALVINGS else checks
     return replace(added, opacities=opacities, encoded=None)
 
 
 @dataclass(frozen=True)
 class Check:
-    """A photograph that may not be matched worse than allowed."""
+    """A photograph with its error budgets."""
 
     budgets: Sequence[ErrorBudget]
     before: Float[Tensor, "h w 3"]
-    """What it sees of the scene without what is added."""
     draw: OpacityImage
-    """What it sees with it."""
+    """Differentiable image in the opacities of the added Gaussians."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A photograph that is checked, and what is seen there."""
+    """A photograph's render with given opacities."""
 
     check: Check
     opacities: Float[Tensor, "n"]
-    """Those that are drawn, which `image` has gradients in."""
     image: Float[Tensor, "h w 3"]
 
     @staticmethod
     def of(check: Check, opacities: Float[Tensor, "n"]) -> Drawn:
-        """What `check` sees with these opacities."""
+        """Render the photograph of a check."""
         return Drawn(check, *drawn_with(check.draw, opacities))
 
     @cached_property
@@ -162,18 +145,18 @@ class Drawn:
 
     @cached_property
     def excess(self) -> float:
-        """Error of the image above the limit of that budget."""
+        """Error above the limit of that budget."""
         return self.error(self.broken) - self.broken.limit
 
     def error(self, budget: ErrorBudget) -> float:
-        """Compute the error of the image that `budget` limits."""
+        """Compute the error that a budget limits."""
         return errors(self.image.detach().clamp(0, 1), budget).sum().item()
 
     def to_lower(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
-        """Choose which of `added` give way.
+        """Choose the Gaussians that lose opacity.
 
-        SSIM is not linear in opacities: where it is broken, Gaussians at the worst pixels give way
-        from the first trial on.
+        SSIM is not linear in opacities, so Gaussians at the worst pixels are chosen from the first
+        round on.
         """
         is_first_order = self.broken.metric == "mse" and trial < HALVINGS
         if not is_first_order and trial < HALVINGS + REMOVALS:
@@ -184,7 +167,7 @@ class Drawn:
         return gradient != 0
 
     def at_worst(self, added: Gaussians) -> Bool[Tensor, "n"]:
-        """Those of `added` at the fewest pixels of the image that make up for its excess."""
+        """Find Gaussians at the fewest pixels that account for the excess."""
         images = (self.image.detach(), self.check.before)
         after, before = (errors(image.clamp(0, 1), self.broken) for image in images)
         relief = after - before
@@ -193,26 +176,24 @@ class Drawn:
 
 
 def those_over(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[Drawn]:
-    """What the photographs see that are matched worse than allowed with these opacities."""
-    drawn = (Drawn.of(check, opacities) for check in checks)
-    return [seen for seen in drawn if seen.excess > 0]
+    """Render all photographs and return those over budget."""
+    rendered = (Drawn.of(check, opacities) for check in checks)
+    return [render for render in rendered if render.excess > 0]
 
 
 def is_undone(
     added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: PsnrGuardConfig = PsnrGuardConfig()
 ) -> bool:
-    """Whether of the opacities of what was `added` so little is `left` that the photographs
-    contradict all of it."""
+    """Return True if added Gaussians lost more than `max_opacity_loss` of their opacity."""
     if config.max_opacity_loss is None or len(added) == 0:
         return False
     return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_opacity_loss
 
 
 def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
-    """The fewest entries whose `relief` adds up to `needed`, or to half of all relief there is.
+    """Select the fewest entries whose relief sums to `needed`, or to half of all relief.
 
-    Relief is a promise of first order. Where it cannot be enough, the worst go first and the rest
-    are judged anew without them.
+    Relief is a first-order estimate, so the other half is re-evaluated after the change.
     """
     helpful = (relief > 0).nonzero()[:, 0]
     most_first, order = relief[helpful].sort(descending=True, stable=True)
@@ -224,7 +205,7 @@ def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
 def error_slope(
     draw: OpacityImage, view: View, opacities: Float[Tensor, "n"]
 ) -> tuple[float, Float[Tensor, "n"]]:
-    """Error against the photograph, and how it grows with each opacity."""
+    """Compute the squared error against a photograph and its gradient in the opacities."""
     variable, image = drawn_with(draw, opacities)
     gradient = gradient_of(image, ErrorBudget(view, "mse", 0.0), variable)
     return squared_error(view.compared(image.detach()), view.image).item(), gradient
@@ -233,8 +214,7 @@ def error_slope(
 def drawn_with(
     draw: OpacityImage, opacities: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "h w 3"]]:
-    """The opacities as what varies, and the image that is drawn with them, which has slopes in
-    them."""
+    """Render with opacities as the variable of gradients."""
     with torch.enable_grad():
         variable = opacities.detach().clone().requires_grad_()
         return variable, draw(variable)
@@ -243,17 +223,17 @@ def drawn_with(
 def gradient_of(
     image: Float[Tensor, "h w 3"], budget: ErrorBudget, variable: Float[Tensor, "n"]
 ) -> Float[Tensor, "n"]:
-    """Differentiate the error that a budget limits with respect to what `image` was drawn with."""
+    """Differentiate the error that a budget limits."""
     with torch.enable_grad():
         error = errors(image, budget).sum()
     return torch.autograd.grad(error, variable)[0]
 
 
 def squared_error(image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]) -> Tensor:
-    """Mean squared error of the image as it is shown, clipped to [0, 1]."""
+    """Compute the mean squared error of an image clipped to [0, 1]."""
     return (image.clamp(0, 1) - photograph).square().mean()
 
 
 def error_with_loss(error: float, decibel: float) -> float:
-    """The mean squared error whose PSNR is `decibel` lower than that of `error`."""
+    """Compute the mean squared error after a loss of PSNR in dB."""
     return error * 10 ** (decibel / 10)

@@ -1,5 +1,4 @@
-"""Stage 4: keep what lies in the holes and refine its opacities, and nothing else
-(paper, Sec. III-F)."""
+"""Stage 4: keep Gaussians in holes and refine their opacities only (paper, Sec. III-F)."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ from gscompleter.types import Camera, Gaussians, View
 def hole_mask(
     alpha: Float[Tensor, "h w"], config: HoleConfig = HoleConfig()
 ) -> Bool[Tensor, "h w"]:
-    """Where the scene covers too little, before dilation (paper, Eq. 12)."""
+    """Return True where alpha is below the threshold, before dilation (paper, Eq. 12)."""
     return alpha < config.max_alpha
 
 
@@ -32,7 +31,7 @@ def keep_in_holes(
     mask: Bool[Tensor, "h w"],
     target: Camera,
 ) -> Gaussians:
-    """The Gaussians that fall within `mask`: by their pixel where it is known, else projected."""
+    """Keep Gaussians inside `mask`, by their source pixel if known, otherwise by projection."""
     if pixel_index is not None:
         return registered[mask.flatten()[pixel_index]]
     return registered[falling_on(mask, registered, target)]
@@ -41,7 +40,7 @@ def keep_in_holes(
 def falling_on(
     mask: Bool[Tensor, "h w"], gaussians: Gaussians, camera: Camera
 ) -> Bool[Tensor, "n"]:
-    """Which Gaussians `camera` sees the means of within `mask`."""
+    """Find Gaussians whose means project into `mask`."""
     pixels, z = project(gaussians.means, camera)
     seen = inside(pixels, z, camera)
     x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
@@ -49,7 +48,7 @@ def falling_on(
 
 
 def has_settled(losses: Sequence[float], min_fall: float) -> bool:
-    """Whether the last step took no more than a share `min_fall` of the loss away."""
+    """Return True if the relative decrease of the last step is at most `min_fall`."""
     return len(losses) > 1 and losses[-2] - losses[-1] <= min_fall * losses[-2]
 
 
@@ -62,18 +61,9 @@ def refine_opacities(
     views: Sequence[View],
     config: RefineConfig = RefineConfig(),
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """`added` with opacities that minimise Eq. 13, and the loss of each iteration.
+    """Minimize Eq. 13 over the opacities of added Gaussians; also return the loss per iteration.
 
-    Everything else of them, and all of the scene, stays as it is: what was good cannot be
-    forgotten.
-
-    Args:
-        added: Gaussians that join the scene.
-        at_target: The scene with `added`, planned at the target.
-        reference: The synthesized image there.
-        at_views: The same, planned at the camera of each of `views`.
-        views: Photographs that it has to agree with, too.
-        config: Weights and steps.
+    The context and all other parameters are fixed, so that nothing observed is forgotten.
     """
     if config.iterations == 0 or len(added) == 0:
         return added, ()

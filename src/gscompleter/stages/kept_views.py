@@ -1,8 +1,4 @@
-"""Frozen views that are kept from target to target.
-
-A scene only grows while it is completed, and most of its cameras are looked from again at every
-target. What they see of it is frozen once and then extended by what was added since.
-"""
+"""A cache of frozen scenes; as a scene grows, they are extended by what was added."""
 
 from __future__ import annotations
 
@@ -14,33 +10,24 @@ from gscompleter.render import FrozenView, Renderer, each_view
 from gscompleter.types import Camera, Completion, Gaussians, merge
 
 Views = dict[Hashable, tuple[int, FrozenView]]
-"""By camera, how many Gaussians of the scene are frozen in a view, and the view."""
+"""Frozen scene per camera, and the number of Gaussians in it."""
 
 Drawn = Callable[[Gaussians], Gaussians]
-"""What is drawn in place of some of a scene: of its context, or of what a target added."""
+"""Simplification of the context, or of what a target added, before it is rendered."""
 
 
 class KeptViews:
-    """What cameras see of the scene that was looked at last.
-
-    Nothing but time depends on whether a view was kept: it is the same as one that is frozen anew.
-    """
+    """Freezes the current scene at cameras and remembers it; the results equal frozen anew."""
 
     def __init__(self, renderer: Renderer, drawn: Drawn | None = None) -> None:
-        """
-        Args:
-            renderer: Freezes and extends the views.
-            drawn: What is drawn in place of the context, and of what each target added; None for
-                themselves.
-        """
         self._renderer, self._drawn = renderer, drawn
         self._scene: weakref.ref[Gaussians] | None = None
         self._views: Views = {}
         self._parts: dict[tuple[int, int], Gaussians] = {}
-        """What is drawn of the context, and of what each target added, by their rows."""
+        """Simplified Gaussians of the context and of each target, by their rows."""
 
     def of(self, completion: Completion, cameras: Sequence[Camera]) -> tuple[FrozenView, ...]:
-        """The scene as it stands, frozen at each of `cameras`."""
+        """Freeze the scene at cameras, or reuse frozen scenes."""
         if self._scene is None or self._scene() is not completion.drawn:
             self._scene, self._views, self._parts = weakref.ref(completion.drawn), {}, {}
         views, keys = self._views, [key_of(camera) for camera in cameras]
@@ -53,21 +40,21 @@ class KeptViews:
                 return self._renderer.freeze(missing[0], camera)
             return view if count == len(completion.drawn) else view.extended(missing[count])
 
-        found = tuple(each_view(completion.drawn)(up_to_date, cameras, known))
-        views.update(zip(keys, ((len(completion.drawn), view) for view in found), strict=True))
-        return found
+        frozen = tuple(each_view(completion.drawn)(up_to_date, cameras, known))
+        views.update(zip(keys, ((len(completion.drawn), view) for view in frozen), strict=True))
+        return frozen
 
     def forget(self) -> None:
-        """Let go of all views, whose memory is needed."""
+        """Drop all frozen scenes to free their memory."""
         self._scene, self._views, self._parts = None, {}, {}
 
     def grown(self, before: Gaussians, after: Gaussians) -> None:
-        """Be told that the scene `after` is `before`, and something that was added to it."""
+        """Accept `after` as the scene `before` with additions."""
         if self._scene is not None and self._scene() is before:
             self._scene = weakref.ref(after)
 
     def _since(self, completion: Completion, count: int) -> Gaussians:
-        """What is drawn of a scene behind its first `count` Gaussians, as many as it had once."""
+        """Select (and simplify) the Gaussians after the first `count`."""
         if self._drawn is None:
             return completion.drawn[count:]
         added = [len(result.added) for result in completion.targets]
@@ -81,6 +68,6 @@ class KeptViews:
 
 
 def key_of(camera: Camera) -> Hashable:
-    """What two cameras that draw the same image have in common."""
+    """Make a key that is equal for cameras with equal images."""
     numbers = (*camera.c2w.flatten().tolist(), *camera.K.flatten().tolist())
     return (*numbers, camera.width, camera.height, camera.near_plane)

@@ -1,9 +1,4 @@
-"""Which photographs the context is made of where no target is named, so that all of the scene
-matters: such as are spread over all places and directions, each with another that sees the same.
-
-Of a walk through a scene that is every n-th photograph. One that shares too little with the others
-for stereo brings along a photograph that makes the best pair with it.
-"""
+"""Selection of context views without a target: spread over the scene, and in stereo pairs."""
 
 from __future__ import annotations
 
@@ -27,29 +22,26 @@ from gscompleter.stages.selection import (
 from gscompleter.types import Camera
 
 MAX_OVERVIEW = 16
-"""Photographs that stand for all that is to be seen."""
+"""Most cameras that represent all others."""
 NUM_ROUNDS = 20
-"""How often photographs move to the middle of those that they stand for, at most."""
+"""Most iterations of k-medoids."""
 MIN_SHARED = 0.3
-"""Share of the points seen that another camera must see, too, for the two to be a pair."""
+"""Smallest fraction of visible points that the other camera of a pair must see, too."""
 MAX_ANGLE = 30.0
-"""Degrees at which the rays of a pair meet at most."""
+"""Largest triangulation angle of a pair, in degrees."""
 
 
 def overview(cameras: Sequence[Camera]) -> list[Camera]:
-    """Some of `cameras` that stand for what is to be seen from all of them."""
+    """Select cameras that represent all others."""
     return [cameras[index] for index in spread_cameras(cameras, MAX_OVERVIEW)]
 
 
 def select_overview(
     cameras: Sequence[Camera], points: Float[Tensor, "n 3"], count: int
 ) -> list[int]:
-    """Indices of up to `count` of `cameras`, ascending, that together see most of what all do.
+    """Select up to `count` cameras that together see most of the scene; return sorted indices.
 
-    Args:
-        cameras: Those of all photographs.
-        points: On or near the surfaces of the scene, in world coordinates; at least one.
-        count: How many photographs are wanted.
+    `points` are on or near surfaces, in world coordinates; at least one.
     """
     number = count
     while True:
@@ -62,7 +54,7 @@ def select_overview(
 
 
 def medoids(cameras: Sequence[Camera], count: int) -> list[int]:
-    """Indices, ascending, of cameras that each stand in the middle of those closest to them."""
+    """Cluster cameras by k-medoids; return the sorted indices of the medoids."""
     where = places(cameras)
     apart = torch.cdist(where, where)
     chosen = spread_cameras(cameras, count)
@@ -76,23 +68,21 @@ def medoids(cameras: Sequence[Camera], count: int) -> list[int]:
 
 
 def middle(apart: Float[Tensor, "n n"], members: Tensor) -> int:
-    """Which of `members` lies closest to all of them, by squared distance."""
+    """Find the member with the smallest sum of squared distances to the others."""
     return int(members[apart[members][:, members].square().sum(dim=1).argmin()])
 
 
 def has_partner(
     index: int, chosen: Sequence[int], cameras: Sequence[Camera], points: Float[Tensor, "n 3"]
 ) -> bool:
-    """Whether another camera of `chosen` sees enough of what a camera sees, from not too far
-    aside."""
+    """Return True if another chosen camera shares enough points at usable angles."""
     seen = spread(sighted(cameras[index], points), MAX_POINTS)
     others = [cameras[other] for other in chosen if other != index]
     return any(shares(cameras[index], other, seen) >= MIN_SHARED for other in others)
 
 
 def shares(camera: Camera, other: Camera, points: Float[Tensor, "p 3"]) -> float:
-    """Share of `points`, which `camera` sees, that are in the image of the other and that their
-    rays meet at, at angles that stereo can bear."""
+    """Compute the fraction of points that another camera sees at a usable triangulation angle."""
     one, two = directions([camera, other], points)
     turn = angles(one, two)
     bearable = (turn > 0) & (turn < MAX_ANGLE)
@@ -100,7 +90,7 @@ def shares(camera: Camera, other: Camera, points: Float[Tensor, "p 3"]) -> float
 
 
 def companion(index: int, cameras: Sequence[Camera], points: Float[Tensor, "n 3"]) -> int:
-    """The camera that makes the best pair with another."""
+    """Find the camera that makes the best stereo pair with another."""
     seen = spread(sighted(cameras[index], points), MAX_POINTS)
     worth = worths(cameras[index], cameras, seen)
     pairs = pair_worths(index, worth, directions(cameras, seen)).sum(dim=-1)

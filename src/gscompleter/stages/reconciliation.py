@@ -1,9 +1,7 @@
-"""Stage 4 in a scene that somebody trained: what is added agrees with every photograph.
+"""Refinement for input splats: appearance of added Gaussians under error budgets.
 
-Such a scene matches the photographs it was trained on almost exactly, with whatever stands where.
-Anything new that they see would make them worse, however right it is at the target. So colours and
-opacities of what is added are fitted together: to the synthesized image in the holes, as in the
-paper's Eq. 13, on the condition that no photograph gets worse. The scene stays as it is.
+A trained splat fits its photographs so well that any addition makes them worse. So opacity and SH
+of added Gaussians are fitted to the image in the holes, with a penalty on exceeded error budgets.
 """
 
 from __future__ import annotations
@@ -27,12 +25,11 @@ Looks = tuple[Float[Tensor, "n"], Float[Tensor, "n k 3"]]
 """Opacities and spherical harmonics."""
 
 FAINT = 0.2
-"""Share of its opacity with which something new begins. It grows where it is welcome, which harms
-less on the way than fading does where it is not."""
+"""Initial opacity as a fraction; growing harms photographs less than fading."""
 GOAL = 0.99
-"""Share of its allowed error that a photograph is brought to, so that it holds once all is done."""
+"""Fraction of the allowed error that the fit aims at, as a reserve."""
 MAX_BAND = 0.2
-"""Largest coefficient of spherical harmonics beyond the constant."""
+"""Largest view-dependent SH coefficient."""
 
 
 @torch_on_one_thread()
@@ -45,37 +42,27 @@ def reconcile(
     budgets: Sequence[ErrorBudget],
     config: ReconcileConfig = ReconcileConfig(),
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """`added` with opacities and view-dependent colours that the photographs agree with.
-
-    Args:
-        added: Generated Gaussians.
-        frozen_target: The scene frozen at the target.
-        reference: The synthesized image there.
-        holes: Where the scene is to look like it.
-        plans: What draws each photograph with other looks of `added`.
-        budgets: Limit of the mean squared error of each photograph.
-        config: How long, and how freely.
+    """Fit opacity and SH of added Gaussians to the holes within the photographs' error budgets.
 
     Returns:
-        The Gaussians, and the loss of each iteration. The photographs are nearly as well matched as
-        allowed, or better; what is left is for `do_no_harm`.
+        The Gaussians and the loss per iteration. `meet_error_budgets` then enforces the budgets.
     """
     if config.iterations == 0 or len(added) == 0:
         return added, ()
     fit = Fit(added, config)
-    planned = frozen_target.plan_appearance(added, holes)
-    at_target = planned.compared(reference.image, shares_of(holes))
+    plan = frozen_target.plan_appearance(added, holes)
+    at_target = plan.compared(reference.image, shares_of(holes))
     before = hole_error(frozen_target.context.image, reference, holes).clamp_min(1e-12)
-    asked = [Asked.by(*each) for each in zip(plans, budgets, strict=True)]
+    photos = [Asked.by(*each) for each in zip(plans, budgets, strict=True)]
     with torch.no_grad():
-        looks = fit.looks()
-        turns = Turns([photograph.excess(looks).item() for photograph in asked])
+        appearance = fit.looks()
+        turns = Turns([photograph.excess(appearance).item() for photograph in photos])
     weight = config.photograph_weight / config.views_per_step
     losses = []
-    for _ in track(range(config.iterations), "Reconciling"):
-        looks = fit.looks()
-        loss = at_target(*looks) / before
-        for over in objections(looks, asked, turns, config.views_per_step):
+    for _ in track(range(config.iterations), "Refining"):
+        appearance = fit.looks()
+        loss = at_target(*appearance) / before
+        for over in objections(appearance, photos, turns, config.views_per_step):
             loss = loss + weight * over
         fit.step(loss)
         losses.append(loss.item())
@@ -85,8 +72,7 @@ def reconcile(
 def objections(
     looks: Looks, asked: Sequence[Asked], turns: Turns, count: int
 ) -> list[Float[Tensor, ""]]:
-    """The excess of those of the `count` photographs whose turn it is that have any; `turns` learns
-    it."""
+    """Compute the excess of the next `count` photographs, and return the positive ones."""
     chosen = turns.take(count)
     found = [asked[k].excess(looks) for k in chosen]
     for k, over in zip(chosen, found, strict=True):
@@ -96,26 +82,25 @@ def objections(
 
 @dataclass(frozen=True)
 class Asked:
-    """A photograph that is asked whether it agrees."""
+    """A photograph with the largest error that it may have."""
 
     error: LooksError
-    """The mean squared error of what its camera sees."""
+    """Mean squared error of its render, differentiable."""
     allowed: float
-    """The largest that is allowed."""
 
     @staticmethod
     def by(plan: AppearanceRender, budget: ErrorBudget) -> Asked:
-        """The photograph of a budget, whose camera sees what `plan` draws."""
+        """Create it from a budget and a differentiable image."""
         view = budget.view
         return Asked(plan.compared(view.image, shares_of(view.counted)), max(budget.limit, 1e-12))
 
     def excess(self, looks: Looks) -> Float[Tensor, ""]:
-        """By how much the error is above its goal, relative to what is allowed."""
+        """Compute the error above its goal, relative to the largest error."""
         return (self.error(*looks) / self.allowed - GOAL).clamp_min(0.0)
 
 
 class Fit:
-    """Opacities and colours of what is added, as far as they are fitted."""
+    """Optimizer of the appearance of added Gaussians."""
 
     def __init__(self, added: Gaussians, config: ReconcileConfig) -> None:
         self._added = added
@@ -125,35 +110,34 @@ class Fit:
         self._optimizer = Adam(rates, (config.beta1, config.beta2))
 
     def looks(self) -> Looks:
-        """As they are by now; differentiable."""
+        """Return the current opacities and SH; differentiable."""
         return self._logits.sigmoid(), self._sh
 
     def step(self, loss: Float[Tensor, ""]) -> None:
-        """One step down the slope of `loss`; colours stay colours."""
+        """Take one gradient step and clamp colours."""
         self._optimizer.step(loss)
         keep_colours(self._sh)
 
     def fitted(self) -> Gaussians:
-        """What is added, as it was fitted."""
+        """Return the fitted Gaussians."""
         opacities, sh = self._logits.detach().sigmoid(), self._sh.detach()
         return replace(self._added, opacities=opacities, sh=sh, encoded=None)
 
 
 def widened(sh: Float[Tensor, "n k 3"], count: int) -> Float[Tensor, "n l 3"]:
-    """A copy of spherical harmonics with `count` coefficients: the first of them, and zeros."""
+    """Copy spherical harmonics with `count` coefficients, truncated or padded with zeros."""
     return pad(sh[:, :count], (0, 0, 0, max(count - sh.shape[1], 0))).clone()
 
 
 class Turns:
-    """Which photographs are asked next: those that are matched worst, and the others in turn."""
+    """Schedule of photographs: the worst ones first, the others in turn."""
 
     def __init__(self, excess: Sequence[float]) -> None:
         self.excess = list(excess)
-        """By how much each was above its goal when it was asked last, relative to it."""
         self._waiting = list(range(len(self.excess)))
 
     def take(self, count: int) -> list[int]:
-        """The next `count` of them."""
+        """Return the next `count` photographs."""
         over = [k for k in self._waiting if self.excess[k] > 0]
         worst = sorted(over, key=self.excess.__getitem__, reverse=True)[: count // 2]
         others = [k for k in self._waiting if k not in worst]
@@ -164,9 +148,9 @@ class Turns:
 
 @torch.no_grad()
 def keep_colours(sh: Float[Tensor, "n k 3"]) -> None:
-    """Bring colours back into [0, 1], and what they change by with the direction to less than that.
+    """Clamp base colours to [0, 1] and view dependence to `MAX_BAND`, in place.
 
-    What is seen from few sides would else glitter from the others.
+    Gaussians seen from few directions would otherwise glitter from others.
     """
     sh[:, 0].clamp_(-0.5 / SH_C0, 0.5 / SH_C0)
     sh[:, 1:].clamp_(-MAX_BAND, MAX_BAND)
@@ -175,10 +159,10 @@ def keep_colours(sh: Float[Tensor, "n k 3"]) -> None:
 def hole_error(
     image: Float[Tensor, "h w 3"], reference: View, holes: Bool[Tensor, "h w"]
 ) -> Float[Tensor, ""]:
-    """Mean squared difference from the synthesized image within the holes."""
+    """Compute the mean squared difference to the synthesized image in holes."""
     return (shares_of(holes) * (image - reference.image).square().sum(dim=-1)).sum()
 
 
 def shares_of(where: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """What each pixel and channel counts in a mean over all of an image of what is `where`."""
+    """Return the weight of each pixel and channel in a mean over the image."""
     return where.float() / (3 * where.numel())

@@ -1,5 +1,4 @@
-"""Stage 3, fine: each Gaussian slides along its own camera ray until it agrees with the scene
-(paper, Sec. III-E)."""
+"""Stage 3, fine: Gaussians slide along rays to agree with the scene (paper, Sec. III-E)."""
 
 from __future__ import annotations
 
@@ -25,15 +24,14 @@ from gscompleter.threads import torch_on_one_thread
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
 
 OCCLUSION_TOLERANCE = 0.05
-"""How far behind the context, relative to depth, still counts as the same surface."""
+"""Distance behind the context, relative to depth, that still counts as the same surface."""
 CARRY_TOLERANCE = 0.02
-"""Largest error of depth, relative to the scene's, of an observed pixel that is taken for an
-example by the holes."""
+"""Largest relative depth error of a pixel whose correction is extrapolated into holes."""
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Candidates in their place."""
+    """Registered Gaussians."""
 
     gaussians: Gaussians
     affine: DepthAffine
@@ -55,7 +53,7 @@ def register(
     alignment: AlignmentConfig = AlignmentConfig(),
     reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> Registration:
-    """Bring the lifted Gaussians to the scene: first all by one affine, then each along its ray.
+    """Register lifted Gaussians: all by one affine, then each along its ray.
 
     Args:
         lift: Candidates and the depth maps predicted together with them.
@@ -100,11 +98,7 @@ def carry_into_holes(
     camera: Camera,
     config: RegistrationConfig,
 ) -> Gaussians:
-    """`registered`, where those in a hole moved like the well registered ones around them.
-
-    A hole is where `scene`, its depth at the target, is not valid. What is continued smoothly is
-    the logarithm of d' / d, the correction each ray received.
-    """
+    """Extrapolate the correction d' / d of well registered Gaussians smoothly into holes."""
     before = z_depths(coarse.means, camera)
     after = z_depths(registered.means, camera)
     error = (after / scene.depth.flatten()[pixel_index].clamp_min(1e-12) - 1).abs()
@@ -128,11 +122,9 @@ def apply_affine(
     footprint: Literal["constant", "fixed"],
     min_ratio: float | None = RegistrationConfig.min_ratio,
 ) -> Gaussians:
-    """`gaussians` at corrected z-depth `scale * z + shift`, each on its own ray of `camera`.
+    """Move Gaussians along their rays to z-depth `scale * z + shift`, at least `min_ratio * z`.
 
-    The distance along the ray follows from the means themselves, d' = d z'/z, which is the
-    paper's Eq. 9 for z-depth models and holds for models of ray distance too. At least `min_ratio`
-    of a distance remains, so that no shift pushes anything through the camera.
+    The ray distance follows from the means, d' = d z'/z: the paper's Eq. 9 without a depth map.
     """
     z = z_depths(gaussians.means, camera)
     ratio = (affine.scale * z + affine.shift) / z
@@ -140,7 +132,7 @@ def apply_affine(
 
 
 def bound(ratio: Float[Tensor, "n"], least: float | None) -> Float[Tensor, "n"]:
-    """Keep ratios of distances from falling below `least`; None bounds nothing."""
+    """Bound distance ratios from below, unless `least` is None."""
     return ratio if least is None else ratio.clamp_min(least)
 
 
@@ -153,10 +145,9 @@ def register_along_rays(
     renderer: Renderer,
     config: RegistrationConfig,
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """Minimise Eq. 11 over one distance per Gaussian; also returns the loss of each iteration.
+    """Minimize Eq. 11 over one distance per Gaussian; also return the loss per iteration.
 
-    Only what reaches a pixel that the objective looks at is drawn: all else has no slope, so that
-    it never moves, and never gets there.
+    Gaussians that reach no compared pixel have no gradient and are not rendered.
     """
     objective = Objective.of(frozen_target.context, at_anchor, reference, anchor, config)
     rows = objective.reached_by(coarse, reference.camera, anchor).nonzero()[:, 0]
@@ -185,7 +176,7 @@ def displace(
     camera: Camera,
     config: RegistrationConfig,
 ) -> Gaussians:
-    """`coarse` moved by the optimised parameters: along the rays (Eq. 10), or freely in 3-DoF."""
+    """Move Gaussians along their target rays (Eq. 10), or freely if `degrees_of_freedom` is 3."""
     offsets = coarse.means - camera.center
     distances = offsets.norm(dim=1, keepdim=True)
     unit = distances if config.lr_unit == "distance" else torch.ones_like(distances)
@@ -202,10 +193,10 @@ def drawn_alone(
     renderer: Renderer,
     config: RegistrationConfig,
 ) -> Callable[[Gaussians], Render]:
-    """Draws what `displace` makes of `coarse`, and nothing else, at least `where` it is asked for.
+    """Return a renderer of moved Gaussians alone, at least inside `where`.
 
-    On their rays and with a constant footprint candidates look the same wherever they stand, and
-    all that is drawn anew is their depth.
+    With a constant footprint their image does not change along rays, so only depth is rendered
+    again.
     """
     if config.degrees_of_freedom == 3 or config.footprint == "fixed":
         return lambda moved: renderer.render(moved, camera)
@@ -214,19 +205,19 @@ def drawn_alone(
 
 
 def compared_depth(render: Render, camera: Camera, config: RegistrationConfig) -> DepthMap:
-    """Return the rendered depth that the losses compare with: without the sky, unless it counts."""
+    """Return the rendered depth that losses compare with, without the sky if `mask_sky` is set."""
     return surfaces_in(render, camera) if config.mask_sky else render.depth_map()
 
 
 @dataclass(frozen=True)
 class Objective:
-    """Eq. 11: `λ_d L_depth + λ_s L_stereo + λ_c L_rgb`, each a mean over the image."""
+    """Loss `λ_d L_depth + λ_s L_stereo + λ_c L_rgb` (paper, Eq. 11), as means over the image."""
 
     target_depth: DepthMap
     anchor_depth: DepthMap
     image: Float[Tensor, "h w 3"]
     unit: float
-    """Depth residuals are divided by it, in scene units."""
+    """Divisor of depth residuals, in scene units."""
     config: RegistrationConfig
 
     @staticmethod
@@ -237,7 +228,7 @@ class Objective:
         anchor: Camera,
         config: RegistrationConfig,
     ) -> Objective:
-        """The objective that draws the candidates to the scene as both cameras see it."""
+        """Create the objective from renders of the scene at target and anchor."""
         anchor_depth = compared_depth(at_anchor, anchor, config)
         seen = anchor_depth.depth[anchor_depth.valid]
         relative = config.lr_unit == "distance" and len(seen) > 0
@@ -246,7 +237,7 @@ class Objective:
         return Objective(target_depth, anchor_depth, reference.image, unit, config)
 
     def reached_by(self, candidates: Gaussians, target: Camera, anchor: Camera) -> Tensor:
-        """Which candidates the cameras may see at pixels that count in the loss [n]."""
+        """Find Gaussians that reach a compared pixel of the target or the anchor."""
         counted = self.target_depth.valid
         if self.config.rgb_weight > 0:
             counted = torch.ones_like(counted)
@@ -260,14 +251,7 @@ class Objective:
         alone: Callable[[Gaussians], Render],
         at_anchor: Render,
     ) -> Float[Tensor, ""]:
-        """The loss of `candidates` where they stand.
-
-        Args:
-            candidates: Where they stand.
-            frozen_target: The scene frozen at the target.
-            alone: Draws them alone at the target.
-            at_anchor: The same as the anchor sees it.
-        """
+        """Compute the loss; `alone` renders `candidates` at the target without the scene."""
         c = self.config
         loss = torch.zeros((), device=candidates.means.device)
         if c.rendered_depth == "composite" or c.rgb_weight > 0:
@@ -282,12 +266,12 @@ class Objective:
         )
 
     def depth_error(self, shown: Render, expected: DepthMap, where: Tensor) -> Float[Tensor, ""]:
-        """Absolute difference of depth, in `unit`, summed over `where` per pixel of the image."""
+        """Compute the L1 depth error inside `where`, in `unit`, averaged over the image."""
         error = (shown.depth - expected.depth).abs() / self.unit
         return torch.where(where, error, 0.0).mean()
 
     def comparable(self, alone: Render) -> Tensor:
-        """Where the anchor sees both the scene and the candidates [h, w]."""
+        """Find anchor pixels that show the scene and unoccluded Gaussians."""
         seen = self.anchor_depth.valid & alone.depth_map().valid
         if not self.config.mask_occluded:
             return seen

@@ -1,12 +1,8 @@
-"""Which photographs the context is made of, where nobody says: those that matter to the targets.
+"""Selection of context views for given targets.
 
-The paper is given its two views. Of a whole capture most photographs show something else, and Ψ
-takes a time that grows with their number. A photograph matters by what it shows of
-what the targets see, from a direction like theirs; and depth comes of pairs, whose rays have to
-meet at an angle: of two that stand in one place no depth can be told, and two that look from far
-apart show different surfaces. So a set is worth, at each point that a target sees, what its best
-pair is worth there. The best pair comes first, then always the one that adds most; where two
-are needed to show what no pair shows yet, as for another target, each is worth half of that.
+A photograph scores by the target's points that it shows, from similar directions; a pair also by
+its triangulation angle. The score of a set is that of its best pair, summed over points. Selection
+is greedy; of two further photographs that are needed to show new points, each counts half.
 """
 
 from __future__ import annotations
@@ -21,27 +17,25 @@ from gscompleter.geometry import inside, project
 from gscompleter.types import Camera
 
 MAX_POINTS = 1000
-"""Points that are looked at, of all targets together."""
+"""Points that are scored for all targets together."""
 MAX_CANDIDATES = 32
-"""Photographs that are compared pair by pair: those closest to the targets."""
+"""Photographs closest to the targets whose pairs are scored."""
 MIN_POINTS = 20
-"""A target that sees fewer is taken to see a plane in the middle of the scene."""
+"""Fewest visible points of a target; with fewer, a plane in the middle of the scene is used."""
 GRID = 8
-"""Points of such a plane, along each side of the image."""
+"""Points of such a plane per image side."""
 PLANES = (0.1, 0.3, 0.5, 0.7, 0.9)
-"""Where planes lie that stand for a scene, in inverse depth from near to far."""
+"""Planes that represent an unknown scene, in normalized inverse depth from near to far."""
 ASIDE = 5.0
-"""Degrees between the directions of a photograph and of a target at a point, at which the worth
-of the photograph has fallen to a half."""
+"""Angle between viewing directions at which the score of a photograph is halved, in degrees."""
 ANGLE = 0.5
-"""Degrees at which the rays of the best pair meet: some pixels of parallax."""
+"""Best triangulation angle of a pair, in degrees: some pixels of parallax."""
 NARROWER, WIDER = 0.3, 20.0
-"""Degrees less and more than that, at which the worth of a pair has fallen to a third."""
+"""Angles in degrees below and above it at which the score of a pair falls to a third."""
 LEFT_OUT = 0.1
-"""A point at which the best pair is worth less is shown by none."""
+"""Pair score below which no pair shows a point."""
 UNSEEN = 1e-3
-"""What a photograph is worth at a point beyond its border: where nothing else is left, the one that
-stands closest is the best."""
+"""Score of a point outside of an image; it ranks photographs that show none."""
 
 
 def select_context(
@@ -50,13 +44,9 @@ def select_context(
     points: Float[Tensor, "n 3"],
     count: int,
 ) -> list[int]:
-    """Indices of up to `count` of `candidates`, ascending.
+    """Select up to `count` of the candidates; return sorted indices.
 
-    Args:
-        targets: Cameras to complete the scene for, at least one.
-        candidates: Cameras of photographs, in the frame of the targets.
-        points: On or near the surfaces of the scene, in world coordinates; at least one.
-        count: How many photographs are wanted.
+    `points` are on or near surfaces, in world coordinates; at least one.
     """
     share = max(MAX_POINTS // len(targets), 1)
     seen = [spread(sighted(target, points), share) for target in targets]
@@ -68,8 +58,7 @@ def select_context(
 
 
 def greedy(worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"], count: int) -> list[int]:
-    """The best pair, then always the candidate that adds most to the best pairs at the points, now
-    or with another one."""
+    """Choose the best pair, then repeatedly the candidate that improves the pair scores most."""
     if min(count, len(worth)) < 2:
         return list(range(min(count, len(worth))))
     pairs = torch.stack([pair_worths(i, worth, rays) for i in range(len(worth))])
@@ -89,7 +78,7 @@ def greedy(worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"], count: int
 def pair_worths(
     one: int, worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"]
 ) -> Float[Tensor, "c p"]:
-    """What candidate `one` and each other are worth together at each point."""
+    """Score the pairs of candidate `one` with all others at each point."""
     excess = angles(rays[one], rays) - ANGLE
     width = torch.where(excess < 0, NARROWER, WIDER)
     together = torch.minimum(worth[one], worth) * torch.exp(-((excess / width) ** 2))
@@ -100,14 +89,14 @@ def pair_worths(
 def worths(
     target: Camera, candidates: Sequence[Camera], points: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "c p"]:
-    """What each candidate is worth at points that the target sees, by itself."""
+    """Score each candidate at points that the target sees."""
     apart = angles(directions([target], points)[0], directions(candidates, points))
     shown = torch.stack([inside(*project(points, c), c) for c in candidates])
     return torch.where(shown, 1.0, UNSEEN) / (1 + (apart / ASIDE) ** 2)
 
 
 def sighted(target: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "p 3"]:
-    """Those of `points` that the target sees, or where these are few, a plane before it."""
+    """Return the points that a target sees, or points on a plane if there are few."""
     seen = points[inside(*project(points, target), target)]
     if len(seen) >= MIN_POINTS:
         return seen
@@ -115,14 +104,13 @@ def sighted(target: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "p 3"
 
 
 def points_before(target: Camera, near: float, far: float) -> Float[Tensor, "p 3"]:
-    """Points that stand for a scene of which nothing but its range of z-depth, in scene units, is
-    known: on planes before a target, as far apart as its image tells depths apart."""
+    """Make points on planes in front of a target, between two z-depths in scene units."""
     inverse = [(1 - share) / near + share / far for share in PLANES]
     return torch.cat([plane_before(target, 1 / value) for value in inverse])
 
 
 def plane_before(target: Camera, depth: float) -> Float[Tensor, "p 3"]:
-    """Points at a z-depth, in scene units, all over the image of a target."""
+    """Make a grid of points at one z-depth, in scene units, over the image of a target."""
     rays = target.z_rays()
     rows, columns = (
         torch.linspace(0, side - 1, GRID).round().long() for side in (target.height, target.width)
@@ -131,16 +119,16 @@ def plane_before(target: Camera, depth: float) -> Float[Tensor, "p 3"]:
 
 
 def spread(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "m 3"]:
-    """At most `count` of `points`, every n-th."""
+    """Keep every n-th point, at most `count`."""
     return points[:: -(-len(points) // count)]
 
 
 def directions(cameras: Sequence[Camera], points: Float[Tensor, "p 3"]) -> Float[Tensor, "c p 3"]:
-    """Unit vectors from each camera's centre to each point."""
+    """Compute unit vectors from each camera centre to each point."""
     centers = torch.stack([camera.center for camera in cameras])
     return torch.nn.functional.normalize((points - centers[:, None]).double(), dim=-1)
 
 
 def angles(a: Float[Tensor, "*#shape 3"], b: Float[Tensor, "*#shape 3"]) -> Float[Tensor, "*shape"]:
-    """Degrees between unit vectors. Half of their difference keeps small angles exact."""
+    """Compute the angle between unit vectors in degrees, exact for small angles."""
     return torch.rad2deg(2 * torch.asin(((a - b).norm(dim=-1) / 2).clamp_max(1.0)))

@@ -1,8 +1,4 @@
-"""Stage 3, ours: a hole beside the sky that shows the sky's colour is sky.
-
-No photograph saw it, so that nothing measured a depth there, and what was lifted hangs at that of
-the roofs and trees around.
-"""
+"""Extrapolation of sky into holes that continue its colour (not in the paper)."""
 
 from __future__ import annotations
 
@@ -17,19 +13,15 @@ from gscompleter.sky import is_sky, sky_depth
 from gscompleter.types import DepthMap, Gaussians, View
 
 LIKE = 0.1
-"""Largest difference of colour to the nearest sky, in any channel, of a hole that is sky."""
+"""Largest colour difference per channel between the hole and the nearest sky."""
 
 
 def sky_into_holes(
     candidates: Gaussians, pixel_index: Int[Tensor, "n"], scene: DepthMap, reference: View
 ) -> Gaussians:
-    """`candidates`, those of holes that continue the sky at its depth.
+    """Move Gaussians of holes that continue the sky to its depth.
 
-    Args:
-        candidates: Where they stand.
-        pixel_index: The pixel of the reference that each came from.
-        scene: What the target sees of the scene; a hole is where it is not valid.
-        reference: The synthesized image and the target camera.
+    `scene` is the depth at the target; its invalid pixels are holes.
     """
     camera = reference.camera
     sky = scene.valid & is_sky(scene.depth, camera)
@@ -43,7 +35,7 @@ def sky_into_holes(
 def continuing(
     sky: Bool[Tensor, "h w"], known: Bool[Tensor, "h w"], image: Float[Tensor, "h w 3"]
 ) -> Bool[Tensor, "h w"]:
-    """The pixels of a hole whose nearest `known` pixel is `sky`, and of its colour."""
+    """Find hole pixels whose nearest known pixel is sky of a similar colour."""
     _, labels = cv2.distanceTransformWithLabels(
         (~known).cpu().numpy().astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )

@@ -1,8 +1,7 @@
-"""What stereo among the photographs shows, where a scene that was brought shows it wrongly.
+"""MVS hint: stereo among the photographs where an input splat is wrong.
 
-Training may fail where photographs do look, and a photograph may never have been trained on. There
-nothing has to be imagined: Ψ makes Gaussians of the photographs that see most of what the target
-sees. They are held against the photographs as the scene is, and taken where they do better.
+Training may fail even where photographs exist. There Φ gets the render of Ψ's reconstruction of the
+photographs instead, if they confirm it better.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ from gscompleter.stages.support import believed_alpha, gather_evidence, support,
 from gscompleter.types import Camera, Render, SceneContext, View
 
 NUM_VIEWS = 3
-"""Photographs that stereo is made of: its time grows with their number."""
+"""Photographs that Ψ reconstructs; time grows with their number."""
 BETTER = 0.1
-"""By how much more the photographs have to support it, so that it takes the place of the scene."""
+"""Required advantage in trusted alpha over the scene."""
 
 
 @dataclass(frozen=True)
 class Stereo:
-    """What stereo among photographs shows to a camera."""
+    """Render of stereo among the photographs at a camera."""
 
     render: Render
     support: Float[Tensor, "h w"]
-    """Its alpha, as far as the photographs support it."""
+    """Alpha weighted by trust."""
 
     def better(self, believed: Float[Tensor, "h w"], min_alpha: float) -> Bool[Tensor, "h w"]:
-        """Where it is worth more than a scene of which this much is believed."""
+        """Find pixels at which stereo is trusted enough, and more than the scene."""
         return (self.support >= min_alpha) & (self.support > believed + BETTER)
 
 
@@ -51,15 +50,9 @@ def stereo_among(
     renderer: Renderer,
     config: TrustConfig,
 ) -> Stereo | None:
-    """What Ψ makes of those of `views` that matter to `camera`; None where they tell no depth.
+    """Reconstruct the photographs that show most of a target, and render the result there.
 
-    Args:
-        views: Photographs, with the depth range.
-        camera: Who asks.
-        drawn: The scene as `camera` sees it, which tells about where things are.
-        reconstructor: Ψ.
-        renderer: Draws what it makes.
-        config: How different from a photograph is too different.
+    `render` shows the scene there. Returns None if the photographs determine no depth.
     """
     covered = drawn.depth_map().valid
     if len(views) < 2 or not covered.any():
@@ -71,14 +64,14 @@ def stereo_among(
     except InputError:
         return None
     frozen_views = [renderer.freeze(scene, view.camera) for view in views]
-    evidence = gather_evidence(scene, views, frozen_views, config)
+    observations = gather_evidence(scene, views, frozen_views, config)
     frozen = renderer.freeze(scene, camera)
-    values = support(evidence, weight_sums(frozen), camera, config)
-    return Stereo(frozen.context, believed_alpha(frozen, values))
+    trust = support(observations, weight_sums(frozen), camera, config)
+    return Stereo(frozen.context, believed_alpha(frozen, trust))
 
 
 def corrected(context: SceneContext, stereo: Stereo) -> SceneContext:
-    """What Φ is told of a scene, with what stereo shows where that is better."""
+    """Replace the target render in the input of Φ where stereo is better."""
     if context.believed is None:
         return context
     better = context.holes & stereo.better(context.believed, context.max_alpha)
@@ -88,5 +81,5 @@ def corrected(context: SceneContext, stereo: Stereo) -> SceneContext:
         torch.where(better, shown.depth, scene.depth),
         torch.where(better, shown.alpha, scene.alpha),
     )
-    believed = torch.where(better, stereo.support, context.believed)
-    return replace(context, at_target=at_target, believed=believed)
+    trusted_alpha = torch.where(better, stereo.support, context.believed)
+    return replace(context, at_target=at_target, believed=trusted_alpha)

@@ -1,1 +1,1 @@
-"""A page that shows a scene before and after its completion, in any browser."""
+"""A web page that compares a scene before and after completion."""

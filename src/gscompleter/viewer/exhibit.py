@@ -1,4 +1,4 @@
-"""What a page shows: a scene before and after, and cameras that one can jump to."""
+"""Content of a viewer page: a scene before and after, and cameras to jump to."""
 
 from __future__ import annotations
 
@@ -29,70 +29,60 @@ from gscompleter.splats.sog import META
 from gscompleter.types import Camera, Gaussians
 
 THUMBNAIL_SIDE = 160
-"""Pixels of the longer side of a thumbnail, which is shown at half of that on fine screens."""
+"""Longer side of a thumbnail in pixels, shown at half size on fine screens."""
 THUMBNAIL_QUALITY = 80
-"""Of the JPEG that a thumbnail is."""
+"""JPEG quality of a thumbnail."""
 
 
 Summary = Mapping[str, Any]
-"""What lies in `summary.json`, whatever that is."""
+"""Content of `summary.json`."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A camera that one can jump to."""
+    """A camera to jump to."""
 
     name: str
-    """What a link calls it, such as `target-6`; no two have the same."""
+    """Unique name in links, such as `target-6`."""
     title: str
     camera: Camera
     """In the frame of the scene."""
     thumbnail: bytes | None = None
-    """A small JPEG of what it shows."""
     notes: tuple[str, ...] = ()
-    """What there is to say of it."""
+    """Sentences on its completion."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the frame that cameras are given in lies in that of a scene."""
+    """Transform from the frame of given cameras to that of a scene."""
 
     origin: Float[np.ndarray, "3"]
-    """What is subtracted from their positions in float64, before anything is rounded."""
+    """Subtracted from camera positions in float64, before rounding."""
     transform: Float[np.ndarray, "4 4"]
-    """From what is left to the frame of the scene."""
+    """Applied afterwards."""
 
 
 SAME = Place(np.zeros(3), np.eye(4))
-"""Of cameras in the frame of the scene."""
+"""Transform of cameras in the frame of the scene."""
 
 
 @dataclass(frozen=True)
 class Exhibit:
-    """Two states of a scene in one frame, and where to look at them from."""
+    """Two states of a scene in one frame, with cameras."""
 
     title: str
     after: Gaussians
     before: Gaussians | None
-    """None where there is nothing to compare with."""
+    """The other state, or None to show one only."""
     shots: tuple[Shot, ...] = ()
     remarks: tuple[str, ...] = ()
-    """Notes on what is missing of it, or not as in its file, a sentence each."""
+    """Sentences on missing or changed content."""
     place: Place = SAME
-    """Where the frame lies that further cameras are given in."""
+    """Frame of further cameras."""
 
 
 def exhibit_of_files(after: Path, before: Path | None, drop_nonfinite: bool) -> Exhibit:
-    """A scene beside another, or beside itself without what was generated.
-
-    Args:
-        after: A file of Gaussians in any format that is known.
-        before: Another one in the same frame; None for what was observed of `after`.
-        drop_nonfinite: Leave out Gaussians that hold NaN or infinity.
-
-    Raises:
-        InputError: where a file cannot be read.
-    """
+    """Load a splat to compare with `before`, or with its observed part if that is None."""
     scene = load_splat(after, drop_nonfinite)
     note = note_infinite_opacities(scene)
     remarks = () if note is None else (note,)
@@ -104,15 +94,15 @@ def exhibit_of_files(after: Path, before: Path | None, drop_nonfinite: bool) -> 
 
 
 def is_completion(path: Path) -> bool:
-    """Whether `path` is a folder, and no scene that is one (a .sog)."""
+    """Return True if `path` is a folder, but not that of a .sog."""
     return path.is_dir() and not (path / META).is_file()
 
 
 def exhibit_of_completion(folder: Path, drop_nonfinite: bool) -> Exhibit:
-    """What `complete` left in a folder, with its targets and the photographs of its context.
+    """Load an output folder of `complete`, with target and context cameras.
 
     Raises:
-        InputError: where the folder is not one of `complete`, or a file cannot be read.
+        InputError: The folder is no output of `complete`, or a file cannot be read.
     """
     missing = [name for name in (COMPLETED, CONTEXT, SUMMARY) if not (folder / name).is_file()]
     if missing:
@@ -133,21 +123,13 @@ def exhibit_of_completion(folder: Path, drop_nonfinite: bool) -> Exhibit:
 
 
 def summary_in(folder: Path) -> Summary:
-    """What a completion said of itself.
-
-    Raises:
-        InputError: where the file cannot be read.
-    """
+    """Read the summary of a completion."""
     content = read_json(folder / SUMMARY, "complete the scene again")
     return content if isinstance(content, dict) else {}
 
 
 def target_shots(folder: Path, summary: Summary, place: Place) -> tuple[Shot, ...]:
-    """The targets of a completion, with their pictures after it; none where it had none.
-
-    Raises:
-        InputError: where a file cannot be read.
-    """
+    """Load the targets of a completion, with thumbnails of the result; may be empty."""
     if not (folder / TARGETS).is_file():
         return ()
     notes = notes_of(summary)
@@ -165,11 +147,7 @@ def target_shots(folder: Path, summary: Summary, place: Place) -> tuple[Shot, ..
 
 
 def context_shots(folder: Path, summary: Summary, place: Place) -> tuple[Shot, ...]:
-    """Show the photographs that the completion in `folder` began with.
-
-    Raises:
-        InputError: where they are no more where they were, or cannot be read.
-    """
+    """Load the photographs of a completion's context; InputError if they were moved."""
     rows, format = summary.get("context"), _part(summary, "settings").get("format")
     photographs = open_photographs(source_of(folder, summary), format)
     transform = place.transform @ frame_from_photographs(place.origin - photographs.origin)
@@ -186,23 +164,16 @@ def context_shots(folder: Path, summary: Summary, place: Place) -> tuple[Shot, .
 
 
 def source_of(folder: Path, summary: Summary) -> Path:
-    """Locate the posed photographs that the completion in `folder` began with: in that folder where
-    their cameras had to be found."""
+    """Locate the photographs of a completion; in `folder` itself if their poses were computed."""
     if _part(summary, "scene").get("format") == "photographs":
         return folder / POSES
     return Path(str(_part(summary, "settings").get("folder")))
 
 
 def camera_shots(path: Path, resolution: Resolution, place: Place) -> tuple[Shot, ...]:
-    """The cameras of a file, with their photographs where these lie there.
+    """Load the cameras of a file, with thumbnails of photographs that exist.
 
-    Args:
-        path: As `load_cameras` takes it.
-        resolution: Of images whose size the file does not tell.
-        place: Where the frame of the file lies in that of the scene.
-
-    Raises:
-        InputError: where the file or one of its cameras is missing or impossible.
+    `resolution` is used if the file states no size; `place` leads from its frame to the scene's.
     """
     frames = read_cameras(path, resolution)
     cameras = load_cameras(path, resolution, origin=place.origin.tolist())
@@ -218,11 +189,7 @@ def camera_shots(path: Path, resolution: Resolution, place: Place) -> tuple[Shot
 
 
 def place_of_completion(folder: Path, summary: Summary) -> Place:
-    """Where the photographs' frame lies in that of a completion's scenes.
-
-    Raises:
-        InputError: where the summary does not tell it.
-    """
+    """Read the transform from the photographs' frame to that of a completion's scenes."""
     frame = _part(summary, "frame")
     transform, origin = _numbers(frame.get("transform"), 4, 4), _numbers(frame.get("origin"), 3)
     if transform is None or origin is None or np.linalg.det(transform) <= 0:
@@ -234,25 +201,21 @@ def place_of_completion(folder: Path, summary: Summary) -> Place:
 
 
 def notes_of(summary: Summary) -> list[tuple[str, ...]]:
-    """What a completion said of each of its targets."""
+    """Collect the notes on each target of a completion."""
     targets = summary.get("targets")
     rows = targets if isinstance(targets, list) else []
     notes = [row.get("notes") if isinstance(row, dict) else None for row in rows]
-    return [tuple(map(str, said)) if isinstance(said, list) else () for said in notes]
+    return [tuple(map(str, row)) if isinstance(row, list) else () for row in notes]
 
 
 def thumbnail_in(frame: Frame) -> bytes | None:
-    """A small JPEG of a frame's photograph; None where none lies in a file."""
+    """Make a thumbnail of a frame's photograph; None if it is not in a file."""
     stored = frame.stored()
     return thumbnail_of(stored) if isinstance(stored, Path) else None
 
 
 def thumbnail_of(path: Path) -> bytes | None:
-    """A small JPEG of an image file; None where there is no such file.
-
-    Raises:
-        InputError: where there is one that cannot be read.
-    """
+    """Make a small JPEG of an image file; None if there is no file."""
     if not path.is_file():
         return None
     image = Image.fromarray(read_pixels(path))
@@ -262,13 +225,13 @@ def thumbnail_of(path: Path) -> bytes | None:
 
 def _lost(source: Path) -> str:
     return (
-        f"The photographs that the completion began with are not shown: {quoted(source)} does not "
-        "hold them any more; name their cameras to jump to them."
+        f"The context photographs are not shown: {quoted(source)} does not hold them any more; "
+        "restore them, or name their cameras."
     )
 
 
 def _numbers(value: Any, *shape: int) -> Float[np.ndarray, "..."] | None:
-    """An array of finite numbers of that shape, if `value` is one."""
+    """Convert `value` to an array of finite numbers of the given shape, or return None."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

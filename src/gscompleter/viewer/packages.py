@@ -1,12 +1,9 @@
-"""The JavaScript that draws Gaussians: npm packages pinned by their hashes, fetched once.
+"""The JavaScript renderer of the viewer: npm packages pinned by their hashes.
 
-`package-lock.json` is npm's own: version and SHA-512 of three.js, of Spark, which draws
-Gaussians with it, and of fflate, which lies within Spark. A wheel brings what `libraries_from`
-takes out of them; a source tree fetches the three archives when a page is first made, from the
-registry that npm is set to, and keeps them in our cache. An archive is compared with its hash
-whenever it is opened, so that it does not matter which registry it came from.
-
-Nothing here needs more than Python itself, for the build of the wheel runs it.
+`package-lock.json` pins three.js, Spark (which renders Gaussians with it) and fflate (part of
+Spark). A wheel contains the result of `extract_libraries`; a source tree fetches the archives from
+npm's registry when a page is first made and caches them. Every archive is compared with its hash
+when it is opened. Only the standard library is used, because the build of the wheel runs this.
 """
 
 from __future__ import annotations
@@ -30,31 +27,31 @@ from gscompleter.errors import InputError
 from gscompleter.io.files import replacing
 
 LOCK = Path(__file__).with_name("package-lock.json")
-"""Which packages, from where, with which hashes."""
+"""Pinned packages with addresses and hashes."""
 BUILT = Path(__file__).with_name("libraries.json")
-"""What the build of a wheel leaves: the libraries, ready to be put into a page."""
+"""Libraries stored by the build of a wheel."""
 MODULES = {
     "three": ("three", "build/three.module.min.js"),
     "three-core": ("three", "build/three.core.min.js"),
     "three/addons/postprocessing/Pass.js": ("three", "examples/jsm/postprocessing/Pass.js"),
     "@sparkjsdev/spark": ("@sparkjsdev/spark", "dist/spark.module.min.js"),
 }
-"""By the name that they are imported by: the package of each module, and its file there."""
+"""Package and file of each module, by its import name."""
 CORE = ('"./three.core.min.js"', '"three-core"')
-"""A module in a page has no folder, so that the one relative import among them gets a name."""
+"""Replacement for the one relative import: modules in a page have no folder."""
 LICENCE = "LICENSE"
-"""The file of each package that has to go with it."""
+"""File of each package that is distributed with it."""
 LARGEST_ARCHIVE = 64 << 20
-"""Bytes of an archive; the largest of ours has 8 million."""
+"""Largest archive in bytes; ours have up to 8 million."""
 SECONDS_TO_ANSWER = 30.0
-"""How long a silent registry is waited for."""
+"""Timeout of the registry in seconds."""
 REGISTRY = "npm_config_registry"
-"""The environment variable of npm that says where packages come from; npm knows it otherwise."""
+"""Environment variable of npm with the address of the registry."""
 
 
 @dataclass(frozen=True)
 class Package:
-    """One npm package, as the lock pins it."""
+    """One npm package, as pinned by the lock."""
 
     name: str
     version: str
@@ -63,40 +60,35 @@ class Package:
 
     @property
     def file(self) -> str:
-        """What its archive is called in our cache."""
+        """Name of its archive in our cache."""
         return f"{self.name.replace('/', '-').lstrip('@')}-{self.version}.tgz"
 
     @property
     def path(self) -> str:
-        """Where every npm registry has its archive."""
+        """Path of its archive in every npm registry."""
         return f"{self.name}/-/{self.name.rsplit('/', 1)[-1]}-{self.version}.tgz"
 
     def is_intact(self, archive: bytes) -> bool:
-        """Whether these bytes are the archive that was pinned."""
+        """Return True if `archive` has the pinned hash."""
         digest = base64.b64encode(hashlib.sha512(archive).digest()).decode()
         return self.integrity == f"sha512-{digest}"
 
 
 @dataclass(frozen=True)
 class Libraries:
-    """JavaScript to put into a page."""
+    """JavaScript for a page."""
 
     modules: Mapping[str, str]
-    """ES modules by the name that they are imported by."""
+    """ES modules by import name."""
     licences: Mapping[str, str]
-    """The licence of each package, by its name and version."""
+    """Licence texts by package name and version."""
 
 
 def load_libraries(lock: Path = LOCK, built: Path = BUILT) -> Libraries:
-    """The libraries as the wheel brought them; in a source tree from the pinned archives.
-
-    Args:
-        lock: An npm lock file.
-        built: Where a wheel has the libraries.
+    """Load the libraries of the wheel, or in a source tree those of the pinned archives.
 
     Raises:
-        InputError: where they are in neither place and cannot be fetched, or are not what was
-            pinned.
+        InputError: They cannot be fetched, or differ from their hashes.
     """
     if built.is_file():
         return Libraries(**json.loads(built.read_text(encoding="utf-8")))
@@ -104,22 +96,14 @@ def load_libraries(lock: Path = LOCK, built: Path = BUILT) -> Libraries:
 
 
 def write_libraries(path: Path, lock: Path = LOCK) -> None:
-    """Write the libraries to `path`, for a wheel: the same lock gives the same bytes.
-
-    Raises:
-        InputError: as `load_libraries`, and where the file cannot be written.
-    """
+    """Write the libraries for a wheel; the same lock gives the same bytes."""
     text = json.dumps(vars(libraries_from(lock)), sort_keys=True, ensure_ascii=False)
     with replacing(path) as file:
         file.write(text.encode())
 
 
 def libraries_from(lock: Path) -> Libraries:
-    """What a page needs of the packages that are pinned in `lock`.
-
-    Raises:
-        InputError: where an archive cannot be fetched, or is not what was pinned.
-    """
+    """Extract the modules and licences of the packages pinned in `lock`."""
     packages = {package.name: package for package in read_lock(lock)}
     archives = {name: archive_of(package) for name, package in packages.items()}
     modules = {
@@ -133,7 +117,7 @@ def libraries_from(lock: Path) -> Libraries:
 
 
 def read_lock(lock: Path) -> list[Package]:
-    """The packages of an npm lock file (`lockfileVersion` 3), in its order."""
+    """Read the packages of an npm lock file (`lockfileVersion` 3), in order."""
     entries = json.loads(lock.read_text(encoding="utf-8"))["packages"]
     return [
         Package(path.removeprefix("node_modules/"), e["version"], e["integrity"])
@@ -143,11 +127,7 @@ def read_lock(lock: Path) -> list[Package]:
 
 
 def archive_of(package: Package) -> bytes:
-    """The archive of a package: from our cache, or else fetched and kept there.
-
-    Raises:
-        InputError: where it cannot be fetched, or what comes is not what was pinned.
-    """
+    """Get the archive of a package from the cache, or fetch and cache it."""
     place = place_of(package)
     if place.is_file():
         archive = place.read_bytes()
@@ -161,60 +141,51 @@ def archive_of(package: Package) -> bytes:
 
 
 def place_of(package: Package) -> Path:
-    """Where its archive is kept, and where one that was fetched by hand is looked for."""
+    """Get the path of an archive in the cache; users may put it there by hand."""
     return cache_folder() / "viewer" / package.file
 
 
 def fetched(package: Package) -> bytes:
-    """The archive of a package from the npm registry.
-
-    Raises:
-        InputError: where it cannot be fetched, or what comes is not what was pinned.
-    """
+    """Fetch an archive from the npm registry and compare its hash."""
     url = f"{registry_for(package)}/{package.path}"
     try:
         with urllib.request.urlopen(url, timeout=SECONDS_TO_ANSWER) as answer:
             archive: bytes = answer.read(LARGEST_ARCHIVE)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{needed(package)}, and {urlsplit(url).netloc or 'its place'} cannot be reached; "
+            f"{needed(package)}, and {urlsplit(url).netloc or 'its address'} cannot be reached; "
             f"fetch {url} and put it at {place_of(package)}."
         ) from error
     if not package.is_intact(archive):
         raise InputError(
-            f"What lies at {url} is not {package.name} {package.version} as it was pinned: "
-            "its SHA-512 differs, and it was not used; try another connection."
+            f"The file at {url} is not {package.name} {package.version}: its SHA-512 differs, so "
+            "it was not used; try another connection."
         )
     return archive
 
 
 def registry_for(package: Package) -> str:
-    """Where npm gets packages from: what its environment variable says, or else npm itself.
-
-    Raises:
-        InputError: where neither is there.
-    """
+    """Find the npm registry, from the environment variable or from npm itself."""
     address, npm = os.environ.get(REGISTRY), shutil.which("npm")
     if not address and npm is not None:
-        asked = [npm, "config", "get", "registry"]
-        answer = subprocess.run(asked, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+        command = [npm, "config", "get", "registry"]
+        answer = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
         address = answer.stdout.strip()
     if not address:
         raise InputError(
-            f"{needed(package)}, and without npm nothing tells where to fetch it; install "
-            f"gscompleter from its wheel, which brings it, or name npm's registry in the "
-            f"environment variable {REGISTRY}."
+            f"{needed(package)}, and there is no npm to fetch it with; install gscompleter "
+            f"from its wheel, which contains it, or set {REGISTRY} to the address of a registry."
         )
     return address.rstrip("/")
 
 
 def needed(package: Package) -> str:
-    """The beginning of a sentence about a package that is missing."""
+    """Make the beginning of a sentence about a missing package."""
     return f"The page needs {package.name} {package.version}, which is not on this machine"
 
 
 def member(archive: bytes, name: str) -> str:
-    """The text of one file of an npm archive, in which all lie in the folder `package`."""
+    """Read a text file of an npm archive, below its folder `package`."""
     with tarfile.open(fileobj=io.BytesIO(archive), mode="r:gz") as files:
         file = files.extractfile(f"package/{name}")
         assert file is not None

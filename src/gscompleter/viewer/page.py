@@ -1,8 +1,8 @@
-"""From an exhibit to a page: one HTML file that asks for nothing, from anywhere it is opened.
+"""Makes one self-contained HTML file that loads nothing from the network.
 
-The page has axes of its own, those of three.js (x right, y up, z back), its origin in the middle
-of the scene, and a unit in which the scene is about `EXTENT` large. So the few bits that a .spz
-gives to positions and sizes suffice for a scene in millimetres and for one in kilometres.
+The page has the axes of three.js (x right, y up, z back), its origin at the centre of the scene,
+and a unit in which the scene has about the size `EXTENT`, so that the few bits of a .spz suffice
+for scenes in millimetres and in kilometres.
 """
 
 from __future__ import annotations
@@ -28,44 +28,43 @@ from gscompleter.viewer.exhibit import Exhibit, Shot
 from gscompleter.viewer.packages import Libraries
 
 ASSETS = Path(__file__).with_name("assets")
-"""What we wrote of the page."""
+"""Folder of our own page sources."""
 EXTENT = 4.0
-"""Half of the Gaussians lie within this of the middle, or within twice as much, in the page."""
+"""Median distance of Gaussians from the centre, within a factor of 2, in page units."""
 REACH = 4096.0
-"""How far from the middle a Gaussian may lie, in the unit of the page: ten bits behind the point
-are left for all others then."""
+"""Largest distance of a Gaussian from the centre, in page units; leaves ten fractional bits."""
 LARGEST_PAGE = 60_000_000
-"""Bytes of Gaussians that the page itself holds; of more, all lie in files beside it."""
+"""Bytes of Gaussians up to which they are inside the page; otherwise in files beside it."""
 PART = 48_000_000
-"""Bytes of Gaussians in one file beside the page, far below the longest string of any browser."""
+"""Bytes of Gaussians per file, below the longest string of any browser."""
 THREE_FROM_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-"""Half a turn about x: for the axes of the world, and for those of a camera."""
+"""Half a turn about x, for the axes of the world and of a camera."""
 MOST_LANDMARKS = 100_000
-"""Gaussians, about, that tell how far a camera looks."""
+"""Approximate number of Gaussians that determine the focus of a camera."""
 OVERVIEW_SIZE = (640, 480)
-"""Width and height of the camera of a scene that comes with none."""
+"""Width and height of the camera for a scene without cameras."""
 OVERVIEW_FOCAL = 550.0
-"""Its focal length in pixels: it sees 60 degrees."""
+"""Its focal length in pixels, for a field of view of 60 degrees."""
 OVERVIEW_DISTANCE = 2.5
-"""How far from the middle it stands, in what half of the Gaussians lie within."""
+"""Its distance from the centre, relative to the median distance of Gaussians."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Where the page's own frame lies in that of the scene."""
+    """The frame of the page."""
 
     centre: Float[Tensor, "3"]
-    """The page's origin, in the scene."""
+    """Origin of the page, in the scene."""
     unit: float
-    """The page's unit in those of the scene, a power of two."""
+    """Unit of the page in scene units, a power of two."""
 
     def moved(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians in the page's origin and unit, and in their own axes."""
+        """Move Gaussians to the page's origin and unit; their axes stay."""
         means = ((gaussians.means.double() - self.centre) / self.unit).float()
         return replace(gaussians, means=means, scales=gaussians.scales / self.unit, encoded=None)
 
     def pose(self, camera: Camera) -> Float[Tensor, "4 4"]:
-        """Camera-to-world with the axes of three.js for both, in the page's origin and unit."""
+        """Compute camera-to-world with three.js axes, in the page's origin and unit."""
         c2w = camera.c2w.detach().cpu().double().clone()
         c2w[:3, 3] = (c2w[:3, 3] - self.centre) / self.unit
         return THREE_FROM_OPENCV @ c2w @ THREE_FROM_OPENCV
@@ -73,17 +72,17 @@ class Frame:
 
 @dataclass(frozen=True)
 class Page:
-    """What has to be written or served."""
+    """Files to write or serve."""
 
     html: bytes
     parts: Mapping[str, bytes]
-    """Scripts that hold the Gaussians, by their file names; none where the page holds them."""
+    """Scripts with the Gaussians by file name; empty if the page contains them."""
     left_out: int
-    """Gaussians of the scene after that lie too far out to be shown."""
+    """Gaussians of the scene after that are too far away to be shown."""
 
 
 def frame_of_scene(gaussians: Gaussians) -> Frame:
-    """The middle of a scene, and how large it is."""
+    """Compute the page's frame from the median position and spread of Gaussians."""
     means = gaussians.means.double().cpu()
     centre = means.median(dim=0).values
     spread = (means - centre).norm(dim=1).median().item()
@@ -91,15 +90,12 @@ def frame_of_scene(gaussians: Gaussians) -> Frame:
 
 
 def make_page(exhibit: Exhibit, libraries: Libraries, name: str = "page") -> Page:
-    """The page of an exhibit; the same values give the same bytes.
+    """Make the page; the same values give the same bytes.
 
-    Args:
-        exhibit: What it shows.
-        libraries: What draws it.
-        name: Of the page's file without its ending, after which files beside it are called.
+    `name` is the stem of the page's file, which names the files beside it.
 
     Raises:
-        InputError: where nothing is left to show.
+        InputError: Nothing is left to show.
     """
     frame = frame_of_scene(exhibit.after)
     layers = {key: frame.moved(part.to("cpu")) for key, part in layers_of(exhibit).items()}
@@ -125,15 +121,14 @@ def make_page(exhibit: Exhibit, libraries: Libraries, name: str = "page") -> Pag
 
 
 def layers_of(exhibit: Exhibit) -> dict[str, Gaussians]:
-    """The Gaussians that are drawn apart: those before, and of those after the two kinds."""
+    """Split the content into layers: before, and the observed and generated part of after."""
     after, before = exhibit.after, exhibit.before
     layers = {"observed": after[after.generated == 0], "generated": after[after.generated > 0]}
     return layers if before is None else {"before": before, **layers}
 
 
 def sources_of(packed: Mapping[str, bytes]) -> dict[str, str]:
-    """Which bytes each layer is made of: where nothing changed, what was there before and what was
-    observed are the same."""
+    """Map layers to byte strings; "before" and "observed" share one if they are equal."""
     sources = {key: key for key in packed}
     if "before" in packed and packed["before"] == packed.get("observed"):
         sources["before"] = "observed"
@@ -141,12 +136,12 @@ def sources_of(packed: Mapping[str, bytes]) -> dict[str, str]:
 
 
 def part_starts(content: bytes) -> range:
-    """Where the parts begin that the bytes of a source are handed over in."""
+    """Compute the offsets at which the bytes of a source are split."""
     return range(0, len(content), PART)
 
 
 def calls_with(packed: Mapping[str, bytes]) -> Iterator[bytes]:
-    """Scripts that hand the bytes of each source to the page, in their order."""
+    """Yield scripts that pass the bytes of each source to the page."""
     for key, content in packed.items():
         for start in part_starts(content):
             text = base64.b64encode(content[start : start + PART]).decode()
@@ -154,12 +149,7 @@ def calls_with(packed: Mapping[str, bytes]) -> Iterator[bytes]:
 
 
 def placed(calls: list[bytes], name: str) -> tuple[list[str], dict[str, bytes]]:
-    """The elements of the page that run these scripts, and the files beside it that they name.
-
-    Args:
-        calls: The scripts.
-        name: Of the page's file without its ending.
-    """
+    """Make the script elements of the page, and the files of stem `name` that they refer to."""
     if sum(map(len, calls)) <= LARGEST_PAGE:
         return [f"<script>{call.decode()}</script>" for call in calls], {}
     files = {f"{name}.{number}.js": call for number, call in enumerate(calls, start=1)}
@@ -167,7 +157,7 @@ def placed(calls: list[bytes], name: str) -> tuple[list[str], dict[str, bytes]]:
 
 
 def shots_of(exhibit: Exhibit) -> tuple[Shot, ...]:
-    """The cameras of an exhibit; one before the whole scene where it has none."""
+    """List the cameras; a scene without any gets an overview."""
     if exhibit.shots:
         return exhibit.shots
     means = exhibit.after.means.cpu()
@@ -181,14 +171,13 @@ def shots_of(exhibit: Exhibit) -> tuple[Shot, ...]:
 
 
 def landmarks(layers: Mapping[str, Gaussians]) -> Float[Tensor, "n 3"]:
-    """Where some Gaussians of the scene after lie, spread over all, in the page's origin and unit
-    and the axes of the scene."""
+    """Sample means of the scene after, in page origin and unit and scene axes."""
     means = torch.cat([layers["observed"].means, layers["generated"].means])
     return means[:: max(1, len(means) // MOST_LANDMARKS)].double()
 
 
 def described(shot: Shot, frame: Frame, means: Float[Tensor, "n 3"]) -> dict[str, Any]:
-    """A camera as the page reads it, which looks at what `landmarks` are before it."""
+    """Describe a camera as the page reads it, focused on the landmarks `means`."""
     K, pose = shot.camera.K.double(), frame.pose(shot.camera)
     picture = None if shot.thumbnail is None else base64.b64encode(shot.thumbnail).decode()
     return {
@@ -204,13 +193,7 @@ def described(shot: Shot, frame: Frame, means: Float[Tensor, "n 3"]) -> dict[str
 
 
 def focus_of(camera: Camera, pose: Float[Tensor, "4 4"], means: Float[Tensor, "n 3"]) -> float:
-    """The median z-depth of what a camera has before it, in the unit of the page.
-
-    Args:
-        camera: For its intrinsics.
-        pose: As `Frame.pose` gives it.
-        means: Of some Gaussians, as `landmarks` gives them.
-    """
+    """Compute the median z-depth of the landmarks that a camera sees, in page units."""
     flip = THREE_FROM_OPENCV[:3, :3]
     x, y, z = ((means @ flip - pose[:3, 3]) @ pose[:3, :3] @ flip).unbind(1)
     K = camera.K.double()
@@ -220,9 +203,9 @@ def focus_of(camera: Camera, pose: Float[Tensor, "4 4"], means: Float[Tensor, "n
 
 
 def filled(content: Mapping[str, Any], scripts: list[str]) -> str:
-    """The page of `viewer.html` with everything that it needs in it.
+    """Fill the template `viewer.html`.
 
-    Text from outside comes in as JSON without a `<`, which no parser of HTML can mistake.
+    External text is inserted as JSON without `<`, which no HTML parser can misread.
     """
     data = json.dumps(content, sort_keys=True).replace("<", "\\u003c")
     texts = {
@@ -238,5 +221,5 @@ def filled(content: Mapping[str, Any], scripts: list[str]) -> str:
 
 
 def asset(name: str) -> str:
-    """One of our files of the page."""
+    """Read one of our page sources."""
     return (ASSETS / name).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A page for the browsers of this machine, and for nobody else."""
+"""Serves a page to browsers of this machine only."""
 
 from __future__ import annotations
 
@@ -10,36 +10,31 @@ from gscompleter.errors import InputError
 from gscompleter.viewer.page import Page
 
 ADDRESS = "127.0.0.1"
-"""The interface that is listened on."""
+"""Network interface of the server."""
 NAMES = (ADDRESS, "localhost")
-"""What a browser of this machine calls it. Another name in a request is that of a site which has
-pointed its own name here to read what we serve."""
+"""Accepted host names; any other one may be a DNS rebinding attack by a website."""
 TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8"}
-"""Media types by the endings of names."""
+"""Media types by file extension."""
 
 
 def serving(page: Page, port: int = 0) -> ThreadingHTTPServer:
-    """A server of the page and its parts, which `serve_forever` starts.
-
-    Args:
-        page: What it serves; nothing is read from the disk.
-        port: Where it listens; 0 for any that is free.
+    """Make a server for the page on `port` (0 for any), to be started by `serve_forever`.
 
     Raises:
-        InputError: where the port is taken.
+        InputError: The port is taken.
     """
     files = {"/": page.html, **{f"/{name}": part for name, part in page.parts.items()}}
     try:
         return ThreadingHTTPServer((ADDRESS, port), handler_of(files))
     except OSError as error:
         raise InputError(
-            f"Port {port} of {ADDRESS} cannot be listened on ({error.strerror}); name another one.",
+            f"Port {port} of {ADDRESS} is not available ({error.strerror}); name another one.",
             "port",
         ) from error
 
 
 def handler_of(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
-    """What answers requests for `files`, which are called by their paths."""
+    """Make a request handler for `files`, which are keyed by URL path."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -69,11 +64,11 @@ def handler_of(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
                 self.wfile.write(content)
 
         def log_message(self, format: str, *args: object) -> None:
-            """Requests are nobody's business."""
+            """Log nothing."""
 
     return Handler
 
 
 def host_of(header: str) -> str:
-    """The name in a Host header, without its port."""
+    """Parse the host name of a Host header, without its port."""
     return header.rsplit(":", 1)[0].lower()

@@ -1,4 +1,4 @@
-"""Weights that authors publish: which there are, where they lie, how they are read and fitted."""
+"""Published weights: list, download, reading, and loading into networks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from gscompleter.weights.fitting import load_strictly
     from gscompleter.weights.reading import read_state_dict
 
-# Imported on first use, so that `gscompleter models` does not wait for torch.
+# Imported on first use, so that `gscompleter models` starts without torch.
 _HOMES = {"load_strictly": "fitting", "read_state_dict": "reading"}
 
 __all__ = [

@@ -1,7 +1,4 @@
-"""Where a file of weights comes from: a path, our cache, the hub's cache, or a download.
-
-Nothing here imports torch.
-"""
+"""Location of weight files: given path, our cache, the hub's cache, or download (no torch)."""
 
 from __future__ import annotations
 
@@ -17,29 +14,26 @@ from gscompleter.errors import InputError
 from gscompleter.weights.published import PublishedWeights
 
 MAX_RETRIES = 2
-"""Retries of a request to the hub."""
+"""Number of retries of a request to the hub."""
 INSTALL = "pip install 'gscompleter[models]'"
 
 
-class WeightsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in a sentence)
+class WeightsNotAvailable(InputError):  # noqa: N818  (describes a state)
     """The published weights are not on this machine."""
 
 
 def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = False) -> Path:
-    """The path of a file of weights, downloaded where it is not on this machine yet.
-
-    What the file holds is checked when it is read. A download shows the hub's progress bar and
-    lands in the hub's cache.
+    """Return the path of a weight file; download it to the hub's cache if it is not local.
 
     Args:
-        weights: Which file.
-        local: The file, or a folder that holds it under its published name. None looks into our
-            cache (`place_of`), then into that of the hub.
-        offline: Download nothing. The environment variable HF_HUB_OFFLINE=1 says the same.
+        weights: The published file.
+        local: The file, or a folder with it under its published name. If None, our cache
+            (`get_cache_path`) and the hub's cache are searched.
+        offline: Download nothing, like the environment variable HF_HUB_OFFLINE=1.
 
     Raises:
-        InputError: where `local` does not exist.
-        WeightsNotAvailable: where the file is not here and cannot be downloaded.
+        InputError: `local` does not exist.
+        WeightsNotAvailable: The file is not local and cannot be downloaded.
     """
     if local is not None:
         return _given(weights, local)
@@ -48,19 +42,19 @@ def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = 
         return found
     if weights.repository is None:
         raise WeightsNotAvailable(
-            f"The weights {weights.name} are not here and no program can fetch them: "
+            f"The weights {weights.name} are not on this machine and have no automatic download; "
             f"{_by_hand(weights)}."
         )
     return _download(weights, offline)
 
 
 def place_of(weights: PublishedWeights) -> Path:
-    """Where a file that was fetched by hand is looked for: `weights/MODEL/FILE` in our cache."""
+    """Return the path for a manually downloaded file: `weights/MODEL/FILE` in our cache."""
     return cache_folder() / "weights" / weights.model.lower() / weights.file
 
 
 def cached(weights: PublishedWeights) -> Path | None:
-    """The file in our cache or in that of the hub, or None; nothing is downloaded."""
+    """Find the file in our cache or in the hub's; None if it is in neither."""
     place = place_of(weights)
     if os.path.isfile(place):
         return place
@@ -73,7 +67,7 @@ def cached(weights: PublishedWeights) -> Path | None:
 
 
 def hub_is_installed() -> bool:
-    """Whether the package huggingface_hub is there, without which no hub cache is seen."""
+    """Return True if huggingface_hub is installed."""
     return find_spec("huggingface_hub") is not None
 
 
@@ -81,8 +75,8 @@ def _given(weights: PublishedWeights, local: Path) -> Path:
     path = local / weights.file if os.path.isdir(local) else local
     if not os.path.isfile(path):
         raise InputError(
-            f"There are no weights at {path}; name the file {weights.file} or a folder that holds "
-            f"it, which {weights.source} gives out."
+            f"There are no weights at {path}; name the file {weights.file} or its folder, from "
+            f"{weights.source}."
         )
     return path
 
@@ -94,10 +88,7 @@ def _by_hand(weights: PublishedWeights) -> str:
 
 @contextmanager
 def few_retries() -> Iterator[None]:
-    """Let the hub's library try `MAX_RETRIES` times again, and say nothing of it.
-
-    It has no setting for the number, so the defaults of its functions are others meanwhile.
-    """
+    """Limit the hub's library to `MAX_RETRIES` retries, by temporarily changed defaults."""
     from huggingface_hub import utils
 
     functions = (getattr(utils, name, None) for name in ("http_backoff", "http_stream_backoff"))
@@ -138,11 +129,10 @@ def _download(weights: PublishedWeights, offline: bool) -> Path:
     except LocalEntryNotFoundError as error:
         reason = "downloads are off" if offline else "the hub cannot be reached"
         raise WeightsNotAvailable(
-            f"The weights {weights.name} are not here and {reason}; {_by_hand(weights)}."
+            f"The weights {weights.name} are not on this machine and {reason}; {_by_hand(weights)}."
         ) from error
     except Exception as error:
-        # Which library's errors come through depends on the version of huggingface_hub; whatever
-        # it was, the way out is the same.
+        # The error type depends on the version of huggingface_hub; the advice does not.
         raise WeightsNotAvailable(
             f"The weights {weights.name} were not downloaded ({type(error).__name__}); "
             f"{_by_hand(weights)}."

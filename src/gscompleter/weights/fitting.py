@@ -1,4 +1,4 @@
-"""Tensors into a network: all of them, each of its shape, or a sentence that says what differs."""
+"""Strict loading of tensors into a network."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from gscompleter.errors import InputError, quoted
 
 Shapes = Mapping[str, tuple[int, ...]]
-"""The shape of each tensor of a network, by its name."""
+"""Shapes of the tensors of a network by name."""
 
 
 def load_strictly(
@@ -20,18 +20,16 @@ def load_strictly(
     where: Path | str,
     variants: Callable[[], Mapping[str, Shapes]] | None = None,
 ) -> None:
-    """Fill a network with tensors that fit it exactly; it stays as it is where they do not.
+    """Load tensors into a network if names and shapes match exactly; else it is unchanged.
 
     Args:
         model: The network.
-        state_dict: Its tensors, parameters and buffers, by their names in the network.
-        where: Where they come from, for the sentence.
-        variants: Gives the shapes of every network that there is, by name; it is called where the
-            tensors do not fit, to say which network they belong to.
+        state_dict: Parameters and buffers by their names in the network.
+        where: Origin of the tensors, for error messages.
+        variants: Function that returns the shapes of all networks, to name the one that fits.
 
     Raises:
-        InputError: where a tensor is missing, is one too many, has another shape, or holds NaN or
-            infinity.
+        InputError: A tensor is missing, unknown, of another shape, or not finite.
     """
     needed, given = shapes_of(model.state_dict()), shapes_of(state_dict)
     if needed != given:
@@ -47,7 +45,7 @@ def load_strictly(
 
 
 def check_finite(state_dict: Mapping[str, Tensor], where: Path | str) -> None:
-    """Raise an InputError where a tensor holds NaN or infinity, with which nothing is computed."""
+    """Raise InputError if a tensor contains NaN or infinity."""
     bad = [name for name, tensor in state_dict.items() if not torch.isfinite(tensor).all()]
     if bad:
         raise InputError(
@@ -57,12 +55,12 @@ def check_finite(state_dict: Mapping[str, Tensor], where: Path | str) -> None:
 
 
 def shapes_of(state_dict: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
-    """The shape of each tensor."""
+    """Return the shape of each tensor."""
     return {name: tuple(tensor.shape) for name, tensor in state_dict.items()}
 
 
 def differences(needed: Shapes, given: Shapes) -> str:
-    """How two lists of tensors differ, in words, with an example of each kind."""
+    """Describe the differences of two sets of tensors, with an example of each kind."""
     missing = [name for name in needed if name not in given]
     extra = [name for name in given if name not in needed]
     other = [name for name in needed if name in given and needed[name] != given[name]]
@@ -72,7 +70,7 @@ def differences(needed: Shapes, given: Shapes) -> str:
         parts.append(f"it lacks {len(missing)} of {len(needed)} tensors (such as {example})")
     if extra:
         example = quoted(extra[0])
-        parts.append(f"it has {len(extra)} that the network does not know (such as {example})")
+        parts.append(f"it has {len(extra)} unknown to the network (such as {example})")
     if other:
         name = other[0]
         shapes = f"{quoted(list(given[name]))} instead of {list(needed[name])}"

@@ -1,8 +1,6 @@
-"""Every file of weights that the feed-forward reconstructors can be filled with.
+"""Published weights of the learned reconstructors (no torch, so it imports fast).
 
-Nothing here imports torch, so that `gscompleter models` answers at once. The hub was out of reach
-when this was written: names, digits and licences are those that the authors' pages state, and none
-of the files was downloaded to confirm them.
+Names, digits and licences are those of the authors' pages; no file was downloaded to verify them.
 """
 
 from __future__ import annotations
@@ -17,66 +15,60 @@ UNLICENSED = "no licence is stated for the file"
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedWeights:
-    """A file of weights as its authors publish it, and what is known of it."""
+    """A published weight file."""
 
     name: str
-    """What it is called here: model, size, data it was trained on, and the size of the images
-    unless that is 256x256."""
+    """Our name: model, size, training data, and the image size unless it is 256x256."""
     model: str
-    """The method, as its authors write it."""
     network: str | None
-    """The configuration that its tensors fit; None where the authors do not say."""
+    """Configuration that fits the tensors, or None if unknown."""
     repository: str | None
-    """Repository on the Hugging Face hub; None where the file lies elsewhere."""
+    """Repository on the Hugging Face hub, or None if the file is elsewhere."""
     revision: str | None = "main"
-    """Commit of the repository, or `main` where none is known, which pins nothing."""
+    """Commit of the repository; `main` if unknown, which is not pinned."""
     file: str
-    """The published name of the file."""
     sha256: str | None = None
-    """Its SHA-256, or as many leading hex digits as are published; None where none are."""
+    """SHA-256 of the file, or its published leading hex digits; None if unpublished."""
     megabytes: int | None = None
-    """Size of the file in MB, where it is known."""
+    """Size of the file in MB, if known."""
     parameters: int | None
-    """Learned numbers; rounded to millions where only the authors' figure is known."""
+    """Number of parameters, rounded to millions if taken from the authors."""
     views: tuple[int, int]
-    """Fewest and most views it was trained with."""
+    """Smallest and largest number of views in training."""
     image_size: tuple[int, int] = (256, 256)
-    """Height and width of the images it was trained on, in pixels."""
     near_far: tuple[float, float] | None
-    """Smallest and largest depth of its authors' evaluation, in scene units, where known."""
+    """Depth range of the authors' evaluation in scene units, if known."""
     code: str
-    """Page of the authors' code."""
     code_licence: str = "MIT"
-    """Licence of that code. Ours is written anew and does not depend on it."""
+    """Licence of that code; ours is independent of it."""
     weights_licence: str = UNSTATED
-    """Licence that is stated for the file, or `not stated`."""
+    """Licence of the file, or `not stated`."""
     caution: str = UNLICENSED
-    """Why commercial use is unclear; empty where a licence allows it plainly."""
+    """Reason why commercial use is unclear; empty if the licence allows it."""
     source: str
-    """Page from which the authors give out the file."""
+    """URL of the authors' download page."""
     entry: str = "state_dict"
-    """Entry of the file that holds the tensors, where they do not lie at the top."""
+    """Entry of the file with the tensors, unless they are at the top level."""
     prefix: str = "encoder."
-    """How the names of the network's tensors begin in the file."""
+    """Prefix of the network's tensor names in the file."""
     gives: Literal["Gaussians", "scene depth", "depth"] = "Gaussians"
-    """What the network predicts: Gaussians, depth in the unit of the scene, of which we make
-    Gaussians, or depth alone, which is no reconstructor."""
+    """Output of the network; `scene depth` is converted to Gaussians, `depth` is not supported."""
 
     @property
     def url(self) -> str:
-        """Where a browser finds the file: itself, or the folder that holds it."""
+        """URL of the file, or of the page that offers it."""
         if self.repository is None:
             return self.source
         return f"https://huggingface.co/{self.repository}/resolve/{self.revision}/{self.file}"
 
     @property
     def is_reconstructor(self) -> bool:
-        """Whether it gives Gaussians or what we make them of, and its network is known."""
+        """True if the network is known and yields Gaussians, directly or from depth."""
         return self.gives != "depth" and self.network is not None
 
     @property
     def pinned_by(self) -> str:
-        """What makes sure that the file is the published one."""
+        """Description of the check that the file is the published one."""
         if self.sha256 is None:
             return "nothing"
         digits = len(self.sha256)
@@ -84,7 +76,7 @@ class PublishedWeights:
 
     @property
     def size(self) -> str:
-        """Its size in words; 4 bytes a parameter are the least where the size is not known."""
+        """Size of the file as text; if unknown, at least 4 bytes per parameter."""
         if self.megabytes is not None:
             return f"{self.megabytes} MB"
         return "?" if self.parameters is None else f">= {self.parameters * 4 // 10**6} MB"
@@ -125,8 +117,8 @@ VOLSPLAT = PublishedWeights(
     source="https://huggingface.co/lhmd/VolSplat",
 )
 
-# Learned numbers of each configuration: the size of its ViT, scales of its cost volume, factor of
-# its upsampler, and the fraction (one in ...) of the image's size at which matching begins.
+# Number of parameters by ViT size, number of scales, upsampling factor, and full resolution over
+# that of the coarsest features.
 PARAMETERS = {
     "small-s1-u4-l4": 38_346_416,
     "small-s1-u8-l8": 38_404_880,
@@ -140,11 +132,7 @@ PARAMETERS = {
 def _depthsplat(
     file: str, configuration: str, caution: str = "", far: float = 100.0
 ) -> PublishedWeights:
-    """A file of DepthSplat's authors, who name it for what it is.
-
-    Its name carries the model, the size of its images, fewest and most views, and the leading
-    digits of its SHA-256.
-    """
+    """Parse the name of a DepthSplat file: model, image size, view range, start of its SHA-256."""
     parts = re.fullmatch(r"(.+-(\d+)x(\d+))-\w*view(\d+)(?:-(\d+))?-([0-9a-f]{8})\.pth", file)
     assert parts is not None, file
     stem, height, width, fewest, most, digits = parts.groups()
@@ -169,7 +157,6 @@ def _depthsplat(
 def _depth_anything(
     name: str, repository: str, parameters: int, caution: str = NON_COMMERCIAL, **others: Any
 ) -> PublishedWeights:
-    """A file of Depth Anything 3's authors: one in each of their repositories."""
     return PublishedWeights(
         name=name,
         model=repository.upper(),
@@ -190,7 +177,7 @@ def _depth_anything(
 
 
 def _retrained(weights: PublishedWeights, **others: Any) -> PublishedWeights:
-    """A baseline that VolSplat's authors trained and put beside their own network."""
+    """Create the entry of a baseline that VolSplat's authors retrained and published."""
     return replace(
         weights,
         repository=VOLSPLAT.repository,
@@ -212,7 +199,7 @@ DEPTH_ALONE: dict[str, Any] = {"near_far": None, "entry": "model", "prefix": "",
 _FILES = (
     MVSPLAT,
     replace(MVSPLAT, name="mvsplat-acid", file="acid.ckpt"),
-    # Whether its tensors are named as those above is not known.
+    # Its tensor names are not known.
     _retrained(MVSPLAT, name="mvsplat-re10k-6view", file="mvsplat-re10k-baseline-256x256.ckpt"),
     DEPTHSPLAT,
     _depthsplat("depthsplat-gs-base-re10k-256x256-view2-ca7b6795.pth", "base-s2-u2-l4", FROM_BASE),
@@ -238,7 +225,7 @@ _FILES = (
         f"{ON_DL3DV}; {FROM_BASE}",
         far=200.0,
     ),
-    # How large it is is not said.
+    # Its size is not published.
     _retrained(
         DEPTHSPLAT,
         name="depthsplat-re10k-6view",
@@ -246,7 +233,7 @@ _FILES = (
         file="depthsplat-re10k-baseline-256x256.ckpt",
         parameters=None,
     ),
-    # The authors do not say which upsampling it has.
+    # Its upsampling is not published.
     replace(
         _depthsplat("depthsplat-depth-small-352x640-randview2-8-e807bd82.pth", "", ON_DEPTH_DATA),
         network=None,

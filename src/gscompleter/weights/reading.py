@@ -1,4 +1,4 @@
-"""From a file of weights to named tensors, and to nothing else: code in a file is never run."""
+"""Safe reading of tensors from weight files: code in a file is never run."""
 
 from __future__ import annotations
 
@@ -19,19 +19,17 @@ from gscompleter.reading import open_file
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
 NOT_THE_ENCODERS = ("decoder.", "losses.")
-"""How the names of other parts begin that the authors' training saves beside the network."""
+"""Prefixes of tensors of other parts that training checkpoints contain."""
 
 
 def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
-    """The tensors of the network in a file, on the CPU, by the names they have in the network.
+    """Read the network's tensors from a file, memory-mapped if possible, to the CPU.
 
-    The file is compared with the published SHA-256, as far as that is known; without one, a
-    damaged archive is still found by its checksums. A `.safetensors` file in place of a published
-    pickle is somebody's conversion or own training and has no published hash: its tensors only
-    have to fit. Tensors are mapped from the file, not copied, where its format allows that.
+    The file is verified by its published SHA-256, or by the archive's checksums if there is none. A
+    `.safetensors` file in place of a published pickle has no hash; its tensors only have to fit.
 
     Raises:
-        InputError: where the file is missing, damaged, another one, or holds more than tensors.
+        InputError: The file is missing, damaged, a different one, or contains other objects.
     """
     check_kind(path, weights.file)
     converted = path.suffix == ".safetensors" and not weights.file.endswith(".safetensors")
@@ -44,9 +42,9 @@ def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
 
 
 def check_kind(path: Path, name: str) -> None:
-    """Raise an InputError where a file is missing, empty, a pointer, a web page, or cut off."""
+    """Raise InputError if a file is missing, empty, a Git LFS pointer, a web page, or truncated."""
     if not os.path.isfile(path):
-        raise InputError(f"There is no file {path}; {name} is needed there.")
+        raise InputError(f"There is no file {path}; put {name} there.")
     with open_file(path) as file:
         head = file.read(64)
     refuse_pointer(path)
@@ -62,11 +60,7 @@ def check_kind(path: Path, name: str) -> None:
 
 
 def check_sha256(path: Path, expected: str, name: str) -> None:
-    """Compare a file with a published SHA-256, or with the leading digits that are known of it.
-
-    Raises:
-        InputError: where it is another file; where it is another published one, the name of that.
-    """
+    """Raise InputError if the SHA-256 of a file does not start with `expected`."""
     digest = sha256_of(path)
     if digest.startswith(expected):
         return
@@ -80,7 +74,7 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file in hex digits; a megabyte of it is in memory at a time."""
+    """Compute the SHA-256 of a file in blocks of 1 MiB."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
@@ -89,7 +83,7 @@ def sha256_of(path: Path) -> str:
 
 
 def is_archive(path: Path) -> bool:
-    """Whether it is a whole zip archive, as which torch saves."""
+    """Return True for a complete zip archive, the format of torch."""
     try:
         return zipfile.is_zipfile(path)
     except zipfile.BadZipFile:
@@ -97,44 +91,36 @@ def is_archive(path: Path) -> bool:
 
 
 def check_archive(path: Path, name: str) -> None:
-    """Raise an InputError where a part of a zip archive differs from its checksum."""
+    """Raise InputError if a part of a zip archive does not match its checksum."""
     if not is_archive(path):
         return
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
-    except Exception as error:  # an archive can be damaged in any way
+    except Exception as error:  # damaged archives raise many types
         damaged = str(error)
     if damaged is not None:
         raise _broken(path, f"is damaged ({quoted(damaged)})", name)
 
 
 def read_tensors(path: Path, name: str) -> Any:
-    """What torch saved in a file: tensors in plain containers. Anything else is refused.
-
-    Raises:
-        InputError: where the file holds pickled Python objects, or is no file of torch.
-    """
+    """Read a torch file that contains only tensors in plain containers."""
     try:
-        # Older files of torch are no zip archives and cannot be mapped.
+        # Old files of torch are not zip archives and cannot be mapped.
         mapped = is_archive(path)
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as error:
         found = re.search(r"GLOBAL (\S+)", str(error))
         if found is None:
             raise _broken(path, "holds no plain weights", name) from error
-        objects = f"Python objects too ({quoted(found[1])}), and to load those may run any code"
-        raise _broken(path, f"holds no plain weights but {objects}", name) from error
-    except Exception as error:  # a damaged pickle can fail in any way
+        objects = f"Python objects too ({quoted(found[1])}), which may run any code"
+        raise _broken(path, f"holds {objects}", name) from error
+    except Exception as error:  # damaged pickles raise many types
         raise _broken(path, "cannot be read by torch", name) from error
 
 
 def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
-    """The tensors of a `.safetensors` file.
-
-    Raises:
-        InputError: where it is damaged, or the package safetensors is not there.
-    """
+    """Read a `.safetensors` file."""
     try:
         import safetensors.torch
     except ImportError as error:
@@ -143,18 +129,14 @@ def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
         ) from error
     try:
         return safetensors.torch.load_file(path)
-    except Exception as error:  # a damaged file can fail in any way
+    except Exception as error:  # damaged files raise many types
         raise InputError(
             f"{path} is no safetensors file ({quoted(str(error))}); give {name}."
         ) from error
 
 
 def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
-    """The network's tensors among what a file holds, without what goes before their names.
-
-    Raises:
-        InputError: where there are none, or others than are known to lie beside them.
-    """
+    """Extract the network's tensors, without the prefix of their names; others are refused."""
 
     def other(held: str) -> InputError:
         return InputError(f"{path} holds {held}; give {weights.file}.")
@@ -182,13 +164,13 @@ def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> d
 
 
 def is_plain(tensor: Tensor) -> bool:
-    """Whether it is an array of real numbers that are there."""
+    """Return True for a dense, real, materialized tensor."""
     strided = tensor.layout == torch.strided and not tensor.is_nested
     return strided and not (tensor.is_meta or tensor.is_quantized or tensor.is_complex())
 
 
 def _broken(path: Path, wrong: str, name: str) -> InputError:
-    # In the hub's cache the path is a link; without the file behind it, it is fetched anew.
+    # In the hub's cache the path is a link; deleting its target makes the hub download again.
     file = path.resolve()
     if file == path.absolute():
         return InputError(f"{path} {wrong}; delete it and fetch {name} again.")

@@ -1,7 +1,7 @@
-"""Who does the jobs: processes of this machine, Ray, or jobs of SLURM by submitit.
+"""Engines, which run jobs: local processes, Ray, or SLURM jobs through submitit.
 
-An engine is given jobs one by one and says what became of each, in the order in which they end. A
-worker that is killed costs its job an attempt, and nothing else.
+An engine takes jobs one by one and yields outcomes in the order in which jobs end. A killed worker
+costs its job one attempt and affects no other job.
 """
 
 from __future__ import annotations
@@ -16,14 +16,8 @@ EngineName = Literal["local", "ray", "submitit"]
 
 @runtime_checkable
 class Engine(Protocol):
-    """Lets workers do jobs."""
+    """Runs jobs on workers."""
 
     def __call__(self, perform: Perform, jobs: Iterable[Job]) -> Iterator[Outcome]:
-        """What became of `jobs`, of which one is taken whenever a worker is free.
-
-        Closing the iterator stops the workers.
-
-        Raises:
-            OutputError: where results cannot be written.
-        """
+        """Run `jobs` and yield their outcomes; closing the iterator stops the workers."""
         ...

@@ -1,5 +1,4 @@
-"""Processes of this machine, each a `ProcessPoolExecutor` of one, so that one that is killed takes
-no other along."""
+"""Local processes, each in its own pool, so that a killed one affects no other."""
 
 from __future__ import annotations
 
@@ -19,15 +18,15 @@ from gscompleter.memory import memory_bytes, needed_bytes
 from gscompleter.threads import usable_cores
 
 PIXELS, IMAGES = 640 * 480, 8
-"""Of a completion as most are, by which the number of workers is chosen."""
+"""Size of a typical completion, for the default number of workers."""
 WATCH_SECONDS = 0.5
-"""How often a worker looks whether it is to stop."""
+"""Interval at which a worker checks whether it has to stop."""
 CLEANING_SECONDS = 20.0
-"""How long it may then take to give its claim back."""
+"""Time that it then has to release its claim."""
 
 
 def default_workers() -> int:
-    """As many workers as there are cores, if each finds the memory of a usual completion."""
+    """Return the number of cores, limited by the memory of a typical completion."""
     there = memory_bytes()
     fitting = usable_cores() if there is None else there // needed_bytes(PIXELS, IMAGES)
     return max(1, min(usable_cores(), fitting))
@@ -35,11 +34,12 @@ def default_workers() -> int:
 
 @dataclass(frozen=True)
 class LocalEngine:
-    """Workers that are processes of this machine."""
+    """Workers that are local processes."""
 
     workers: int
 
     def __call__(self, perform: Perform, jobs: Iterable[Job]) -> Iterator[Outcome]:
+        """Run jobs as `Engine` does."""
         stop = multiprocessing.get_context("spawn").Event()
         waiting = iter(jobs)
         running: dict[Future[Outcome], tuple[ProcessPoolExecutor, Job]] = {}
@@ -70,15 +70,12 @@ def send(
     executor: ProcessPoolExecutor,
     running: dict[Future[Outcome], tuple[ProcessPoolExecutor, Job]],
 ) -> None:
-    """Let a worker do a job."""
+    """Submit a job to a worker."""
     running[executor.submit(busy_with, perform, job)] = executor, job
 
 
 def outcome_of(future: Future[Outcome], job: Job) -> Outcome:
-    """What became of the job of `future`, which is over.
-
-    Raises whatever ended the worker's work but being killed or told to stop.
-    """
+    """Return the outcome of a finished job; raise any error but that of a killed worker."""
     error = future.exception()
     if error is None:
         return future.result()
@@ -88,30 +85,30 @@ def outcome_of(future: Future[Outcome], job: Job) -> Outcome:
 
 
 def worker(stop: Event) -> ProcessPoolExecutor:
-    """One more process, which ends with `stop` and with this process, however that ends."""
+    """Start a process that ends with `stop` or with this process."""
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, context, begin_worker, (stop,))
 
 
 _busy = Lock()
-"""Held by a worker while it does a job."""
+"""Held by a worker while it runs a job."""
 
 
 def busy_with(perform: Perform, job: Job) -> Outcome:
-    """Do a job in this worker."""
+    """Run a job in this worker."""
     with _busy:
         return perform(job)
 
 
 def begin_worker(stop: Event) -> None:
-    """Prepare this process: Ctrl-C is for those who started it, and `stop` reaches its jobs."""
+    """Initialize a worker: ignore Ctrl-C, which is for the parent, and watch `stop`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     Thread(target=watch, args=(stop,), daemon=True).start()
 
 
 def watch(stop: Event) -> None:
-    """End this process once it is to stop, or nobody waits for it; a job gives its claim back."""
+    """End this process when it has to stop or its parent is gone; a job releases its claim."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     while parent.is_alive() and not stop.is_set():

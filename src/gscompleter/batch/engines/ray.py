@@ -1,4 +1,4 @@
-"""Tasks of Ray, on a cluster that is there or on one of this machine alone."""
+"""Ray tasks, on an existing cluster or a local one."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.threads import bound_threads
 
 IN_FLIGHT = 2
-"""Tasks that wait or run, for each that the cluster has room for."""
+"""Tasks that wait or run, per task that the cluster can run at once."""
 STORE_BYTES = 200 * 10**6
-"""Memory for what tasks return, on a cluster of this machine alone: rows, as the rest are files."""
+"""Memory for return values in a local cluster; they are small, as results are files."""
 STOP_SECONDS = 20.0
-"""How long tasks that are stopped may take to give their claims back."""
+"""Time that stopped tasks have to release their claims."""
 
 
 @dataclass(frozen=True)
 class RayEngine:
-    """Workers that are tasks of Ray."""
+    """Workers that are Ray tasks."""
 
     workers: int | None
-    """How many tasks run at once; None takes what the cluster has room for."""
+    """Number of simultaneous tasks; None uses all of the cluster."""
     threads: int
-    """CPUs of a task."""
     gpus: float = 0.0
-    """GPUs of a task, also a part of one."""
+    """GPUs per task, possibly a fraction."""
     address: str | None = None
-    """Of a cluster that is there; None starts one on this machine."""
+    """Address of a cluster; None starts one on this machine."""
 
     def __call__(self, perform: Perform, jobs: Iterable[Job]) -> Iterator[Outcome]:
+        """Run jobs as `Engine` does."""
         with self._cluster() as ray:
-            # A task that is lost is sent again by whoever keeps count of the attempts of a job.
+            # `Rounds` repeats lost tasks, because it counts the attempts of a job.
             task = ray.remote(done).options(
                 num_cpus=self.threads, num_gpus=self.gpus, max_retries=0
             )
@@ -61,7 +61,7 @@ class RayEngine:
 
     @contextlib.contextmanager
     def _cluster(self) -> Iterator[Any]:
-        """Ray, connected; what was started is stopped at the end."""
+        """Connect to Ray, and shut down a local cluster at the end."""
         ray = imported_ray()
         handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
@@ -72,7 +72,7 @@ class RayEngine:
                 "address",
             ) from error
         try:
-            # Ray has put handlers of its own in their place.
+            # Ray has replaced them by its own.
             for number, handler in handlers.items():
                 signal.signal(number, handler)
             yield ray
@@ -91,7 +91,6 @@ class RayEngine:
         }
 
     def _in_flight(self, ray: Any) -> int:
-        """How many tasks are sent before any is done."""
         if self.workers is not None:
             return self.workers
         there = int(ray.cluster_resources().get("CPU", 1) // self.threads)
@@ -99,9 +98,9 @@ class RayEngine:
 
 
 def imported_ray() -> Any:
-    """The package; an InputError where it is not installed."""
+    """Import Ray; raise InputError if it is not installed."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # Ray would otherwise say on standard error what it plans for its next versions.
+    # Suppresses Ray's notice about future versions on standard error.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         import ray
@@ -113,16 +112,13 @@ def imported_ray() -> Any:
 
 
 def done(perform: Perform, job: Job, threads: int) -> Outcome:
-    """Do a job in a worker of Ray."""
-    bound_threads(threads)  # before the first job imports what reads it
+    """Run a job in a worker of Ray."""
+    bound_threads(threads)  # before the first job imports libraries that read it
     return perform(job)
 
 
 def outcome_of(ray: Any, reference: Any, job: Job) -> Outcome:
-    """What became of the job of a task that is over.
-
-    Raises whatever ended the task but its worker or its node being lost.
-    """
+    """Return the outcome of a finished task; raise any error but that of a lost worker."""
     try:
         outcome: Outcome = ray.get(reference)
     except (

@@ -1,7 +1,4 @@
-"""Jobs of SLURM, sent by submitit: each does a share of the batch, one job after the other.
-
-Where there is no SLURM, submitit starts them as processes of this machine.
-"""
+"""SLURM jobs, or local processes without SLURM, sent by submitit; each has a share."""
 
 from __future__ import annotations
 
@@ -16,22 +13,23 @@ from gscompleter.batch.jobs import Job, Outcome, Perform
 from gscompleter.errors import InputError, quoted
 
 POLL_SECONDS = 2.0
-"""How often SLURM's jobs are looked at."""
+"""Interval between checks of the SLURM jobs."""
 
 
 @dataclass(frozen=True)
 class SubmititEngine:
-    """Workers that are jobs of SLURM."""
+    """Workers that are SLURM jobs."""
 
     workers: int
     threads: int
     gpus: float
     folder: Path
-    """Where submitit keeps what it sends, and what the jobs print."""
+    """Folder for submitit's files and the output of the jobs."""
     parameters: Mapping[str, str]
-    """What SLURM is told besides, as in `partition` and `time`."""
+    """Further SLURM parameters such as `partition` and `time`."""
 
     def __call__(self, perform: Perform, jobs: Iterable[Job]) -> Iterator[Outcome]:
+        """Run jobs as `Engine` does."""
         listed = list(jobs)
         shares = [share for i in range(self.workers) if (share := listed[i :: self.workers])]
         executor = self._executor()
@@ -58,28 +56,31 @@ class SubmititEngine:
             ) from error
         executor = submitit.AutoExecutor(folder=str(self.folder))
         here = executor.cluster == "local"
-        asked = {} if here else {f"slurm_{k}": v for k, v in self.parameters.items()}
+        further = {} if here else {f"slurm_{k}": v for k, v in self.parameters.items()}
         try:
             executor.update_parameters(
                 cpus_per_task=self.threads,
                 gpus_per_node=int(self.gpus),
                 name="gscompleter",
                 **({"timeout_min": 24 * 60} if here else {}),
-                **asked,
+                **further,
             )
         except (ValueError, NameError, TypeError) as error:
-            raise InputError(f"SLURM is told something wrong: {quoted(str(error))}.") from error
+            raise InputError(
+                f"A --slurm parameter is invalid: {quoted(str(error))}; correct it."
+            ) from error
         return executor
 
 
 @dataclass(frozen=True)
 class Share:
-    """Does a share of a batch in a job of SLURM."""
+    """Runs a share of a batch in a SLURM job."""
 
     perform: Perform
     threads: int
 
     def __call__(self, share: Sequence[Job]) -> list[Outcome]:
+        """Run the jobs of a share one after the other."""
         from gscompleter.interrupts import treat_stops_alike
         from gscompleter.threads import bound_threads
 
@@ -88,17 +89,14 @@ class Share:
         return [self.perform(job) for job in share]
 
     def checkpoint(self, share: Sequence[Job]) -> Any:
-        """What SLURM is given once more where it takes the machine away: what has a row is left."""
+        """Resubmit the share if SLURM preempts the job; jobs with a row are skipped."""
         import submitit
 
         return submitit.helpers.DelayedSubmission(self, share)
 
 
 def outcomes_of(sent: Any, share: Sequence[Job]) -> Iterator[Outcome]:
-    """What became of a share; where its job was killed, which of it had a row is not known.
-
-    Raises whatever ended the work of the share.
-    """
+    """Yield the outcomes of a share; all of them are lost if its SLURM job was killed."""
     error = sent.exception()
     if error is None:
         yield from sent.result()

@@ -1,1 +1,1 @@
-"""COLMAP's sparse models: cameras, images and points, as binary and as text files."""
+"""Readers for COLMAP's sparse models, binary and text."""

@@ -1,6 +1,6 @@
 """COLMAP's binary files: cameras.bin, images.bin and points3D.bin.
 
-What a file claims to hold is compared with its size before anything is made room for.
+Claimed counts are compared with the file size before memory is allocated.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gscompleter.errors import InputError, quoted, refuse_pointer
 from gscompleter.reading import open_file
 
 MAX_NAME = 1024
-"""Of bytes in the name of an image."""
+"""Longest image name, in bytes."""
 
 _COUNT = Struct("<Q")
 _CAMERA = Struct("<IiQQ")
@@ -35,33 +35,21 @@ _SIGHTING = Struct("<II")
 
 
 def read_cameras(path: Path) -> dict[int, Intrinsics]:
-    """The cameras of a cameras.bin by their numbers.
-
-    Raises:
-        InputError: where it cannot be read or is damaged, or a camera is impossible.
-    """
+    """Read the cameras of a cameras.bin by number."""
     with _opened(path) as records:
         count = records.count(_CAMERA.size)
         return dict(_camera(records) for _ in range(count))
 
 
 def read_images(path: Path) -> list[PosedImage]:
-    """The images of an images.bin, in its order. Their features are skipped.
-
-    Raises:
-        InputError: where it cannot be read or is damaged.
-    """
+    """Read the images of an images.bin in its order, without features."""
     with _opened(path) as records:
         count = records.count(_IMAGE.size + 1 + _COUNT.size)
         return [_image(records) for _ in range(count)]
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """The points of a points3D.bin, in scene units. Their sightings are skipped.
-
-    Raises:
-        InputError: where it cannot be read or is damaged.
-    """
+    """Read the points of a points3D.bin in scene units, without tracks."""
     coordinates = array("d")
     with _opened(path) as records:
         for _ in range(records.count(_POINT.size + _COUNT.size)):
@@ -101,7 +89,7 @@ def _opened(path: Path) -> Iterator[_Records]:
 
 
 class _Records:
-    """The values of a file, one after the other, and never one that it does not hold."""
+    """Bounds-checked sequential reader of a file."""
 
     def __init__(self, content: mmap.mmap, path: Path) -> None:
         self.content = content
@@ -109,20 +97,18 @@ class _Records:
         self.position = 0
 
     def numbers(self, form: Struct) -> tuple[Any, ...]:
-        """The next numbers."""
         start = self.position
         self.skip(form.size)
         return form.unpack_from(self.content, start)
 
     def count(self, smallest: int) -> int:
-        """How many records of at least so many bytes come next, as the file claims."""
+        """Read a count of records, each of at least `smallest` bytes."""
         (count,) = self.numbers(_COUNT)
         if count * smallest > len(self.content) - self.position:
             raise self._damaged()
         return int(count)
 
     def text(self) -> str:
-        """The characters up to the next zero."""
         end = self.content.find(b"\0", self.position, self.position + MAX_NAME)
         if end < 0:
             raise self._damaged()
@@ -131,7 +117,6 @@ class _Records:
         return text
 
     def skip(self, size: int) -> None:
-        """Go on `size` bytes later."""
         if size > len(self.content) - self.position:
             raise self._damaged()
         self.position += size

@@ -1,4 +1,4 @@
-"""COLMAP's camera models, as pinhole intrinsics and the distortion before them."""
+"""COLMAP's camera models as pinhole intrinsics and distortion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gscompleter.errors import InputError, quoted
 
 @dataclass(frozen=True)
 class Model:
-    """A camera model: its number in binary files, and what its parameters are."""
+    """A camera model: its number in binary files, parameters and projection."""
 
     number: int
     parameters: tuple[str, ...]
@@ -42,22 +42,16 @@ MODELS = {
     "FISHEYE": _model(15, "fx fy cx cy", "equidistant"),
     "EUCM": _model(16, "fx fy cx cy alpha beta", "unified"),
 }
-"""By the names that COLMAP gives them. The coefficients k4 to k6 of FULL_OPENCV divide, and are
-called d1 to d3 here; s1 and s3 are COLMAP's sx1 and sy1."""
+"""Models by COLMAP's names; k4 to k6 of FULL_OPENCV are d1 to d3, sx1 and sy1 are s1 and s3."""
 
 NUMBERS = {model.number: name for name, model in MODELS.items()}
-"""The names of models by their numbers in binary files."""
 
 _SHAPES = ("omega", "k", "alpha", "beta")
 _CENTERS = ("f", "fx", "fy", "cx", "cy")
 
 
 def model_called(name: str | int, title: str) -> Model:
-    """The model of that name, or with that number.
-
-    Raises:
-        InputError: where it is not one of `MODELS`.
-    """
+    """Return the model of a name or number."""
     known = NUMBERS.get(name) if isinstance(name, int) else name
     if known not in MODELS:
         raise InputError(
@@ -70,17 +64,7 @@ def model_called(name: str | int, title: str) -> Model:
 def intrinsics_of(
     model: Model, size: tuple[int, int], numbers: Sequence[float], title: str
 ) -> Intrinsics:
-    """The intrinsics and the lens of a camera.
-
-    Args:
-        model: One of `MODELS`.
-        size: Width and height in pixels.
-        numbers: As many as the model has parameters.
-        title: What error messages call the camera.
-
-    Raises:
-        InputError: where the size or a number is impossible.
-    """
+    """Build the intrinsics and distortion of a camera, and check their range."""
     if not all(1 <= side <= MAX_SIDE for side in size):
         raise InputError(
             f"The size of {title} is {quoted(size[0])} × {quoted(size[1])}; sides from 1 to "
@@ -100,14 +84,14 @@ def intrinsics_of(
 
 
 def _distortion(model: Model, values: dict[str, float]) -> Distortion:
-    def numbers(*names: str) -> tuple[float, ...]:
+    def select(*names: str) -> tuple[float, ...]:
         return tuple(values[name] for name in names if name in values)
 
     return Distortion(
         model.projection,
-        shape=numbers(*_SHAPES),
-        radial=numbers("k1", "k2", "k3", "k4"),
+        shape=select(*_SHAPES),
+        radial=select("k1", "k2", "k3", "k4"),
         tangential=(values.get("p1", 0.0), values.get("p2", 0.0)),
-        denominator=numbers("d1", "d2", "d3"),
+        denominator=select("d1", "d2", "d3"),
         prism=(values.get("s1", 0.0), values.get("s3", 0.0)),
     )

@@ -1,4 +1,4 @@
-"""What the files of a COLMAP model hold, whichever way it is written."""
+"""Records of a COLMAP model, binary or text."""
 
 from __future__ import annotations
 
@@ -12,19 +12,18 @@ from gscompleter.data.poses import c2w_of, rotation_of
 
 @dataclass(frozen=True)
 class PosedImage:
-    """An image of a model: its name and its pose from world to camera."""
+    """An image of a model: its name and its world-to-camera pose."""
 
     name: str
-    """Path of the photograph below the folder of all photographs, with forward slashes."""
+    """Path below the folder of photographs, with forward slashes."""
     camera: int
-    """Number of its camera."""
     quaternion: tuple[float, ...]
-    """Of the rotation from world to camera, real part first."""
+    """World-to-camera rotation, real part first."""
     translation: tuple[float, ...]
-    """From world to camera, in scene units."""
+    """World-to-camera translation, in scene units."""
 
     def c2w(self) -> Float[np.ndarray, "4 4"]:
-        """Camera-to-world in OpenCV axes; where it does not exist, the transform as it is."""
+        """Compute camera-to-world in OpenCV axes; an invalid transform stays as it is."""
         viewmat = np.eye(4)
         viewmat[:3, :3] = rotation_of(self.quaternion)
         viewmat[:3, 3] = self.translation
@@ -32,5 +31,5 @@ class PosedImage:
 
 
 def portable(name: str) -> str:
-    """The name of an image with forward slashes, also where Windows wrote it."""
+    """Replace backslashes of Windows in an image name."""
     return name.replace("\\", "/")

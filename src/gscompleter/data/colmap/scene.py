@@ -1,4 +1,4 @@
-"""Photographs with a COLMAP model, in the layouts in which users hold them."""
+"""Photographs with a COLMAP model, in common folder layouts."""
 
 from __future__ import annotations
 
@@ -29,34 +29,25 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.io.image import is_turned
 
 DISTORTED = "distorted"
-"""The folder of a model with its lens, beside the undistorted photographs of 3DGS's scripts."""
+"""Folder of the model with distortion, beside undistorted photographs (3DGS's scripts)."""
 HOMES = ("sparse", "colmap/sparse", f"{DISTORTED}/sparse", "")
-"""Where the models of a scene lie, in the order in which they are looked for. A home is a model
-itself, or holds some in folders with a number for a name."""
+"""Folders that are models or hold numbered ones, in search order."""
 FILES = ("cameras", "images")
-"""Without them there is no model. `rigs` and `frames`, since COLMAP 3.12, tell nothing that the
-poses of the images do not."""
+"""Required files of a model; `rigs` and `frames` (COLMAP 3.12) add nothing to the poses."""
 
 _READERS = {".bin": binary, ".txt": text}
 
 
 def holds_colmap(path: Path) -> bool:
-    """Whether `path` is a scene with a COLMAP model, a model, or the images file of one."""
+    """Check whether `path` is a scene with a COLMAP model, a model, or its images file."""
     return is_image_file(path) or bool(_models(path))
 
 
 def open_colmap(path: Path) -> Iterator[Photographs]:
-    """The photographs of a scene, called by the name of its folder.
+    """Open the photographs of a scene, model or images file; the folder names it.
 
-    Of several models the one with most images is opened. Frames are numbered in the order of
-    the sorted names of those images whose photograph is there.
-
-    Args:
-        path: The folder of a scene, the folder of a model, or its images file.
-
-    Raises:
-        InputError: where there is no model or it is damaged, and where none of its photographs
-            is there.
+    The model with most images is used. Frames are numbered by the sorted names of the photographs
+    that exist.
     """
     if is_image_file(path):
         yield _scene(path.parent, path.parent, read_image_file(path), ())
@@ -65,18 +56,14 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
 
 
 def read_cameras_of(path: Path) -> list[Frame]:
-    """Read the cameras of a scene's largest model in its order, with photographs that are there.
-
-    Raises:
-        InputError: where there is no model or it is damaged.
-    """
+    """Read the cameras of a scene's largest model in its order, with existing photographs."""
     model, frames, _ = _largest(path)
     finder = _finder(_roots(path, model))
     return [finder.placed(frame) for frame in frames]
 
 
 def _largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
-    """Find the model of a scene with most images: its folder, its frames, and notes on others."""
+    """Find the largest model of a scene: its folder, frames, and notes on others."""
     models = _models(path)
     if not models:
         raise InputError(
@@ -89,11 +76,7 @@ def _largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
 
 
 def read_image_file(path: Path) -> list[Frame]:
-    """The cameras of an images.txt or images.bin in its order, without photographs.
-
-    Raises:
-        InputError: where it is damaged, or there is no cameras file beside it.
-    """
+    """Read the cameras of an images.txt or images.bin in its order, without photographs."""
     cameras = _file(path.parent, "cameras")
     if cameras is None:
         raise InputError(
@@ -104,13 +87,13 @@ def read_image_file(path: Path) -> list[Frame]:
 
 
 def is_image_file(path: Path) -> bool:
-    """Whether `path` is the file of a COLMAP model that holds its poses."""
+    """Check whether `path` is the images file of a COLMAP model."""
     name = path.name.casefold()
     return name in {f"images{ending}" for ending in _READERS} and os.path.isfile(path)
 
 
 def _models(path: Path) -> list[Path]:
-    """The folders of the models of a scene, all of one home."""
+    """List the model folders of a scene, all from the first matching home."""
     if not os.path.isdir(path):
         return []
     homes = [find_path(path, home) for home in HOMES]
@@ -128,7 +111,7 @@ def _is_model(folder: Path) -> bool:
 
 
 def _file(folder: Path, name: str) -> Path | None:
-    """A file of a model, binary rather than text; None where there is none."""
+    """Find a file of a model, preferring binary; None if there is none."""
     found = (find_path(folder, name + ending) for ending in _READERS)
     return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
@@ -141,7 +124,7 @@ def _frames_of(model: Path) -> list[Frame]:
 
 
 def _frames(cameras_file: Path, images_file: Path) -> list[Frame]:
-    """The frames of a model in the order of its file, without photographs."""
+    """Read the frames of a model in file order, without photographs."""
     cameras = _READERS[cameras_file.suffix.lower()].read_cameras(cameras_file)
     images = _READERS[images_file.suffix.lower()].read_images(images_file)
     if not images:
@@ -177,16 +160,13 @@ def _scene(
 
 
 def _finder(roots: Sequence[Path]) -> ImageFinder:
-    # Beside a model with a lens, `images` may hold photographs that have lost theirs.
+    # Beside a model with distortion, `images` may hold undistorted photographs.
     lens = any(root.name.casefold() == DISTORTED for root in roots)
     return ImageFinder(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
 
 
 def _roots(scene: Path, model: Path) -> list[Path]:
-    """The folder of a model and those above it, up to that of the scene.
-
-    Where the path of the model itself was given, its name and the next ones tell where that is.
-    """
+    """List the folders from the model up to the scene; names decide if a model itself is given."""
     top, roots = Path(os.path.abspath(scene)), [Path(os.path.abspath(model))]
     while top in roots[-1].parents or _is_part(roots[-1]):
         roots.append(roots[-1].parent)
@@ -194,7 +174,7 @@ def _roots(scene: Path, model: Path) -> list[Path]:
 
 
 def _is_part(folder: Path) -> bool:
-    """Whether a folder is one of `HOMES` or a numbered model in it, rather than a scene."""
+    """Check whether a folder is one of `HOMES` or a numbered model in it."""
     parts = {part for home in HOMES if home for part in home.split("/")}
     numbered = folder.name.isdecimal() and folder.parent.name.casefold() in parts
     return numbered or folder.name.casefold() in parts
@@ -205,26 +185,26 @@ def _choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
         return ()
     others = ", ".join(str(size) for number, size in enumerate(sizes) if number != best)
     return (
-        f"{len(models)} models lie in {models[best].parent}: the one in {models[best].name} with "
-        f"{sizes[best]} images was opened, of the others with {others} nothing is used.",
+        f"{len(models)} models lie in {models[best].parent}: {models[best].name} with "
+        f"{sizes[best]} images is used; the others, with {others} images, are ignored.",
     )
 
 
 def _turned(frame: Frame) -> tuple[str, ...]:
-    """What is said where photographs are to be turned, which COLMAP does not do."""
+    """Note that COLMAP ignores the EXIF rotation of photographs."""
     if not isinstance(frame.image, Path) or not is_turned(frame.image):
         return ()
     return (
-        f"The photographs are to be turned by their EXIF data, as {quoted(frame.name)} is: they "
-        "are used as they are stored, which is how COLMAP saw them.",
+        f"The EXIF rotation of the photographs, such as {quoted(frame.name)}, is ignored: they are "
+        "used as they are stored, like in COLMAP.",
     )
 
 
 def _points_of(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
-    """What reads the points of a model; None where it has no file of points."""
+    """Return a reader of the model's points; None if it has no file of points."""
     path = _file(model, "points3D")
     if path is not None:
         return partial(_READERS[path.suffix.lower()].read_points, path)
-    # 3DGS's script leaves them as a PLY.
+    # The script of 3DGS writes them as PLY.
     cloud = find_path(model, "points3D.ply")
     return None if cloud is None else partial(read_point_cloud, cloud)

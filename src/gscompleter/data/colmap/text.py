@@ -1,7 +1,6 @@
 """COLMAP's text files: cameras.txt, images.txt and points3D.txt.
 
-Other programs write them too, and leave out the lines of features or add empty ones. So lines are
-told apart by what stands in them and not by counting.
+Other programs omit the feature lines or add empty ones, so lines are classified by content.
 """
 
 from __future__ import annotations
@@ -20,35 +19,23 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.reading import read_lines
 
 MAX_LINE = 1 << 22
-"""Longest line, in characters: the features of an image."""
+"""Longest line in characters: the features of an image."""
 MAX_BYTES = 1 << 34
 """Longest file, in bytes."""
 
 
 def read_cameras(path: Path) -> dict[int, Intrinsics]:
-    """The cameras of a cameras.txt by their numbers.
-
-    Raises:
-        InputError: where it cannot be read, a line is damaged, or a camera is impossible.
-    """
+    """Read the cameras of a cameras.txt by number."""
     return dict(_camera(line, place) for line, place in _lines(path))
 
 
 def read_images(path: Path) -> list[PosedImage]:
-    """The images of an images.txt, in its order. Their features are skipped.
-
-    Raises:
-        InputError: where it cannot be read, or a line is damaged.
-    """
+    """Read the images of an images.txt in its order, without features."""
     return [_image(line, place) for line, place in _lines(path) if not _lists_features(line)]
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """The points of a points3D.txt, in scene units. Their sightings are skipped.
-
-    Raises:
-        InputError: where it cannot be read, or a line is damaged.
-    """
+    """Read the points of a points3D.txt in scene units, without tracks."""
     coordinates = array("d")
     for line, place in _lines(path):
         try:
@@ -88,14 +75,14 @@ def _image(line: str, place: str) -> PosedImage:
 
 
 def _lists_features(line: str) -> bool:
-    """Whether a line holds triples X Y POINT3D_ID, rather than a pose and a name."""
+    """Check whether a line holds triples X Y POINT3D_ID instead of a pose and a name."""
     words = line.split()
     return len(words) % 3 == 0 and words[-1].lstrip("-").isdecimal()
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """The lines that say something, each with where it stands."""
-    # Names may be of any encoding, and are handed on to the file system as they are.
+    """Yield the lines with content, each with its location."""
+    # Names may have any encoding and are passed to the file system unchanged.
     lines = read_lines(path, MAX_LINE, MAX_BYTES, errors="surrogateescape")
     for number, line in enumerate(lines, start=1):
         if line.strip() and not line.lstrip().startswith("#"):

@@ -1,4 +1,4 @@
-"""Models that lack no tensor: what is missing, transformers would fill with random numbers."""
+"""Detection of missing tensors, which transformers would initialize randomly."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gscompleter.generators.diffusion.published import IncompleteWeightsError, S
 
 
 def language_models(source: Source, dtype: torch.dtype) -> dict[str, Any]:
-    """The parts of a pipeline that are models of transformers, by name, each as by `loaded`."""
+    """Load the parts of a pipeline that are models of transformers, by name."""
     import transformers
     from diffusers import DiffusionPipeline, pipelines
 
@@ -20,7 +20,7 @@ def language_models(source: Source, dtype: torch.dtype) -> dict[str, Any]:
     for name, kind in parts.items():
         if not isinstance(kind, (list, tuple)) or kind[0] is None:
             continue
-        # Names that neither library knows any more are for diffusers to translate.
+        # Names unknown to both libraries are translated by diffusers.
         library = transformers if kind[0] == "transformers" else getattr(pipelines, kind[0], None)
         model = getattr(library, kind[1], None)
         if isinstance(model, type) and issubclass(model, transformers.PreTrainedModel):
@@ -29,37 +29,32 @@ def language_models(source: Source, dtype: torch.dtype) -> dict[str, Any]:
 
 
 def loaded(kind: Any, source: Source, part: str, unused: str = "^$", **arguments: Any) -> Any:
-    """A model of transformers of the class `kind`.
+    """Load a model of transformers of class `kind`, named `part` in errors.
 
-    Args:
-        kind: The class.
-        source: Where its files are.
-        part: What to call it in a sentence.
-        unused: Pattern of tensors that it has but never uses, and that may be missing.
-        arguments: For its `from_pretrained`.
+    Tensors that match `unused` may be missing.
 
     Raises:
-        IncompleteWeightsError: where it lacks a tensor.
+        IncompleteWeightsError: A tensor is missing.
     """
-    model, told = kind.from_pretrained(
+    model, info = kind.from_pretrained(
         source.place, output_loading_info=True, **{**source.arguments, **arguments}
     )
-    missing = sorted(name for name in told["missing_keys"] if not re.search(unused, name))
+    missing = sorted(name for name in info["missing_keys"] if not re.search(unused, name))
     if missing:
         raise IncompleteWeightsError(part, missing)
     return model
 
 
 def check_complete(model: torch.nn.Module, part: str) -> None:
-    """Raise an IncompleteWeightsError where a model of diffusers lacks a tensor."""
-    # diffusers gives no memory to what it did not find
+    """Raise IncompleteWeightsError if a model of diffusers lacks a tensor."""
+    # diffusers leaves missing parameters on the meta device
     missing = sorted(name for name, value in model.named_parameters() if value.is_meta)
     if missing:
         raise IncompleteWeightsError(part, missing)
 
 
 def check_parts(pipeline: Any) -> None:
-    """`check_complete` for each model among the parts of a pipeline."""
+    """Apply `check_complete` to each model of a pipeline."""
     for part, model in pipeline.components.items():
         if isinstance(model, torch.nn.Module):
             check_complete(model, part)

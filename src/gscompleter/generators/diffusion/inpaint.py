@@ -1,8 +1,4 @@
-"""Any inpainting pipeline of diffusers, given the photographs warped into the target.
-
-The pipeline paints the hole; what the photographs show stays as it was warped. Sizes and the
-arguments of a pipeline are read from its configuration and its signature.
-"""
+"""Inpainting pipelines of diffusers, applied to photographs warped to the target."""
 
 from __future__ import annotations
 
@@ -39,25 +35,23 @@ from gscompleter.masks import dilate
 from gscompleter.types import Camera, SceneContext, View
 
 SIDE = 512
-"""Side of the square whose area is painted where a pipeline's configuration names none."""
+"""Default side length of the square image, in pixels."""
 MARGIN = 4
-"""Pixels around a hole that the pipeline may paint anew, so that it meets no hard border. In the
-image that is returned they are as they were warped."""
+"""Width in pixels around a hole that is inpainted too, for smooth borders, but not kept."""
 
 
 @dataclass(frozen=True)
 class Painter:
-    """A loaded inpainting pipeline, and how its images must be sized."""
+    """A loaded inpainting pipeline with its image sizes."""
 
     pipeline: Any
-    """A pipeline of diffusers that takes `image` and `mask_image`."""
     side: int
-    """Side of the square image that it was trained on, in pixels."""
+    """Side length of the square training images, in pixels."""
     multiple: int
-    """Both sides of an image must be multiples of this."""
+    """Divisor of the side lengths of all images, in pixels."""
 
     def size_for(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width of about `side`² pixels, in the proportions of the image."""
+        """Compute a size of about `side`² pixels with the aspect ratio of the image."""
         scale = self.side / (height * width) ** 0.5
         h, w = (max(1, round(scale * n / self.multiple)) for n in (height, width))
         return h * self.multiple, w * self.multiple
@@ -70,7 +64,7 @@ class Painter:
         seed: int,
         steps: int | None,
     ) -> Float[Tensor, "h w 3"]:
-        """`image` with the hole painted, as the pipeline returns all of it."""
+        """Inpaint the hole; other pixels may change too."""
         size = self.size_for(*hole.shape)
         mask = (resized(hole[..., None].float(), size) > 0).float()
         wanted: dict[str, Any] = {
@@ -79,7 +73,7 @@ class Painter:
             "mask_image": mask.permute(2, 0, 1)[None].cpu(),
             "height": size[0],
             "width": size[1],
-            "strength": 1.0,  # the hole starts from noise alone
+            "strength": 1.0,  # start from pure noise in the hole
             "generator": torch.Generator().manual_seed(seed),
             "output_type": "pt",
         }
@@ -93,21 +87,20 @@ class Painter:
 
 @dataclass(frozen=True)
 class DiffusersInpaint:
-    """Φ by any inpainting pipeline. `load_painter` gives it."""
+    """Generator Φ that inpaints warped photographs; see `load_painter`."""
 
     painter: Painter
-    """What paints."""
     seed: int = 0
-    """Of its noise; the same seed gives the same image on the same device."""
+    """Seed of the noise; results are reproducible per device."""
     prompt: str = DiffusersInpaintSettings.prompt
-    """What it is told, whatever the image."""
+    """Text prompt for all images."""
     steps: int | None = None
-    """Denoising steps; the pipeline's own number if None."""
+    """Number of denoising steps, or None for the pipeline's default."""
     retries: int = 0
-    """How many further seeds are tried where the painting disagrees with what was warped."""
+    """Number of further seeds to try if the image is inconsistent with the warped photographs."""
 
     def __call__(self, nearest: View, target: Camera, context: SceneContext) -> Synthesis:
-        """The image `target` would take; outside of the hole it is the warped one."""
+        """Synthesize the image at `target`; pixels outside the hole are warped photographs."""
         observed = completed_warp(nearest, target, context)
         hole = dilate(~observed.known, MARGIN)
 
@@ -122,7 +115,7 @@ class DiffusersInpaint:
 
 
 def completed_warp(nearest: View, target: Camera, context: SceneContext) -> Warped:
-    """What the photographs show of the target, over a smooth continuation of its colours."""
+    """Warp the photographs to the target and extrapolate their colours smoothly into the holes."""
     warped = warp_photographs(nearest, target, context)
     if not warped.known.any():
         return replace(warped, image=nearest.image.mean(dim=(0, 1)).expand_as(warped.image))
@@ -136,22 +129,22 @@ def load_diffusers_inpaint(
     device: str = "cpu",
     settings: DiffusersInpaintSettings = DiffusersInpaintSettings(),
 ) -> DiffusersInpaint:
-    """Φ as the settings want it; errors as those of `load_painter`."""
+    """Create the generator from its settings; raises the errors of `load_painter`."""
     painter = load_painter(settings.weights, device, settings.offload)
     return DiffusersInpaint(painter, seed, settings.prompt, settings.steps, settings.retries)
 
 
 @lru_cache(maxsize=1)
 def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -> Painter:
-    """An inpainting pipeline, loaded once in a process.
+    """Load an inpainting pipeline; the last one is cached.
 
     Args:
-        path: A folder that diffusers saved, or USER/NAME or USER/NAME@COMMIT on the hub.
-        device: cpu or cuda. On a GPU all is bfloat16, on a CPU float32.
-        offload: Keep on the GPU only the part that is at work. Slower, and needs accelerate.
+        path: A folder in the format of diffusers, or USER/NAME or USER/NAME@COMMIT on the hub.
+        device: cpu (float32) or cuda (bfloat16).
+        offload: Keep only the active part on the GPU; slower, and needs accelerate.
 
     Raises:
-        InputError: packages are missing, no path was given, or there is no inpainting pipeline.
+        InputError: Packages, the path, or an inpainting pipeline are missing.
     """
     needs_diffusers("diffusers-inpaint")
     if path is None:
@@ -169,7 +162,7 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
 
 
 def inpainting(source: Source, dtype: torch.dtype) -> Any:
-    """The pipeline that a folder or repository names, as an inpainting one."""
+    """Load the pipeline of a folder or repository as an inpainting pipeline."""
     from diffusers import AutoPipelineForInpainting, DiffusionPipeline
 
     pipeline = DiffusionPipeline.from_pretrained(
@@ -182,10 +175,7 @@ def inpainting(source: Source, dtype: torch.dtype) -> Any:
 
 
 def size_rules(pipeline: Any) -> tuple[int, int]:
-    """Side of the trained square in pixels, and what an image's sides must be multiples of.
-
-    A UNet halves its latents on every level but the first; a transformer pairs them up.
-    """
+    """Return the side length of training images and the divisor of side lengths, in pixels."""
     latent = int(getattr(pipeline, "vae_scale_factor", 8))
     unet = getattr(pipeline, "unet", None)
     if unet is None:

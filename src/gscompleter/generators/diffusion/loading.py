@@ -1,4 +1,4 @@
-"""Load FLUX Kontext for PE-Field: the prompt is encoded first, then its encoders leave memory."""
+"""Loading of FLUX Kontext for PE-Field."""
 
 from __future__ import annotations
 
@@ -25,25 +25,21 @@ from gscompleter.generators.diffusion.published import (
 from gscompleter.generators.diffusion.rotary import HEADS, with_per_head_positions
 
 PROMPT = "Ensure that the picture does not change in any way"
-"""What the model was trained to be told, whatever the image."""
+"""Fixed prompt of the training."""
 
 
 @lru_cache(maxsize=1)
 def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = False) -> Kontext:
-    """The model of PE-Field, loaded once in a process.
-
-    T5 and CLIP encode the prompt and are dropped before the transformer is loaded, so that both
-    are never in memory together. On a GPU all is bfloat16, on a CPU float32.
+    """Load the PE-Field model; the last one is cached.
 
     Args:
-        path: A folder or repository: a whole pipeline with the transformer of PE-Field, or a
-            folder that holds the transformer alone, which then joins the published base. None
-            takes both as published.
-        device: cpu or cuda.
-        offload: Keep on the GPU only the part that is at work. Slower, and needs accelerate.
+        path: A folder or repository with a whole pipeline, or a folder with the transformer
+            alone, to use with the published base. If None, both are the published ones.
+        device: cpu (float32) or cuda (bfloat16).
+        offload: Keep only the active part on the GPU; slower, and needs accelerate.
 
     Raises:
-        InputError: packages are missing, or the weights cannot be had or do not fit.
+        InputError: Packages or weights are missing, or the weights do not fit.
     """
     needs_diffusers("pe-field")
     base, transformer = sources(path)
@@ -67,7 +63,7 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
 
 
 def sources(path: str | None) -> tuple[Source, Source]:
-    """Where the base pipeline and the transformer come from."""
+    """Determine the sources of base pipeline and transformer."""
     if path is None:
         return KONTEXT, PE_FIELD
     given = source_of(path)
@@ -82,7 +78,7 @@ def sources(path: str | None) -> tuple[Source, Source]:
 
 
 def encode_prompt(base: Source, device: str, dtype: torch.dtype) -> Prompt:
-    """The prompt in the words of T5 and CLIP, both of which are dropped afterwards."""
+    """Encode the prompt by T5 and CLIP, which are freed afterwards."""
     from diffusers import FluxKontextPipeline
 
     readers = FluxKontextPipeline.from_pretrained(
@@ -99,7 +95,7 @@ def encode_prompt(base: Source, device: str, dtype: torch.dtype) -> Prompt:
 
 
 def load_transformer(source: Source, dtype: torch.dtype) -> Any:
-    """What denoises."""
+    """Load the denoising transformer."""
     from diffusers import FluxTransformer2DModel
 
     network = FluxTransformer2DModel.from_pretrained(source.place, dtype=dtype, **source.arguments)
@@ -108,7 +104,7 @@ def load_transformer(source: Source, dtype: torch.dtype) -> Any:
 
 
 def load_pipeline(base: Source, network: Any, dtype: torch.dtype) -> Any:
-    """`network` with the VAE and the scheduler, and without what encodes prompts."""
+    """Load VAE and scheduler around `network`, without text encoders."""
     from diffusers import FluxKontextPipeline
 
     unused = dict.fromkeys(("text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2"))

@@ -1,7 +1,7 @@
-"""PE-Field: a diffusion transformer that reads the photograph at the target camera's positions.
+"""PE-Field: a diffusion transformer that reads the photograph at its target positions.
 
-The model is told by nothing but positions how the camera moved: every token of the photograph
-stands where the target camera sees what it shows. Holes are filled through attention alone.
+The camera motion enters only by positions: each token of the photograph is placed where the
+target camera sees its content. Attention fills the holes.
 """
 
 from __future__ import annotations
@@ -36,47 +36,40 @@ GUIDANCE = 3.5
 
 @dataclass(frozen=True)
 class Condition:
-    """What the model is told of one target."""
+    """Input of the model for one target: the resized photograph, output size, and positions."""
 
     photograph: Float[Tensor, "h w 3"]
-    """At the size that it is worked on."""
     size: tuple[int, int]
-    """Height and width that the target is painted at."""
     source_positions: Float[Tensor, "m 63"]
-    """Where the target camera sees the tokens of the photograph."""
+    """Positions of the photograph's tokens in the target camera."""
 
 
 @dataclass(frozen=True)
 class PEField:
-    """Φ of the paper. `load_kontext` gives the model."""
+    """The paper's generator Φ; see `load_kontext` for the model."""
 
     model: Kontext
-    """FLUX Kontext with per-head positions."""
     seed: int = 0
-    """Of the noise; the same seed gives the same image on the same device."""
+    """Seed of the noise; results are reproducible per device."""
     steps: int = PEFieldSettings.steps
-    """Evaluations of the transformer."""
+    """Number of denoising steps."""
     depth: SourceDepth | None = None
-    """Depth of the photograph: of the scene itself, or `MonocularDepth`; None takes what the
-    completer's settings name."""
+    """Source of the photograph's depth, or None to use the setting of the completer."""
     device: str = "cpu"
-    """Device of a depth network that the completer's settings name."""
     ids_dtype: torch.dtype = torch.bfloat16
-    """What positions of the target are rounded to: bfloat16 as in the authors' run."""
+    """Rounding of target positions; bfloat16 as in the authors' code."""
     retries: int = 0
-    """How many further seeds are tried where an image disagrees with the photographs."""
+    """Number of further seeds to try if an image is inconsistent with the photographs."""
     at_once: int = PEFieldSettings.batch_size
-    """Most images that are denoised together."""
+    """Largest number of images denoised together."""
 
     takes_margin: bool = True
 
     def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
-        """The images of `requests`, their colours brought to those of the photographs.
-
-        Images of one size are denoised together.
+        """Synthesize the images of `requests`, with colours adjusted to the photographs.
 
         Raises:
-            InputError: where the scene has no depth at the nearest photograph.
+            InputError: The scene has no depth at the nearest photograph.
         """
         conditions = [self.condition(r.nearest, r.target, r.context) for r in requests]
         first: dict[int, Tensor] = {}
@@ -99,7 +92,7 @@ class PEField:
         return [answer(i) for i in range(len(requests))]
 
     def condition(self, nearest: View, target: Camera, context: SceneContext) -> Condition:
-        """What the model is told of a target; errors as those of `synthesize`."""
+        """Create the model input for a target; raises the errors of `synthesize`."""
         size = self.model.size_for(target.height, target.width)
         source_size = self.model.size_for(nearest.camera.height, nearest.camera.width)
         grids = self.model.grid(source_size), self.model.grid(size)
@@ -109,7 +102,7 @@ class PEField:
         return Condition(resized(nearest.image, source_size), size, positions)
 
     def painted(self, conditions: Sequence[Condition], seed: int) -> Float[Tensor, "b h w 3"]:
-        """An image for each condition. All are of one size, and so are their photographs."""
+        """Generate an image for each condition; all sizes must be equal."""
         size = conditions[0].size
         return self.model.generate(
             torch.stack([one.photograph for one in conditions]),
@@ -128,22 +121,17 @@ def preview(
     context: SceneContext,
     depth: SourceDepth = context_depth,
 ) -> Float[Tensor, "h w 3"]:
-    """What the positions say: the pixels of the photograph where `target` sees them, over black.
+    """Splat the photograph to its positions in `target`, over black, for inspection.
 
-    The model is not shown this picture. It is to be looked at: where it is displaced, or torn
-    within a surface, the depth or the cameras are wrong, and the model is misled. Gaps beside what
-    stands in front are right, and so is the smear at the border: there lies all that the target
-    does not see.
-
-    Raises:
-        InputError: where the scene has no depth at the nearest photograph.
+    Displaced pixels or torn surfaces indicate wrong depth or cameras; gaps next to the foreground
+    and a smear at the border are correct.
     """
     pixels, _ = seen_from(depth(nearest, render_at(nearest, context)), nearest.camera, target)
     return forward_splat(nearest.image, pixels, (target.height, target.width))
 
 
 def grouped(conditions: Sequence[Condition], most: int) -> list[list[int]]:
-    """Indices of conditions whose images and photographs have one size, at most `most` of them."""
+    """Group the indices of conditions of equal size into batches of at most `most`."""
     alike: dict[tuple[tuple[int, int], torch.Size], list[int]] = {}
     for i, one in enumerate(conditions):
         alike.setdefault((one.size, one.photograph.shape), []).append(i)
@@ -155,17 +143,17 @@ def grouped(conditions: Sequence[Condition], most: int) -> list[list[int]]:
 
 
 def render_at(view: View, context: SceneContext) -> Render:
-    """The scene as the camera of `view`, one of the context's, sees it."""
+    """Find the render of the scene at `view`, one of the context views."""
     for known, render in zip(context.views, context.at_views, strict=True):
         if known is view or same_camera(known.camera, view.camera):
             return render
-    raise InputError("The photograph to start from is none of the scene's; give one of its views.")
+    raise InputError("The nearest view is not a view of the scene; give one of its views.")
 
 
 def load_pe_field(
     seed: int = 0, device: str = "cpu", settings: PEFieldSettings = PEFieldSettings()
 ) -> PEField:
-    """PE-Field as the settings want it; an InputError where packages or weights are missing."""
+    """Create PE-Field from its settings; raises InputError if packages or weights are missing."""
     return PEField(
         load_kontext(settings.weights, device, settings.offload),
         seed,

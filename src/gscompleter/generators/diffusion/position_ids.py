@@ -1,8 +1,7 @@
-"""Where each latent token lies: PE-Field's positions on three levels.
+"""Position ids of PE-Field for latent tokens, on three levels.
 
-A position is a triple (z, row, column), rows and columns in units of the target's tokens. A token
-has one triple on level 0, one for each of its 2 x 2 cells on level 1, and one for each of its
-4 x 4 cells on level 2: 1 + 4 + 16 triples, kept as one row of 63 numbers.
+A position is (z, row, column), in tokens of the target. Levels 0, 1 and 2 divide a token into 1,
+4 and 16 cells, so its 21 positions form a row of 63 numbers.
 """
 
 from __future__ import annotations
@@ -14,28 +13,24 @@ from torch import Tensor
 from gscompleter.types import Camera
 
 LEVELS = (1, 2, 4)
-"""Cells that a side of a token is divided into, level by level."""
+"""Number of cells along a side of a token, per level."""
 IDS = 3 * sum(factor**2 for factor in LEVELS)
-"""Numbers for each token: 63."""
+"""Numbers per token: 63."""
 FLAT_DEPTH = 0.01
-"""Normalised depth of a source image whose points all lie at one depth."""
+"""Normalised depth of a source image with constant depth."""
 CLOSEST = 1e-3
-"""Least z-depth that a point is projected with, as a share of the median depth of all. What lies
-behind the target camera is thereby projected far outside of its image."""
+"""Smallest z-depth for projection relative to the median; clamps points behind the camera."""
 
 
 def target_ids(
     size: tuple[int, int], grid: tuple[int, int], dtype: torch.dtype = torch.bfloat16
 ) -> Float[Tensor, "tokens 63"]:
-    """Positions of the tokens of the image that is generated, a regular grid at z = 0.
-
-    Level 0 holds the plain integers of FLUX; level k the centres of the cells, in tokens.
+    """Compute positions of the generated tokens: integers at level 0, else cell centres; z = 0.
 
     Args:
         size: Height and width of the generated image, in pixels.
         grid: Height and width in tokens.
-        dtype: What the positions are rounded to before use. The authors' run rounds them to
-            bfloat16, which moves level 2 by up to an eighth of a token at 1024 pixels.
+        dtype: Rounding. The authors' bfloat16 moves level 2 by up to 1/8 token at 1024 pixels.
     """
     levels = []
     for factor in LEVELS:
@@ -48,10 +43,7 @@ def target_ids(
 
 
 def cell_centres(pixels: int, tokens: int, factor: int) -> Float[Tensor, "cells"]:
-    """Centres of `factor` cells for each of `tokens` along a side, in tokens; -0.5 is the border.
-
-    Computed as the authors do, from pixel centres, so that rounding falls the same way.
-    """
+    """Compute the centres of `factor` cells per token along a side, in tokens, from -0.5."""
     centres = torch.arange(pixels, dtype=torch.float32) + 0.5
     resized = torch.nn.functional.interpolate(
         centres[None, None, None], (1, tokens * factor), mode="bilinear", align_corners=False
@@ -66,21 +58,11 @@ def source_ids(
     source_grid: tuple[int, int],
     target_grid: tuple[int, int],
 ) -> Float[Tensor, "tokens 63"]:
-    """Positions of the tokens of the photograph: where the target camera sees what they show.
+    """Compute the positions of the photograph's tokens in the target camera.
 
-    Every pixel is carried into the target camera through its depth; a token takes the mean of the
-    two by two pixels around its centre (and so do its cells). z is normalised to [1, 2].
-
-    With equal cameras, a token of 16 pixels that the target would number i gets i + 0.46875:
-    the authors count from the centre of the first pixel of the image here, and from the centre
-    of the first token for the target. The model was trained that way, and so it stays.
-
-    Args:
-        depth: z-depth of the photograph in scene units, positive everywhere.
-        source: Its camera, of the size of `depth`.
-        target: The camera of the image that is generated.
-        source_grid: Height and width of the photograph in tokens.
-        target_grid: Height and width of the generated image in tokens.
+    Pixels are projected by their positive z-depth; cells average the 2 x 2 pixels at their centres.
+    z is normalised to [1, 2]. As in training, equal cameras give an offset of 0.46875 for tokens of
+    16 pixels. Both grids are height and width in tokens.
     """
     pixels, z = seen_from(depth, source, target)
     nearness = z - z.min()
@@ -107,10 +89,7 @@ def source_ids(
 def seen_from(
     depth: Float[Tensor, "h w"], source: Camera, target: Camera
 ) -> tuple[Float[Tensor, "h w 2"], Float[Tensor, "h w"]]:
-    """Column and row of each pixel of `source` in `target`, and its z-depth there.
-
-    Columns and rows are indices of pixels: 0 is the centre of the first one.
-    """
+    """Project the pixels of `source` to pixel indices (column, row) and z-depth in `target`."""
     target_from_source = target.viewmat.double() @ source.c2w.double()
     K_source, K_target = source.K.double(), target.K.double()
     y, x = torch.meshgrid(
@@ -130,11 +109,7 @@ def seen_from(
 
 
 def packed(cells: Float[Tensor, "rows columns 3"], factor: int) -> Float[Tensor, "tokens numbers"]:
-    """The triples of the `factor` x `factor` cells of each token, side by side.
-
-    Two by two cells are gathered at a time, row by row, so that the quarters of a token come one
-    after the other and each is followed through all its own quarters.
-    """
+    """Join the positions of the `factor` x `factor` cells of each token, in quadtree order."""
     rows, columns = cells.shape[0], cells.shape[1]
     gathered = cells
     while factor > 1:

@@ -1,7 +1,6 @@
-"""The published folders that the generators load, and where they come from.
+"""Sources of the generators' published weights (imports neither torch nor diffusers).
 
-Nothing here imports torch or diffusers. The hub was out of reach when this was written: names,
-sizes and licences are what the authors' pages state, and no commit is known to pin them by.
+Names, sizes and licences are those of the authors' pages; no commit is known.
 """
 
 from __future__ import annotations
@@ -17,31 +16,30 @@ from gscompleter.errors import InputError, quoted
 from gscompleter.weights.fetching import few_retries
 
 PACKAGES = ("diffusers", "transformers", "accelerate")
-"""What the generators import; the rest comes with these."""
+"""Packages that the generators import."""
 INSTALL = "pip install 'gscompleter[diffusion]'"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """A folder that diffusers reads: on this machine, or in a repository of the hub."""
+    """A folder in the format of diffusers, local or on the hub."""
 
     place: str
     """Path of the folder, or id of the repository."""
     revision: str | None = None
-    """Commit or branch of the repository; None for a folder on this machine."""
+    """Commit or branch of the repository, or None for a local folder."""
     subfolder: str | None = None
-    """Where in it the files lie; None for its top."""
     terms: str = "the licence that its page states"
-    """Licence of the weights, in words that go into a sentence."""
+    """Licence of the weights, as part of a sentence."""
 
     @property
     def is_local(self) -> bool:
-        """Whether nothing is downloaded for it."""
+        """True for a local folder."""
         return self.revision is None
 
     @property
     def is_pinned(self) -> bool:
-        """Whether its files can never change: it is here, or named by its commit."""
+        """True if the files cannot change: a local folder or a commit."""
         revision = self.revision
         return revision is None or (
             len(revision) == 40 and set(revision) <= set("0123456789abcdef")
@@ -49,7 +47,7 @@ class Source:
 
     @property
     def arguments(self) -> dict[str, str]:
-        """What `from_pretrained` is told beside the place."""
+        """Further arguments of `from_pretrained`."""
         pairs = {"revision": self.revision, "subfolder": self.subfolder}
         return {key: value for key, value in pairs.items() if value is not None}
 
@@ -62,18 +60,18 @@ KONTEXT = Source(
         "logged-in account (`hf auth login`)"
     ),
 )
-"""The base model: VAE, text encoders, tokenizers and scheduler. Gated."""
+"""Base model: VAE, text encoders, tokenizers and scheduler; gated."""
 
 PE_FIELD = Source(
     place="yunpeng1998/PE-Field",
     revision="main",
     subfolder="FLUX.1-Kontext-dev/transformer",
     terms=(
-        "no licence of its own that is known; it is fine-tuned from FLUX.1-Kontext-dev, whose "
+        "no known licence of its own; it is fine-tuned from FLUX.1-Kontext-dev, whose "
         "non-commercial licence covers derivatives"
     ),
 )
-"""The authors' transformer: 1160 tensors, 23.8 GB in bfloat16."""
+"""Transformer of the authors: 1160 tensors, 23.8 GB in bfloat16."""
 
 PE_FIELD_TRANSFORMER = {
     "patch_size": 1,
@@ -87,7 +85,7 @@ PE_FIELD_TRANSFORMER = {
     "guidance_embeds": True,
     "axes_dims_rope": (16, 56, 56),
 }
-"""Its configuration, in the words of diffusers."""
+"""Configuration of that transformer in diffusers."""
 
 LICENCES = {
     "flux": "the FLUX.1 [dev] Non-Commercial License for the [dev] models, and a gated page",
@@ -95,7 +93,7 @@ LICENCES = {
     "stable-diffusion": "CreativeML Open RAIL-M for Stability's and Runway's own",
     "depth-anything-v2-small": "Apache-2.0",
 }
-"""What weights of a family are usually under, by a part of their id."""
+"""Usual licences of model families, by a part of the repository id."""
 
 
 class IncompleteWeightsError(ValueError):
@@ -107,13 +105,7 @@ class IncompleteWeightsError(ValueError):
 
 
 def source_of(path: str, library: str = "diffusers") -> Source:
-    """The folder or repository that a user names: PATH, USER/NAME, or USER/NAME@COMMIT.
-
-    `library` is what saved it, for the sentence.
-
-    Raises:
-        InputError: where it is neither a folder nor the id of a repository.
-    """
+    """Parse a user's PATH, USER/NAME or USER/NAME@COMMIT in the format of `library`."""
     if Path(path).expanduser().is_dir():
         return Source(place=str(Path(path).expanduser()))
     name, _, revision = path.partition("@")
@@ -128,18 +120,18 @@ def source_of(path: str, library: str = "diffusers") -> Source:
 
 
 def announce(sources: list[Source]) -> None:
-    """Say on stderr, before anything is downloaded, what is fetched and under which terms."""
+    """Print to stderr which weights are downloaded, and under which terms."""
     once = {(source.place, source.revision): source for source in sources if not source.is_local}
     for source in once.values():
         page = f"https://huggingface.co/{source.place}"
-        pinned = f"at {source.revision!r}, which pins nothing: what is fetched may change"
+        pinned = f"at {source.revision!r}, which is not pinned, so the files may change"
         if source.is_pinned:
             pinned = f"at commit {source.revision}"
         print(f"Weights of {page} {pinned}. Terms: {source.terms}.", file=sys.stderr)
 
 
 def needs_diffusers(name: str) -> None:
-    """Raise an InputError that says what to install where one of `PACKAGES` is missing."""
+    """Raise InputError with an install command if one of `PACKAGES` is missing."""
     missing = [package for package in PACKAGES if find_spec(package) is None]
     if missing:
         raise InputError(
@@ -150,13 +142,7 @@ def needs_diffusers(name: str) -> None:
 
 @contextmanager
 def reading(source: Source, setting: str = "weights") -> Iterator[None]:
-    """While the files of `source` are read: nothing is said, and what fails becomes a sentence.
-
-    `setting` of the generator names a folder in its place.
-
-    Raises:
-        InputError: where the files cannot be had, or are not what they should be.
-    """
+    """Silence the libraries and convert failures to InputErrors, which name `setting`."""
     try:
         with silent(source.is_local), few_retries():
             yield
@@ -168,14 +154,11 @@ def reading(source: Source, setting: str = "weights") -> Iterator[None]:
 
 @contextmanager
 def silent(local: bool) -> Iterator[None]:
-    """Nothing of diffusers and transformers but errors, and bars where something is downloaded.
+    """Limit diffusers and transformers to errors, and to progress bars of downloads."""
+    from diffusers.utils import logging as diffusers_logging
+    from transformers.utils import logging as transformers_logging
 
-    What they would warn of is seen to (`complete.py`), or asks for torchvision without need.
-    """
-    from diffusers.utils import logging as of_diffusers
-    from transformers.utils import logging as of_transformers
-
-    logs = (of_diffusers, of_transformers)
+    logs = (diffusers_logging, transformers_logging)
     levels = [log.get_verbosity() for log in logs]
     bars = [log for log in logs if local and log.is_progress_bar_enabled()]
     for log in logs:
@@ -192,7 +175,7 @@ def silent(local: bool) -> Iterator[None]:
 
 
 def cannot_load(source: Source, error: Exception, setting: str) -> InputError:
-    """The sentence for a folder or repository that did not load."""
+    """Create the error for a source that failed to load."""
     page = f"https://huggingface.co/{source.place}"
     if source.is_local:
         way_out = "see that it is complete, as `save_pretrained` writes it"

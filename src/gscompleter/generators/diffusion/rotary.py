@@ -1,8 +1,7 @@
-"""Rotary embeddings that differ from head to head, for the FLUX transformer of diffusers.
+"""Rotary embeddings per attention head, for the FLUX transformer of diffusers.
 
-The heads form four groups, one for each quarter of a token. In a group the first head turns by
-the token's position, the second by that of the quarter, and the others by those of the quarter's
-own four quarters, in equal shares. No parameter is added: published weights fit as they are.
+The heads form four groups, one per quarter of a token. Of six heads in a group, the first uses
+the position of the token, the second that of the quarter, the others those of its own quarters.
 """
 
 from __future__ import annotations
@@ -18,32 +17,26 @@ from gscompleter.generators.diffusion.position_ids import IDS
 THETA = 10_000.0
 """Base of the frequencies, as in FLUX."""
 HEADS = 24
-"""Heads that the scheme is made for: six in a group, on levels 0, 1, 2, 2, 2 and 2."""
+"""Required number of heads: six per group, on levels 0, 1, 2, 2, 2 and 2."""
 TRIPLE_OF_HEAD = tuple(
     triple
     for quarter in range(4)
     for triple in (0, 1 + quarter, *(5 + 4 * quarter + inner for inner in range(4)))
 )
-"""Which of the 21 triples of a token each head turns by."""
+"""Index of each head's position among the 21 of a token."""
 
 
 class PerHeadRotary(nn.Module):
-    """Position ids of tokens -> cosines and sines for each of their heads."""
+    """Conversion of position ids to cosines and sines per head."""
 
     def __init__(self, axes: tuple[int, int, int]) -> None:
-        """`axes` are the channels of a head that z, row and column turn; their sum is its size."""
         super().__init__()
         self.axes = axes
 
     def forward(
         self, ids: Float[Tensor, "tokens numbers"]
     ) -> tuple[Float[Tensor, "b tokens 24 d"], Float[Tensor, "b tokens 24 d"]]:
-        """Cosines and sines; each pair of channels shares an angle.
-
-        Args:
-            ids: The 63 numbers of each token, for one image after the other: the transformer of
-                diffusers hands over a matrix, and has no images in a batch stand elsewhere.
-        """
+        """Compute cosines and sines from the 63 `ids` of each token, image by image."""
         triples = ids.unflatten(-1, (-1, IDS // 3, 3)).transpose(0, 1).double()
         angles = torch.cat(
             [triples[..., axis, None] * self.frequencies(axis, ids) for axis in range(3)], dim=-1
@@ -54,15 +47,15 @@ class PerHeadRotary(nn.Module):
         return cosines[:, :, heads], sines[:, :, heads]
 
     def frequencies(self, axis: int, ids: Tensor) -> Float[Tensor, "pairs"]:
-        """Radians per token for each pair of the axis's channels."""
+        """Compute the radians per token for each channel pair of an axis."""
         channels = torch.arange(0, self.axes[axis], 2, dtype=torch.float64, device=ids.device)
         return 1.0 / THETA ** (channels / self.axes[axis])
 
 
 class PerHeadAttention:
-    """An attention processor for FLUX blocks that turns each head by its own table."""
+    """Attention processor for FLUX blocks with a rotary table per head."""
 
-    # Diffusers calls it with names of its own, and hands over whichever its version knows.
+    # The parameter names are those of diffusers; which it passes depends on its version.
     def __call__(
         self,
         attn: Any,
@@ -71,16 +64,16 @@ class PerHeadAttention:
         attention_mask: Tensor | None = None,
         image_rotary_emb: tuple[Tensor, Tensor] | None = None,
     ) -> Float[Tensor, "b tokens c"] | tuple[Tensor, Tensor]:
-        """Attention of text and image tokens; in single blocks they come as one sequence."""
+        """Attend among text and image tokens; single blocks pass both as one sequence."""
         layers = (attn.to_q, attn.to_k, attn.to_v)
         query, key, value = projected(hidden_states, layers, (attn.norm_q, attn.norm_k))
         if encoder_hidden_states is not None:
             layers = (attn.add_q_proj, attn.add_k_proj, attn.add_v_proj)
             norms = (attn.norm_added_q, attn.norm_added_k)
-            of_text = projected(encoder_hidden_states, layers, norms)
+            text_states = projected(encoder_hidden_states, layers, norms)
             query, key, value = (
                 torch.cat([text, image], dim=1)
-                for text, image in zip(of_text, (query, key, value), strict=True)
+                for text, image in zip(text_states, (query, key, value), strict=True)
             )
         if image_rotary_emb is not None:
             query, key = turned(query, *image_rotary_emb), turned(key, *image_rotary_emb)
@@ -97,7 +90,7 @@ class PerHeadAttention:
 def projected(
     tokens: Float[Tensor, "b n c"], layers: tuple[nn.Module, ...], norms: tuple[nn.Module, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Query, key and value [b, n, heads, d], by a layer each; the first two are normalised."""
+    """Compute query, key and value [b, n, heads, d]; query and key are normalised."""
     query, key, value = (layer(tokens).unflatten(-1, (HEADS, -1)) for layer in layers)
     return norms[0](query), norms[1](key), value
 
@@ -107,18 +100,14 @@ def turned(
     cosines: Float[Tensor, "b n heads d"],
     sines: Float[Tensor, "b n heads d"],
 ) -> Float[Tensor, "b n heads d"]:
-    """`states` with each pair of channels turned by its angle, computed in float32."""
+    """Rotate each pair of channels, in float32."""
     real, imaginary = states.unflatten(-1, (-1, 2)).unbind(-1)
-    quarter_turned = torch.stack([-imaginary, real], dim=-1).flatten(-2)
-    return (states.float() * cosines + quarter_turned.float() * sines).to(states.dtype)
+    quarter_rotated = torch.stack([-imaginary, real], dim=-1).flatten(-2)
+    return (states.float() * cosines + quarter_rotated.float() * sines).to(states.dtype)
 
 
 def with_per_head_positions(transformer: Any) -> Any:
-    """`transformer`, a FluxTransformer2DModel, made to take ids [tokens, b * 63]; its weights stay.
-
-    Raises:
-        ValueError: where it has not 24 heads, which the scheme needs.
-    """
+    """Make a FluxTransformer2DModel of 24 heads accept ids [tokens, b * 63]."""
     heads = transformer.config.num_attention_heads
     if heads != HEADS:
         raise ValueError(f"PE-Field needs a transformer of {HEADS} heads, got {heads}")

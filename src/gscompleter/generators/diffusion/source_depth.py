@@ -1,4 +1,4 @@
-"""Depth of the photograph that PE-Field carries into the target camera: positive everywhere."""
+"""Depth of the photograph for PE-Field, positive everywhere."""
 
 from __future__ import annotations
 
@@ -23,30 +23,27 @@ from gscompleter.generators.smooth import continued
 from gscompleter.types import Render, View
 
 MONOCULAR = "depth-anything/Depth-Anything-V2-Small-hf"
-"""A published model. The authors of PE-Field took MoGe-2, which transformers does not have."""
+"""Published depth model. The authors use MoGe-2, which transformers does not support."""
 METRIC = {"depth_anything": False, "dpt": False, "glpn": True}
-"""Kinds of networks, and whether they give depth rather than its inverse up to scale and shift. The
-configuration of a network may say otherwise."""
+"""Supported kinds of networks, and True for those that predict depth rather than disparity."""
 NEVER_USED = r"fusion_stage\.layers\.0\.residual_layer1\."
-"""Of DPT's first fusion layer, which has nothing to fuse. Some published files lack them."""
+"""Pattern of DPT's unused tensors in the first fusion layer; some files omit them."""
 
 
 @runtime_checkable
 class SourceDepth(Protocol):
-    """A photograph and the scene as its camera sees it -> z-depth in scene units."""
+    """Function from a photograph and the render at its camera to z-depth in scene units."""
 
-    def __call__(self, photograph: View, render: Render) -> Float[Tensor, "h w"]: ...
+    def __call__(self, photograph: View, render: Render) -> Float[Tensor, "h w"]:
+        """Compute z-depth."""
+        ...
 
 
 def context_depth(photograph: View, render: Render) -> Float[Tensor, "h w"]:
-    """Depth of the scene itself, so that the image fits it without any further alignment.
-
-    Where the scene does not cover half of a pixel, the logarithm of the depth is continued
-    smoothly from what surrounds it: next to the border the nearest depths, far from it the mean of
-    all.
+    """Return the depth of the scene, with smooth extrapolation where alpha is below 0.5.
 
     Raises:
-        InputError: where the photograph's camera sees nothing of the scene.
+        InputError: The camera sees nothing of the scene.
     """
     valid = seen(render)
     depth = torch.where(valid, render.depth, torch.ones_like(render.depth)).detach().cpu()
@@ -57,29 +54,26 @@ def context_depth(photograph: View, render: Render) -> Float[Tensor, "h w"]:
 
 
 def seen(render: Render) -> Bool[Tensor, "h w"]:
-    """Where the scene has a depth; an InputError where that is nowhere."""
+    """Return a mask of valid depth; raises InputError if it is empty."""
     valid = render.depth_map().valid & (render.depth > 0)
     if not valid.any():
         raise InputError(
             "The camera nearest to the target sees nothing of the scene, and PE-Field needs its "
-            "depth there; bring a scene that the photographs show, or choose 'warp-inpaint'."
+            "depth there; give a scene that the photographs show, or choose 'warp-inpaint'."
         )
     return valid
 
 
 @dataclass(frozen=True)
 class MonocularDepth:
-    """Depth that a network guesses from the photograph, brought to the unit of the scene."""
+    """Depth of a monocular network, fitted to the scene."""
 
     network: Any
-    """A depth estimation model of transformers."""
     processor: Any
-    """Its image processor."""
     device: str = "cpu"
-    """Where it runs."""
 
     def __call__(self, photograph: View, render: Render) -> Float[Tensor, "h w"]:
-        """Its depth, fitted to that of the scene where it has one; errors as `context_depth`."""
+        """Predict depth and fit it to the scene; raises the errors of `compute_context_depth`."""
         size = (photograph.camera.height, photograph.camera.width)
         pixels = (255 * photograph.image.clamp(0, 1)).round().byte().cpu().numpy()
         inputs = self.processor(images=pixels, return_tensors="pt").to(self.device)
@@ -87,23 +81,22 @@ class MonocularDepth:
             answer = self.network(**inputs)
         found = self.processor.post_process_depth_estimation(answer, target_sizes=[size])
         guess = found[0]["predicted_depth"].float().clone().to(render.depth.device)
-        told = getattr(self.network.config, "depth_estimation_type", None)
-        metric = METRIC[self.network.config.model_type] if told is None else told == "metric"
+        declared = getattr(self.network.config, "depth_estimation_type", None)
+        metric = (
+            METRIC[self.network.config.model_type] if declared is None else declared == "metric"
+        )
         return rescaled(guess, render) if metric else from_disparity(guess, render)
 
 
 def rescaled(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
-    """`guess`, a depth in another unit, by the median ratio to the depth of the scene."""
+    """Scale depth by the median ratio to the depth of the scene."""
     valid = seen(render)
     guess = guess.clamp_min(1e-6 * float(guess.abs().max().clamp_min(1e-12)))
     return guess * (render.depth[valid] / guess[valid]).median()
 
 
 def from_disparity(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
-    """The depth of which `guess` is the inverse up to scale and shift, both fitted to the scene.
-
-    Depths end at ten times the largest of the scene, for a disparity of zero is infinitely far.
-    """
+    """Convert disparity to depth, with scale and shift fitted to the scene."""
     valid = seen(render)
     middle = render.depth[valid].median()
     inverse = middle / render.depth[valid]
@@ -115,12 +108,12 @@ def from_disparity(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor,
 
 
 def deviation(values: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Median distance from the median."""
+    """Compute the median absolute deviation."""
     return (values - values.median()).abs().median()
 
 
 def source_depth_named(name: str, device: str = "cpu") -> SourceDepth:
-    """`context`, `monocular` (the published model), or what `load_monocular` makes of a path."""
+    """Return `context`, `monocular` (the published model), or the model of a path."""
     if name == "context":
         return context_depth
     return load_monocular(MONOCULAR if name == "monocular" else name, device)
@@ -128,11 +121,7 @@ def source_depth_named(name: str, device: str = "cpu") -> SourceDepth:
 
 @lru_cache(maxsize=1)
 def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth:
-    """A depth estimation model of transformers from a folder, USER/NAME or USER/NAME@COMMIT.
-
-    Raises:
-        InputError: where packages are missing or the model cannot be had.
-    """
+    """Load a depth model of transformers from a folder, USER/NAME or USER/NAME@COMMIT."""
     needs_diffusers("pe-field")
     source = source_of(path, "transformers")
     announce([source])
@@ -144,7 +133,7 @@ def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth
     kind = network.config.model_type
     if kind not in METRIC:
         raise InputError(
-            f"The depth network of {path} is a {kind}, of which it is not known whether it gives "
-            f"depth or its inverse; choose one of {', '.join(METRIC)}."
+            f"The depth network of {path} is of the unsupported kind {kind}; choose one of "
+            f"{', '.join(METRIC)}."
         )
     return MonocularDepth(network.eval().to(device), processor, device)

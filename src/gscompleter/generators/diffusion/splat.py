@@ -1,4 +1,4 @@
-"""A photograph thrown into another camera, pixel by pixel, with holes left black."""
+"""Forward splatting of a photograph into another camera; holes stay black."""
 
 from __future__ import annotations
 
@@ -10,14 +10,10 @@ from torch import Tensor
 def forward_splat(
     image: Float[Tensor, "h w c"], pixels: Float[Tensor, "h w 2"], size: tuple[int, int]
 ) -> Float[Tensor, "height width c"]:
-    """Each pixel of `image` at the pixel nearest to where `pixels` (column, row) puts it.
+    """Move each pixel of `image` to the nearest pixel of its position in a target of `size`.
 
-    Several that meet are averaged, whatever their depths, and what lies outside goes to the border.
-
-    Args:
-        image: The photograph.
-        pixels: Where each of its pixels lies in the other image; 0 is the centre of the first.
-        size: Height and width of the other image.
+    Pixels at the same position are averaged regardless of depth; pixels outside move to the border.
+    `pixels` has (column, row), where 0 is the centre of the first.
     """
     h, w = size
     columns = pixels[..., 0].round().clamp(0, w - 1).long()

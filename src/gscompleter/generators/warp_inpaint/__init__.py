@@ -1,9 +1,6 @@
-"""The embedded Φ: warp what the photographs saw into the target, and fill what none of them saw.
+"""The default Φ, without weights: warped photographs, and holes filled with patches.
 
-It needs no weights. Observed pixels come from the photographs through the depth of the scene
-(`warp`), all in one exposure (`harmonize`), and so does what they show where the scene itself is
-empty. The rest takes its tone from a smooth continuation of its border (`smooth`) and, as far as
-the border can tell, its structure from patches of the photographs (`exemplar`).
+The tone of a hole continues its border smoothly; structure near the border comes from patches.
 """
 
 from __future__ import annotations
@@ -28,30 +25,26 @@ from gscompleter.interpolation import smoothed
 from gscompleter.types import Camera, SceneContext, View
 
 STRUCTURE_REACH = 0.15
-"""How far into a hole structure is continued, relative to the longer side of the image; it fades
-out on the second half of the way. Nothing tells what lies deeper, and a wrong guess is worse than
-none."""
+"""Depth of structure in a hole, relative to the longer image side; its second half fades."""
 TONE_RADIUS = 4
-"""Pixels over which a hole keeps the mean colour of its smooth continuation. Patches alone look as
-plausible but drift in tone."""
+"""Radius in pixels over which patches keep the tone of the smooth continuation."""
 CRACK_WIDTH = 4
-"""Gaps of at most this many pixels are closed smoothly: patches have nothing to add there."""
+"""Width in pixels up to which gaps are filled smoothly, without patches."""
 
 
 @dataclass(frozen=True)
 class WarpInpaint:
-    """Φ without weights: depth-aware warp of all photographs, then exemplar-based filling."""
+    """Φ by depth-aware warping of all photographs and exemplar-based filling."""
 
     seed: int = 0
-    """Of the random search for patches; the same seed gives the same bytes."""
 
     def __call__(
         self, nearest: View, target: Camera, context: SceneContext
     ) -> Float[Tensor, "h w 3"]:
-        """The image `target` would take, completely filled, in [0, 1]."""
+        """Synthesize the complete image of `target`, in [0, 1]."""
         warped = warp_photographs(nearest, target, context)
         if not warped.known.any():
-            # Nothing of the scene is in sight: there is no border to continue.
+            # The target observes nothing, so there is no border to continue.
             return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
         warped = with_unexplained(warped, target, context).to("cpu")
         image = self.with_structure(*background_first(warped), warped, context)
@@ -64,7 +57,7 @@ class WarpInpaint:
         warped: Warped,
         context: SceneContext,
     ) -> Float[Tensor, "h w 3"]:
-        """The smoothly completed image `tone`, with structure along the borders of its holes."""
+        """Add structure to the smooth image `tone` along the borders of its holes."""
         reach = STRUCTURE_REACH * max(warped.known.shape)
         away = distance_to_known(warped.known)
         undecided = without_cracks(~warped.known, CRACK_WIDTH) & (away <= reach)
@@ -79,7 +72,7 @@ class WarpInpaint:
 
 
 def without_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]:
-    """The parts of `hole` that are wider than `width` pixels. The image's border is no limit."""
+    """Keep the parts of `hole` wider than `width` pixels; the image border is no limit."""
     kernel = np.ones((width + 1, width + 1), np.uint8)
     padded = np.pad(hole.numpy().astype(np.uint8), width + 1, mode="edge")
     opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, kernel)
@@ -88,7 +81,7 @@ def without_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]
 
 
 def sources_of(context: SceneContext, warped: Warped) -> Sources:
-    """All photographs in one exposure, and what is known of the target itself."""
+    """Collect patch sources: photographs of equal exposure, and the known target pixels."""
     photographs = [
         (gain * view.image.cpu()).clamp(0, 1)
         for view, gain in zip(context.views, warped.gains, strict=True)

@@ -1,5 +1,8 @@
-"""Fill a hole with patches of the photographs, coarse to fine (Wexler et al., Space-Time Video
-Completion, 2007; Barnes et al., PatchMatch, 2009; Darabi et al., Image Melding, 2012)."""
+"""Coarse-to-fine hole filling with patches of the photographs.
+
+After Wexler et al. (2007), Barnes et al. (PatchMatch, 2009) and Darabi et al. (Image Melding,
+2012).
+"""
 
 from __future__ import annotations
 
@@ -21,38 +24,34 @@ from gscompleter.kernels.patchmatch import RADIUS, SIDE
 from gscompleter.masks import dilate
 
 MAX_BIAS = 0.1
-"""Largest shift of a patch's colour channel, in units of the colour."""
+"""Largest colour shift of a patch per channel."""
 BIAS_PENALTY = 0.3
-"""Cost of a squared shift, relative to a squared difference of colour."""
+"""Cost of a squared shift relative to a squared colour difference."""
 DEPTH_PENALTY = 0.02
-"""Cost of taking from a surface before the expected depth, per squared log-depth."""
+"""Cost per squared log-depth of a source in front of the expected depth."""
 DISTANCE_PENALTY = 0.002
-"""Cost of taking from the other end of the image."""
+"""Cost of a source at the other end of the image."""
 FEWEST_ROUNDS = 2
-"""Rounds of search and vote on the finest level."""
+"""Iterations of search and vote on the finest level."""
 MOST_ROUNDS = 10
-"""Rounds on the coarsest level, where they cost little. Sharp votes need more of them to agree."""
+"""Iterations on the coarsest level; sharp votes need more to agree."""
 COARSEST_PASSES, FINER_PASSES = 2, 1
-"""How often a round looks through the hole: there and back where nothing is known yet, once where
-the coarser level has found about the place."""
+"""Search passes per iteration, on the coarsest level and on finer ones."""
 VOTE_SHARPNESS = 8
-"""How sharply votes fall with their costs. At 1, patches that disagree are averaged, and so is
-their detail: of 24 real holes the median gradient energy is 0.27 of the photograph's, at 8 it is
-0.35, at 0.08 dB less."""
+"""Decay of a vote with its cost; at 1, averaged patches lose a quarter of their detail."""
 LEAST_LIKELY = 1e-6
-"""Of a vote. Where all that there are cost much, they count alike."""
+"""Smallest weight of a vote."""
 CONFIDENCE = 0.85
-"""Factor of the weight of an unknown pixel per pixel from the border of the hole."""
+"""Weight factor of an unknown pixel per pixel from the border of the hole."""
 MIN_SIZE = 80
-"""Shorter side, in pixels, under which the pyramid stops. Coarser levels would invent large
-structures, which are seldom the true ones; over real cases they cost 0.3 dB."""
+"""Shorter side of the coarsest level, in pixels; coarser ones cost 0.3 dB."""
 FINE_REACH = 8
-"""Pixels within which the random search looks around what the coarser level found."""
+"""Radius in pixels of the random search around a match of the coarser level."""
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Images to take patches from, padded to one size."""
+    """Images to copy patches from, padded to one size."""
 
     images: Float[Tensor, "s h w 3"]
     valid: Bool[Tensor, "s h w"]
@@ -64,14 +63,14 @@ class Sources:
         valid: list[Bool[Tensor, "_ _"]],
         depths: list[Float[Tensor, "_ _"]],
     ) -> Sources:
-        """Images of any sizes as sources; depth in scene units, 0 where unknown."""
+        """Stack images of any size; depth is in scene units, 0 if unknown."""
         h, w = (max(image.shape[axis] for image in images) for axis in (0, 1))
 
         def padded(values: Tensor) -> Tensor:
             below, right = h - values.shape[0], w - values.shape[1]
             return pad(values, ((0, 0) * (values.dim() - 2)) + (0, right, 0, below))
 
-        # A surface of unknown depth counts as far away, which costs nothing.
+        # Unknown depth counts as far away, which costs nothing.
         farthest = max(depth.max().item() for depth in depths)
         logs = [torch.where(d > 0, d, farthest).clamp_min(1e-30).log() for d in depths]
         return Sources(
@@ -83,7 +82,7 @@ class Sources:
 
 @dataclass(frozen=True)
 class Level:
-    """The image, what is known of it, the log-depth it should have, and sources of its scale."""
+    """One pyramid level: image, known pixels, expected log-depth and sources."""
 
     image: Float[Tensor, "h w 3"]
     known: Bool[Tensor, "h w"]
@@ -92,9 +91,9 @@ class Level:
 
 
 Field = Int64[ndarray, "h w 3"]
-"""For each pixel near the hole the source, row and column of the patch that matches; -1 else."""
+"""Source, row and column of the matching patch per pixel near the hole; -1 elsewhere."""
 CoarseField = Int64[ndarray, "coarse_h coarse_w 3"]
-"""The field of the next coarser level."""
+"""Field of the next coarser level."""
 
 
 def fill_by_patches(
@@ -104,14 +103,10 @@ def fill_by_patches(
     sources: Sources,
     seed: int,
 ) -> Float[Tensor, "h w 3"]:
-    """`image` with what is not `known` made of patches of `sources`.
+    """Fill the unknown pixels of `image` with patches of `sources`.
 
-    Args:
-        image: Colours; where not known, a first guess of the tone.
-        known: Which pixels are to stay.
-        expected: Logarithm of the depth that each pixel should have; nearer sources cost.
-        sources: Where patches come from.
-        seed: Of the random search.
+    Unknown pixels of `image` hold a first guess of the tone. `expected` is the expected log-depth;
+    nearer sources cost more.
     """
     levels = [Level(image, known, expected, sources)]
     while min(levels[-1].known.shape) // 2 >= MIN_SIZE:
@@ -127,10 +122,7 @@ def fill_by_patches(
 def solve(
     level: Level, coarse_field: CoarseField | None, rounds: int, seed: int
 ) -> tuple[Float[Tensor, "h w 3"], Field | None]:
-    """Alternate between the best patches for the image and the image these patches vote for.
-
-    It begins with the first guess, or with what the field of the coarser level votes for.
-    """
+    """Alternate between searching the best patches and voting for the image."""
     h, w = level.known.shape
     known = level.known.numpy()
     usable = usable_centres(level.sources.valid)
@@ -148,7 +140,7 @@ def solve(
     log_depth = np.ascontiguousarray(level.sources.log_depth.numpy())
     frame = patchmatch.framed(np.repeat(weight[..., None], 3, axis=-1))
     total = cv2.boxFilter(weight, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    asked = (total[near_hole], queries, query_at, level.expected.numpy()[near_hole])
+    target = (total[near_hole], queries, query_at, level.expected.numpy()[near_hole])
     costs = costs_in(usable.shape[1:])
 
     def voted() -> Float32[ndarray, "p 3"]:
@@ -162,7 +154,7 @@ def solve(
         reach, passes = FINE_REACH, FINER_PASSES
     for number in range(rounds):
         matched = patchmatch.Matched(
-            patchmatch.framed(current), frame, *asked, images, usable, log_depth
+            patchmatch.framed(current), frame, *target, images, usable, log_depth
         )
         cost, shift = patchmatch.search(matched, costs, matches, passes, reach, seed + 31 * number)
         votes = weight[near_hole] * likelihood(cost)
@@ -173,26 +165,26 @@ def solve(
 
 
 def likelihood(cost: Float32[ndarray, "q"]) -> Float32[ndarray, "q"]:
-    """How much the vote of a patch counts by what it costs (Wexler et al. 2007, Sec. 3.2)."""
+    """Convert costs to vote weights (Wexler et al. 2007, Sec. 3.2)."""
     usual = max(float(np.percentile(cost, 75)), 1e-6)
     likely = np.exp(-VOTE_SHARPNESS * cost / (2 * usual))
     return np.maximum(likely, LEAST_LIKELY).astype(np.float32)
 
 
 def trust(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]:
-    """How much a pixel counts when patches are compared: less, the deeper it lies in the hole."""
+    """Compute pixel weights for patch comparison, falling with the depth in the hole."""
     away = distance_to_known(known).numpy()
     return np.where(known, 1.0, np.maximum(CONFIDENCE**away, 0.05)).astype(np.float32)
 
 
 def costs_in(size: Sequence[int]) -> patchmatch.Costs:
-    """What matches cost in images of a size (height, width)."""
+    """Set up the matching costs for images of a size (height, width)."""
     weights = MAX_BIAS, BIAS_PENALTY, DEPTH_PENALTY, DISTANCE_PENALTY, math.hypot(*size)
     return patchmatch.Costs(*map(np.float32, weights))
 
 
 def usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
-    """Pixels around which a whole patch is valid; beyond the border nothing is."""
+    """Mark the pixels whose whole patch is valid and inside the image."""
     lacking = pad(~valid, (RADIUS,) * 4, value=True)
     inner = slice(RADIUS, -RADIUS)
     return np.stack([~dilate(v, RADIUS)[inner, inner].numpy() for v in lacking])
@@ -204,11 +196,7 @@ def initial_matches(
     usable: Bool[ndarray, "s source_h source_w"],
     seed: int,
 ) -> Int64[ndarray, "q 3"]:
-    """The matches of the coarser level at twice their place; where it has none, what is nearest.
-
-    Nearest in the last source, which is what is known of the image itself; at random where it has
-    no whole patch.
-    """
+    """Initialize matches from the coarse level, the nearest known patch, or at random."""
     own = len(usable) - 1
     if usable[own].any():
         places = nearest_places(usable[own])[queries[:, 0], queries[:, 1]]
@@ -231,7 +219,7 @@ def initial_matches(
 
 
 def nearest_places(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
-    """Row and column of the nearest pixel of `mask`, for every pixel."""
+    """Find row and column of the nearest pixel of `mask`, for every pixel."""
     _, labels = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -242,7 +230,7 @@ def nearest_places(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
 
 
 def halved(level: Level) -> Level:
-    """The level at half the size; averages leave out what is unknown."""
+    """Halve a level; averages leave out unknown pixels."""
     known = level.known.float()[..., None]
     share = pooled(known)
     guess = pooled(level.image * (1 - known)) / (1 - share).clamp_min(1e-6)
@@ -261,7 +249,7 @@ def halved(level: Level) -> Level:
 
 
 def pooled(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:
-    """Means of 2 x 2 pixels."""
+    """Average 2 x 2 pixels."""
     channels_first = values.movedim(-1, -3)
     flat = channels_first.reshape(-1, *channels_first.shape[-3:]).contiguous()
     means = avg_pool2d(flat, 2, ceil_mode=True, count_include_pad=False)

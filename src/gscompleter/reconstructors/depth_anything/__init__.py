@@ -1,7 +1,6 @@
-"""Ψ with weights: Depth Anything 3, a transformer that looks at any number of views.
+"""Depth Anything 3 as a reconstructor Ψ: a transformer for any number of views.
 
-The code is our own, written from a description of the model; the modules are named as in the
-authors' files, so that these load without renaming.
+The code is our own. Module names follow the authors' files, so that these load unchanged.
 """
 
 from gscompleter.reconstructors.depth_anything.config import (

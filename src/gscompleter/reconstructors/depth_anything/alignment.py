@@ -1,5 +1,4 @@
-"""The similarity between two sets of camera centres (Umeyama 1991), from most of them where there
-are many."""
+"""Alignment of two sets of camera centres by a similarity (Umeyama 1991), with RANSAC."""
 
 from __future__ import annotations
 
@@ -13,40 +12,35 @@ from gscompleter.errors import InputError
 Points = Float[np.ndarray, "n 3"]
 
 MANY = 10
-"""Cameras from which on a minority of wrong ones is left out (RANSAC)."""
+"""Smallest number of cameras for which RANSAC rejects outliers."""
 DRAWS = 10
-"""Random halves of the cameras that are tried."""
+"""Number of random samples, each of half of the cameras."""
 SEED = 42
-"""Of these draws, as the authors have it."""
+"""Seed of the samples, as in the authors' code."""
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """`x' = scale * rotation @ x + shift`."""
+    """The transform `x' = scale * rotation @ x + shift`."""
 
     scale: float
     rotation: Float[np.ndarray, "3 3"]
     shift: Float[np.ndarray, "3"]
 
     def __call__(self, points: Points) -> Points:
+        """Transform points."""
         return self.scale * points @ self.rotation.T + self.shift
 
 
 def similarity_between(given: Points, found: Points) -> Similarity:
-    """The one that leads from `given` to `found` with the least squared error.
-
-    Of points on one line, as any two are, the turn about that line is arbitrary; the scale is not.
-
-    Raises:
-        InputError: where all of `given` are one point.
-    """
+    """Fit the similarity from `given` to `found` by least squares; it needs two distinct points."""
     x, y = given.astype(np.float64), found.astype(np.float64)
     middle_x, middle_y = x.mean(0), y.mean(0)
     x, y = x - middle_x, y - middle_y
     spread = (x**2).sum(1).mean()
     if not spread > 0:
         raise InputError(
-            f"All {len(x)} cameras stand in one place, which tells no scale; give photographs "
+            f"All {len(x)} cameras stand in one place, so the scale is unknown; give photographs "
             "taken from different positions."
         )
     u, values, v = np.linalg.svd(y.T @ x / len(x))
@@ -57,11 +51,7 @@ def similarity_between(given: Points, found: Points) -> Similarity:
 
 
 def similarity_of_most(given: Points, found: Points) -> Similarity:
-    """The same, of ten points and more from those that agree best with a random half of all.
-
-    Raises:
-        InputError: where all of `given` are one point.
-    """
+    """Fit a similarity, with RANSAC from ten points on."""
     every = similarity_between(given, found)
     if len(given) < MANY:
         return every
@@ -82,12 +72,12 @@ def similarity_of_most(given: Points, found: Points) -> Similarity:
 
 
 def halves(count: int) -> list[Int[np.ndarray, "_"]]:
-    """Random choices of half of `count` points."""
+    """Sample random halves of `count` points."""
     generator = np.random.default_rng(SEED)
     size = max(3, (count + 1) // 2)
     return [generator.choice(count, size, replace=False) for _ in range(DRAWS)]
 
 
 def distances_to_nearest(points: Points, others: Points) -> Float[np.ndarray, "n"]:
-    """How far each point lies from the nearest of the others."""
+    """Measure the distance from each point to the nearest of the others."""
     return np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)

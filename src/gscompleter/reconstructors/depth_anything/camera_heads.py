@@ -1,4 +1,4 @@
-"""Between cameras and tokens of the transformer."""
+"""Conversion between cameras and transformer tokens."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from gscompleter.reconstructors.depth_anything.vit import Block
 from gscompleter.reconstructors.feed_forward.dino import Attention, Mlp
 
 HEADS = 16
-"""Heads of the attention among cameras, whatever the size of the network."""
+"""Number of attention heads of the camera encoder, for all network sizes."""
 LAYERS = 4
-"""Layers of the transformer over cameras."""
+"""Number of layers of the camera encoder."""
 
 
 class PoseBranch(nn.Module):
-    """Nine numbers of a camera as a token."""
+    """Two linear layers from nine camera parameters to a token."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -25,11 +25,12 @@ class PoseBranch(nn.Module):
         self.fc2 = nn.Linear(channels // 2, channels)
 
     def forward(self, numbers: Float[Tensor, "b v 9"]) -> Float[Tensor, "b v c"]:
+        """Apply both layers."""
         return self.fc2(F.gelu(self.fc1(numbers)))
 
 
 class CameraEncoder(nn.Module):
-    """A token for each camera, which knows of the others of its scene."""
+    """Transformer that encodes the cameras of a scene as tokens."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -44,12 +45,12 @@ class CameraEncoder(nn.Module):
         self.trunk_norm = nn.LayerNorm(channels)
 
     def forward(self, numbers: Float[Tensor, "b v 9"]) -> Float[Tensor, "b v c"]:
-        """From `encoded` cameras."""
+        """Encode parameters from `encode_poses`."""
         return self.trunk_norm(self.trunk(self.token_norm(self.pose_branch(numbers))))
 
 
 class CameraDecoder(nn.Module):
-    """The camera that a token tells."""
+    """Layers that predict a camera from its token."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -61,6 +62,6 @@ class CameraDecoder(nn.Module):
         self.fc_fov = nn.Sequential(nn.Linear(channels, 2), nn.ReLU())
 
     def forward(self, tokens: Float[Tensor, "b v c"]) -> Float[Tensor, "b v 9"]:
-        """Cameras to be `decoded`; their quaternions have any length."""
+        """Predict parameters for `decode_poses`; quaternions are not normalised."""
         x = self.backbone(tokens)
         return torch.cat([self.fc_t(x), self.fc_qvec(x), self.fc_fov(x)], dim=-1)

@@ -1,4 +1,4 @@
-"""What the sizes of Depth Anything 3 differ in."""
+"""Sizes of the Depth Anything 3 networks."""
 
 from __future__ import annotations
 
@@ -10,47 +10,45 @@ from gscompleter.reconstructors.feed_forward.dino import PATCH
 
 @dataclass(frozen=True)
 class VitConfig:
-    """A vision transformer."""
+    """Size of the vision transformer."""
 
     channels: int = 384
     heads: int = 6
     blocks: int = 12
     outputs: tuple[int, int, int, int] = (5, 7, 9, 11)
-    """Blocks after which tokens are handed on, from 0 on."""
+    """Indices of the blocks that output tokens."""
     alternates_from: int | None = 4
-    """The first block that knows of other views; None where each view is seen alone."""
+    """Index of the first multi-view block, or None for a network of single views."""
     gated: bool = False
-    """Whether the layers between are gated (SwiGLU)."""
+    """Use SwiGLU in the MLPs."""
 
     @property
     def described(self) -> int:
-        """Channels of what is handed on of each patch."""
+        """Number of output channels per patch."""
         return self.channels if self.alternates_from is None else 2 * self.channels
 
 
 @dataclass(frozen=True)
 class DepthAnythingConfig:
-    """Any number of views, with or without poses."""
+    """Size of a network for any number of views, with or without poses."""
 
     vit: VitConfig = VitConfig()
     features: int = 64
-    """Channels of the fused maps."""
     widths: tuple[int, int, int, int] = (48, 96, 192, 384)
     """Channels of the four levels, finest first."""
     gaussians: bool = False
-    """Whether there is a head for Gaussians."""
     image_size: tuple[int, int] = (504, 504)
-    """Height and width it was trained at, in pixels; the longer side matters."""
+    """Height and width of the training images, in pixels; the longer side is relevant."""
 
     @property
     def patch(self) -> int:
-        """Sides of the images must be multiples of it, in pixels."""
+        """Side lengths of the images must be multiples of this, in pixels."""
         return PATCH
 
 
 @dataclass(frozen=True)
 class MetricDepthConfig:
-    """One view at a time, depth in metres."""
+    """Size of the network for metric depth of single views."""
 
     vit: VitConfig = VitConfig(1024, 16, 24, (4, 11, 17, 23), None)
     features: int = 256
@@ -60,13 +58,14 @@ class MetricDepthConfig:
 
 @dataclass(frozen=True)
 class NestedConfig:
-    """Any number of views, in metres."""
+    """Sizes of both networks of a nested one."""
 
     any_view: DepthAnythingConfig
     metric: MetricDepthConfig = MetricDepthConfig()
 
     @property
     def image_size(self) -> tuple[int, int]:
+        """Height and width of the training images, in pixels."""
         return self.any_view.image_size
 
 
@@ -83,4 +82,4 @@ VARIANTS: Mapping[str, DepthAnythingConfig | MetricDepthConfig | NestedConfig] =
     "da3-metric-large": MetricDepthConfig(),
     "da3-nested-giant-large": NestedConfig(GIANT),
 }
-"""The published ones."""
+"""Published variants by name."""

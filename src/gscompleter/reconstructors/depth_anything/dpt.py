@@ -1,4 +1,4 @@
-"""What the heads have in common: four maps of patches, fused to a map of the image (DPT)."""
+"""The common part of the heads: fusion of four patch maps to image resolution (DPT)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,15 @@ from gscompleter.reconstructors.feed_forward.dpt import Scratch, projections, re
 HIDDEN = 32
 """Channels before the last convolution of a head."""
 CODE_WEIGHT = 0.1
-"""Weight of the code that tells a map's pixels where they lie."""
+"""Weight of the position encoding of maps."""
 CODE_BASE = 100.0
-"""The slowest wave of the code is almost this many times longer than the fastest."""
+"""Approximate ratio of the longest to the shortest wavelength of the position encoding."""
 
 
 class Dpt(nn.Module):
-    """Tokens of four blocks as maps at 4, 2, 1 and 1/2 times the resolution of the patches."""
+    """Conversion of tokens to maps at 4, 2, 1 and 1/2 times the patch resolution."""
 
     def __init__(self, channels: int, widths: Sequence[int], coded: bool) -> None:
-        """
-        Args:
-            channels: Of the tokens.
-            widths: Channels of the four levels, finest first.
-            coded: Whether each level is told where its pixels lie.
-        """
         super().__init__()
         self.coded = coded
         self.projects = projections(channels, widths)
@@ -37,7 +31,7 @@ class Dpt(nn.Module):
     def pyramid(
         self, tokens: Sequence[Tokens], rows: int, columns: int
     ) -> list[Float[Tensor, "n _ _ _"]]:
-        """A map for each level, finest first, of all n = b v views."""
+        """Compute the map of each level, finest first, for n = b v views."""
         maps = []
         for given, project, resize in zip(tokens, self.projects, self.resize_layers, strict=True):
             patches = self.normed(given.patches).flatten(0, 1).transpose(1, 2)
@@ -46,12 +40,12 @@ class Dpt(nn.Module):
         return maps
 
     def normed(self, patches: Float[Tensor, "b v p c"]) -> Float[Tensor, "b v p c"]:
-        """The patches as they come; a head may normalise them."""
+        """Return the patches unchanged; a subclass may normalise them."""
         return patches
 
 
 class ImageScratch(Scratch):
-    """Fuses the levels, and ends in two convolutions at the resolution of the image."""
+    """Fusion of the levels, followed by two convolutions at image resolution."""
 
     def __init__(self, widths: Sequence[int], features: int, out: int) -> None:
         super().__init__(widths, features, None)
@@ -60,18 +54,12 @@ class ImageScratch(Scratch):
 
 
 def last_convolutions(channels: int, out: int) -> nn.Sequential:
-    """From the fused map to what a head tells."""
+    """Create the output layers of a head."""
     return nn.Sequential(nn.Conv2d(channels, HIDDEN, 3, 1, 1), nn.ReLU(), nn.Conv2d(HIDDEN, out, 1))
 
 
 def with_position(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:
-    """A map with waves over its columns added to the first half of its channels, and waves over
-    its rows to the second.
-
-    Args:
-        x: The map.
-        aspect: Width of the image over its height.
-    """
+    """Encode columns in the first half of the channels and rows in the second."""
     c, h, w = x.shape[1:]
     diagonal = (aspect**2 + 1) ** 0.5
     across = waves(places(w, aspect / diagonal, x.device), c // 4)[:, None, :].expand(-1, h, -1)
@@ -80,13 +68,13 @@ def with_position(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "
 
 
 def places(count: int, extent: float, device: torch.device) -> Float[Tensor, "count"]:
-    """Centres of `count` cells between -extent and extent."""
+    """Compute the centres of `count` cells between -extent and extent."""
     last = extent * (count - 1) / count
     return torch.linspace(-last, last, count, device=device)
 
 
 def waves(at: Float[Tensor, "m"], count: int) -> Float[Tensor, "k m"]:
-    """`count` sines of falling frequency at some places, then their cosines."""
+    """Compute `count` sines of decreasing frequency, then their cosines."""
     k = torch.arange(count, device=at.device, dtype=torch.float64)
     angles = (CODE_BASE ** (-k / count))[:, None] * at.double()
     return torch.cat([angles.sin(), angles.cos()]).to(at.dtype)

@@ -1,4 +1,4 @@
-"""The head for Gaussians, and from its raw channels to Gaussians in the frame of its cameras."""
+"""The Gaussian head, and conversion of its output to Gaussians in the frame of its cameras."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussi
 from gscompleter.reconstructors.feed_forward.resampling import resized
 
 SH = 9
-"""Harmonics of a colour (degree 2)."""
+"""SH coefficients per colour (degree 2)."""
 CHANNELS = (2, 3, 4, 3 * SH, 1, 1)
-"""Offset, scale, rotation, harmonics, offset of the depth, opacity."""
+"""Channels of offset, scale, rotation, SH, depth offset, opacity."""
 SCALES = (1e-5, 30.0)
-"""Smallest and largest standard deviation, in tenths of what a pixel covers both ways."""
+"""Smallest and largest standard deviation, in tenths of the sum of pixel width and height."""
 
 
 def merged_images(features: int) -> nn.Sequential:
-    """Layers that add the image itself to what the transformer saw of it."""
+    """Create the layers that add image features to the fused map."""
     widths = pairwise([3, features // 8, features // 4, features // 2])
     layers = [(nn.Conv2d(a, b, 3, 1, 1), nn.GELU()) for a, b in widths]
     return nn.Sequential(*chain.from_iterable(layers))
 
 
 class GaussianDpt(Dpt):
-    """Raw channels of a Gaussian for each pixel."""
+    """Head for the raw Gaussian channels of each pixel."""
 
     scratch: ImageScratch
 
@@ -47,7 +47,7 @@ class GaussianDpt(Dpt):
     def forward(
         self, tokens: Sequence[Tokens], images: Float[Tensor, "b v 3 h w"]
     ) -> Float[Tensor, "b v h w c"]:
-        """From tokens and normalised images."""
+        """Predict raw channels from tokens and normalised images."""
         size = (images.shape[3], images.shape[4])
         pyramid = self.pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
         x = resized(self.scratch.output_conv1(self.scratch(pyramid)), size)
@@ -62,9 +62,9 @@ def gaussians_from(
     poses: Poses,
     factors: Float[Tensor, "b"],
 ) -> PixelGaussians:
-    """Gaussians in the frame of `poses`, whose centres and depths are multiplied by `factors`.
+    """Create Gaussians in the frame of `poses`, with centres and depths multiplied by `factors`.
 
-    The head has learnt with predicted cameras and with z-depth taken for the length of the ray.
+    As in training, the predicted z-depth is used as distance along the ray.
     """
     offset, scale, rotation, sh, closer, opacity = raw.split(CHANNELS, dim=-1)
     factor = factors[:, None, None, None]
@@ -85,7 +85,7 @@ def gaussians_from(
 def z_rays(
     offsets: Float[Tensor, "b v h w 2"], K: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w 3"]:
-    """Directions in camera axes through a point of each pixel, `offsets` pixels off its centre."""
+    """Compute directions in camera axes, `offsets` pixels from each pixel centre."""
     h, w = offsets.shape[2:4]
     x = torch.arange(w, device=offsets.device) + 0.5
     y = torch.arange(h, device=offsets.device) + 0.5
@@ -97,7 +97,7 @@ def z_rays(
 def sizes(
     scale: Float[Tensor, "b v h w 3"], K: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w 3"]:
-    """Standard deviations at a distance of 1."""
+    """Compute standard deviations at a distance of 1."""
     low, high = SCALES
     pixel = 0.1 * (1 / K[..., 0, 0] + 1 / K[..., 1, 1])
     return (low + (high - low) * scale.sigmoid()) * pixel[..., None, None, None]
@@ -106,13 +106,11 @@ def sizes(
 def turned_quats(
     raw: Float[Tensor, "b v h w 4"], turns: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w 4"]:
-    """wxyz quaternions of Gaussians whose cameras are turned.
+    """Rotate Gaussians with their cameras; returns wxyz quaternions.
 
-    Raw ones are xyzw. The authors' code changes them to wxyz, turns them as if they were xyzw
-    still, and shows the result as wxyz. For a camera that is not turned that is right; for others
-    it is no rotation of the Gaussian, but the published weights were trained with it.
+    As in training, quaternions are reordered to wxyz but rotated as if they were xyzw.
     """
     x, y, z, w = F.normalize(raw, dim=-1, eps=1e-8).unbind(-1)
-    taken = torch.stack([z, w, x, y], dim=-1)  # (w, x, y, z) read as xyzw, in our order
-    turned = quats_product(quats_from(turns)[:, :, None, None], taken)
-    return torch.where(turned[..., :1] < 0, -turned, turned).roll(-1, -1)
+    misread = torch.stack([z, w, x, y], dim=-1)  # (w, x, y, z) misread as xyzw, in our order
+    rotated = quats_product(quats_from(turns)[:, :, None, None], misread)
+    return torch.where(rotated[..., :1] < 0, -rotated, rotated).roll(-1, -1)

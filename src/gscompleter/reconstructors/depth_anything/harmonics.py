@@ -1,4 +1,4 @@
-"""How the Gaussian head turns view-dependent colour: as the basis of 3DGS asks for."""
+"""Rotation of spherical harmonics (SH) in the basis of 3DGS."""
 
 from __future__ import annotations
 
@@ -11,23 +11,19 @@ from torch import Tensor
 from gscompleter.reconstructors.feed_forward.spherical_harmonics import rotate_sh
 
 POLE = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-"""From the axes of e3nn, whose harmonics have their pole along y, to those of 3DGS, whose have it
-along z."""
+"""Permutation of the axes of e3nn (pole along y) to those of 3DGS (pole along z)."""
 
 
 def turned_harmonics(
     sh: Float[Tensor, "b v h w k 3"], turns: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w k 3"]:
-    """Harmonics of 3DGS once what they colour is turned: `Y(R d) sh' = Y(d) sh` for all d.
-
-    They are those of e3nn in other axes, with the sign of odd orders changed.
-    """
+    """Rotate SH of 3DGS such that `Y(R d) sh' = Y(d) sh` for all directions d."""
     pole, signs = turns.new_tensor(POLE), signs_of_orders(sh)
     return signs * rotate_sh(signs * sh, pole.T @ turns @ pole)
 
 
 def signs_of_orders(sh: Float[Tensor, "*n k 3"]) -> Float[Tensor, "k 1"]:
-    """-1 for harmonics of odd order, 1 for the others."""
+    """Return -1 for SH of odd order, 1 for the others."""
     degrees = range(isqrt(sh.shape[-2]))
     orders = [order for degree in degrees for order in range(-degree, degree + 1)]
     return torch.tensor([(-1.0) ** order for order in orders]).to(sh)[:, None]

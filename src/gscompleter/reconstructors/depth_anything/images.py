@@ -1,4 +1,4 @@
-"""Photographs as the networks take them: resized to whole patches, and normalised."""
+"""Resizing and normalisation of photographs for the networks."""
 
 from __future__ import annotations
 
@@ -12,40 +12,39 @@ from torch import Tensor
 from gscompleter.reconstructors.feed_forward.dino import PATCH
 
 MEAN = (0.485, 0.456, 0.406)
-"""Mean colour of the images that the transformer was trained on."""
+"""Mean colour of the training images."""
 DEVIATION = (0.229, 0.224, 0.225)
-"""Standard deviation of their colours."""
+"""Standard deviation of the training colours."""
 
 Image = UInt8[np.ndarray, "_ _ 3"]
 Side = Literal["longer", "shorter"]
-"""The side of a photograph that gets a certain length."""
+"""Side of a photograph that is scaled to a given length."""
 Fit = Literal["resized", "cropped"]
-"""How a photograph gets whole patches then."""
+"""Method to obtain whole patches."""
 
 
 def normalised_images(images: UInt8[Tensor, "*n h w 3"]) -> Float[Tensor, "*n 3 h w"]:
-    """Colours about their mean, channels first."""
+    """Normalise colours and move channels first."""
     colours = images.float() / 255
-    normed = (colours - colours.new_tensor(MEAN)) / colours.new_tensor(DEVIATION)
-    return normed.movedim(-1, -3)
+    normalized = (colours - colours.new_tensor(MEAN)) / colours.new_tensor(DEVIATION)
+    return normalized.movedim(-1, -3)
 
 
 def scaled_to(image: Image, resolution: int, side: Side) -> Image:
-    """`image` with a longer or shorter side of `resolution` pixels."""
+    """Scale the longer or shorter side of `image` to `resolution` pixels."""
     h, w = image.shape[:2]
     factor = resolution / (max(h, w) if side == "longer" else min(h, w))
     return resized_to(image, max(1, round(h * factor)), max(1, round(w * factor)))
 
 
 def whole_patches(side: int, fit: Fit) -> int:
-    """Pixels of whole patches that are resized from `side` pixels, as many as come nearest (of two
-    numbers the larger), or cut out of them; one patch at least."""
+    """Round `side` to whole patches: to the nearest if resized (ties up), down if cropped."""
     patches = (2 * side + PATCH) // (2 * PATCH) if fit == "resized" else side // PATCH
     return max(1, patches) * PATCH
 
 
 def resized_to(image: Image, height: int, width: int) -> Image:
-    """Bicubic where a side grows, else the mean over the area of each pixel."""
+    """Resize an image, bicubically if a side grows, else by area averaging."""
     h, w = image.shape[:2]
     if (h, w) == (height, width):
         return image

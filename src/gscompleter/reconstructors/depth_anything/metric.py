@@ -1,4 +1,4 @@
-"""The metric network: the depth of one view in metres, and where the sky is."""
+"""The metric network: depth in metres and sky of single views."""
 
 from __future__ import annotations
 
@@ -17,37 +17,36 @@ from gscompleter.reconstructors.feed_forward.dino import PATCH
 from gscompleter.reconstructors.feed_forward.resampling import resized
 
 FOCAL = 300.0
-"""Focal length, in pixels, of the camera whose metres the network tells."""
+"""Focal length in pixels for which the network predicts metres."""
 MAX_SKY = 0.3
-"""What the network says of the sky, under which a pixel is none."""
+"""Largest sky output of a pixel that does not count as sky."""
 MIN_PIXELS = 10
-"""There is a sky, and something before it, where more pixels than this show each."""
+"""Sky and foreground need more pixels than this to be considered."""
 FAR_QUANTILE = 0.99
-"""Share of what is no sky that lies nearer than the sky is put."""
+"""Quantile of the foreground depth at which the sky is placed."""
 
 
 @dataclass(frozen=True)
 class MetricDepth:
-    """What the network makes of views."""
+    """Depth and sky of a batch of views."""
 
     depth: Float[Tensor, "b v h w"]
-    """z-depth in metres, for a focal length of 300 pixels; not known of the sky."""
+    """z-depth in metres at a focal length of 300 pixels; undefined in the sky."""
     sky: Float[Tensor, "b v h w"]
-    """How much the pixel looks like the sky, from 0 upwards."""
 
     @property
     def solid(self) -> Bool[Tensor, "b v h w"]:
-        """Where there is no sky."""
+        """True outside the sky."""
         return self.sky < MAX_SKY
 
     def in_metres(self, K: Float[Tensor, "b v 3 3"]) -> Float[Tensor, "b v h w"]:
-        """z-depth in metres as cameras of these intrinsics, in pixels, see it."""
+        """Compute z-depth in metres for intrinsics in pixels."""
         focal = (K[..., 0, 0] + K[..., 1, 1]) / 2
         return self.depth * (focal / FOCAL)[..., None, None]
 
 
 class SkyScratch(ImageScratch):
-    """Ends in depth and in sky."""
+    """Fusion with outputs for depth and sky."""
 
     def __init__(self, widths: Sequence[int], features: int) -> None:
         super().__init__(widths, features, out=1)
@@ -55,7 +54,7 @@ class SkyScratch(ImageScratch):
 
 
 class MetricDpt(Dpt):
-    """The head."""
+    """Head for depth and sky."""
 
     scratch: SkyScratch
 
@@ -65,7 +64,7 @@ class MetricDpt(Dpt):
 
 
 class MetricDepthAnything(nn.Module):
-    """The whole network: 334 M parameters. Every view is seen alone."""
+    """The metric network: 334 M parameters, one view at a time."""
 
     def __init__(self, config: MetricDepthConfig = MetricDepthConfig()) -> None:
         super().__init__()
@@ -74,7 +73,7 @@ class MetricDepthAnything(nn.Module):
         self.head = MetricDpt(config.vit.described, config.widths, config.features)
 
     def forward(self, images: Float[Tensor, "b v 3 h w"]) -> MetricDepth:
-        """Depth and sky of normalised images, their sides multiples of 14."""
+        """Predict depth and sky of normalised images with sides divisible by 14."""
         size = (images.shape[3], images.shape[4])
         tokens = [tokens.float() for tokens in self.backbone["pretrained"](images)]
         with full_precision(images):
@@ -90,8 +89,7 @@ class MetricDepthAnything(nn.Module):
 def with_far_sky(
     depth: Float[Tensor, "b v h w"], solid: Bool[Tensor, "b v h w"], farthest: float = torch.inf
 ) -> Float[Tensor, "b v h w"]:
-    """Depth whose sky lies behind nearly all that is solid, as the authors put it, and at most as
-    far as `farthest`. Where nearly all or nearly nothing is sky, it is left as it is."""
+    """Set the sky to the depth of the far foreground, at most `farthest`, as the authors do."""
     if min(int(solid.sum()), int((~solid).sum())) <= MIN_PIXELS:
         return depth
     far = quantile(depth[solid], FAR_QUANTILE).clamp_max(farthest)
@@ -99,8 +97,7 @@ def with_far_sky(
 
 
 def quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
-    """Between the two values that lie next to it (`torch.quantile` takes no more than 16 million
-    values)."""
+    """Compute a quantile; `torch.quantile` is limited to 16 million values."""
     place = share * (len(values) - 1)
     ordered = values.sort().values
     below, above = ordered[int(place)], ordered[min(int(place) + 1, len(values) - 1)]

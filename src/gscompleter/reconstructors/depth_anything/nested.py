@@ -1,4 +1,4 @@
-"""The nested network: any number of views, brought to metres by the metric network."""
+"""The nested network: any-view depth, scaled to metres by the metric network."""
 
 from __future__ import annotations
 
@@ -21,36 +21,35 @@ from gscompleter.reconstructors.depth_anything.poses import Poses
 from gscompleter.reconstructors.feed_forward.cameras import full_precision
 
 MIN_METRES = 0.01
-"""Depth, in metres, under which a pixel tells nothing of the scale."""
+"""Smallest depth of pixels that determine the scale, in metres."""
 MIN_DEPTH = 1e-3
-"""Likewise, in the unit of the any-view network."""
+"""Smallest depth of pixels that determine the scale, in the unit of the any-view network."""
 FARTHEST = 200.0
-"""Metres at which the sky is put at most."""
+"""Largest depth of the sky, in metres."""
 
 
 @dataclass(frozen=True)
 class NestedPrediction:
-    """What the network makes of one scene."""
+    """Predictions of both networks for one scene."""
 
     any_view: Prediction
-    """In the unit of its own."""
     metric: MetricDepth
     scale: float
-    """Metres to that unit."""
+    """Metres per unit of `any_view`."""
 
     @property
     def depth(self) -> Float[Tensor, "1 v h w"]:
-        """z-depth in metres; the sky lies behind nearly all else, 200 m away at most."""
+        """The z-depth in metres; the sky lies behind the foreground, at most at 200 m."""
         return with_far_sky(self.any_view.depth * self.scale, self.metric.solid, FARTHEST)
 
     @property
     def confidence(self) -> Float[Tensor, "1 v h w"]:
-        """How sure the network is of it, from 1 upwards: 1 of the sky."""
+        """The confidence, from 1 upwards; 1 in the sky."""
         return self.any_view.confidence.where(self.metric.solid, 1.0)
 
 
 class NestedDepthAnything(nn.Module):
-    """Both networks: 1690 M parameters."""
+    """The nested network: 1690 M parameters."""
 
     def __init__(self, config: NestedConfig) -> None:
         super().__init__()
@@ -61,7 +60,7 @@ class NestedDepthAnything(nn.Module):
     def forward(
         self, images: Float[Tensor, "1 v 3 h w"], poses: Poses | None = None
     ) -> NestedPrediction:
-        """As `DepthAnything`, and how long its unit is in metres."""
+        """Predict like `DepthAnything`, and the scale to metres."""
         prediction = self.da3(images, poses)
         metric = self.da3_metric(images)
         with full_precision(images):
@@ -69,11 +68,7 @@ class NestedDepthAnything(nn.Module):
 
 
 def metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
-    """The factor by which the depth of the any-view network fits that of the metric one best.
-
-    The surer half of what is no sky counts. Where there is hardly anything else than sky it is 1,
-    for nothing tells it.
-    """
+    """Fit the scale from any-view to metric depth on the more confident half of the foreground."""
     metres = metric.in_metres(prediction.poses.K)
     counts = counted(prediction, metric, metres)
     if int(counts.sum()) <= MIN_PIXELS:
@@ -85,7 +80,7 @@ def metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
 def counted(
     prediction: Prediction, metric: MetricDepth, metres: Float[Tensor, "b v h w"]
 ) -> Bool[Tensor, "b v h w"]:
-    """The pixels that tell the scale."""
+    """Select the pixels that determine the scale."""
     if not metric.solid.any():
         return torch.zeros_like(metric.solid)
     sure = prediction.confidence >= quantile(prediction.confidence[metric.solid], 0.5)

@@ -1,7 +1,4 @@
-"""Depth Anything 3 (Lin et al., 2025): depth, cameras and Gaussians of any number of views.
-
-Modules carry the names of the published weights, so that these load as they are.
-"""
+"""Depth Anything 3 (Lin et al., 2025): depth, cameras and Gaussians of any number of views."""
 
 from __future__ import annotations
 
@@ -23,28 +20,27 @@ from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussi
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a network makes of a batch, in a frame and unit of its own."""
+    """Output for a batch, with z-depth, in a frame and unit of its own."""
 
     depth: Float[Tensor, "b v h w"]
-    """z-depth."""
     confidence: Float[Tensor, "b v h w"]
-    """How sure it is of it, from 1 upwards."""
+    """Confidence of the z-depth, from 1 upwards."""
     numbers: Float[Tensor, "b v 9"]
-    """Of the predicted cameras, as in `poses.encoded`, but with quaternions of any length."""
+    """Predicted cameras as from `encode_poses`, with quaternions that are not normalised."""
     poses: Poses
-    """The predicted cameras, also where poses were given."""
+    """Predicted cameras, even if poses were given."""
     raw: Float[Tensor, "b v h w c"] | None
-    """Raw channels of a Gaussian for each pixel, where the network has a head for them."""
+    """Raw Gaussian channels per pixel, or None without a Gaussian head."""
 
     def gaussians(self, factors: Float[Tensor, "b"]) -> PixelGaussians:
-        """The Gaussians, once the predicted cameras are `factors` times as far apart."""
+        """Create the Gaussians, with distances between cameras multiplied by `factors`."""
         assert self.raw is not None
         with full_precision(self.raw):
             return gaussians_from(self.raw, self.depth, self.poses, factors)
 
 
 class DepthAnything(nn.Module):
-    """The whole network: 34 M (small), 135 M (base), 411 M (large) or 1356 M (giant) parameters."""
+    """The any-view network: 34 M (small), 135 M (base), 411 M (large), 1356 M (giant) weights."""
 
     def __init__(self, config: DepthAnythingConfig = DepthAnythingConfig()) -> None:
         super().__init__()
@@ -57,11 +53,9 @@ class DepthAnything(nn.Module):
         self.gs_head = GaussianDpt(channels, *head) if config.gaussians else None
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], poses: Poses | None = None) -> Prediction:
-        """Depth, cameras and, where there is a head for them, Gaussians.
+        """Predict depth, cameras and, with a Gaussian head, raw Gaussians.
 
-        Args:
-            images: Normalised, their sides multiples of 14.
-            poses: Of the cameras, as `seen_from_first`; None where they are not known.
+        Images are normalised and have sides divisible by 14; `poses` come from `normalize_poses`.
         """
         size = (images.shape[3], images.shape[4])
         tokens = self.described(images, poses)
@@ -80,7 +74,7 @@ class DepthAnything(nn.Module):
             )
 
     def described(self, images: Float[Tensor, "b v 3 h w"], poses: Poses | None) -> list[Tokens]:
-        """What the transformer hands on, in float32."""
+        """Compute the transformer's tokens, in float32."""
         with full_precision(images):
             size = (images.shape[3], images.shape[4])
             cameras = None if poses is None else self.cam_enc(encoded(poses, size))

@@ -1,4 +1,4 @@
-"""The frame and unit in which the networks are told the cameras."""
+"""Frame and unit of the camera poses that the networks receive."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from gscompleter.errors import InputError
 from gscompleter.reconstructors.depth_anything.poses import Poses, inverse_of
 
 MIN_UNIT = 0.1
-"""Least unit of the authors, in scene units."""
+"""Smallest unit in the authors' code, in scene units."""
 
 
 def seen_from_first(poses: Poses, units: Float[Tensor, "b"]) -> Poses:
-    """The cameras of each scene in the axes of its first one, and in its unit (in scene units)."""
+    """Transform each scene to the axes of its first camera and to `units` (in scene units)."""
     c2w = poses.c2w.double()
     relative = inverse_of(c2w[:, :1]) @ c2w
     relative[..., :3, 3] /= units.double()[:, None, None]
@@ -24,19 +24,16 @@ def seen_from_first(poses: Poses, units: Float[Tensor, "b"]) -> Poses:
 
 
 def scene_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
-    """The lower median of the distances between the first camera and all, itself included; of two
-    views, where that is 0, their distance.
+    """Compute the lower median distance from the first camera; of two views, their distance.
 
-    It follows the unit of the scene, so that the network is told the same of a scene in metres and
-    in millimetres. The authors' own (`authors_units`) differs for two views, which it puts 10
-    units apart for each scene unit, and for scenes smaller than a tenth of a unit.
+    It scales with the scene, unlike the authors' own unit (`compute_authors_units`).
 
     Raises:
-        InputError: where all cameras of a scene stand in one place, or one nowhere.
+        InputError: All cameras of a scene are at one position, or one is not finite.
     """
     apart = distances_from_first(centers)
     if not apart.isfinite().all():
-        raise InputError("The place of a camera is not finite; correct its pose.")
+        raise InputError("The position of a camera is not finite; correct its pose.")
     least = apart.where(apart > 0, torch.inf).amin(dim=1)
     if least.isinf().any():
         raise InputError(
@@ -47,11 +44,10 @@ def scene_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
 
 
 def authors_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
-    """The lower median of the distances between the first camera and all, itself included, and
-    0.1 scene units at least, as in the authors' inference."""
+    """Compute the same median, but at least 0.1 scene units, as in the authors' inference."""
     return distances_from_first(centers).median(dim=1).values.clamp_min(MIN_UNIT)
 
 
 def distances_from_first(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b v"]:
-    """How far each camera of a scene stands from its first one."""
+    """Measure the distance of each camera from the first camera of its scene."""
     return (centers.double() - centers[:, :1].double()).norm(dim=-1).to(centers.dtype)

@@ -1,4 +1,4 @@
-"""Gaussians from the frame of the first camera to the world."""
+"""Transform of Gaussians from the frame of the first camera to the world."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussi
 
 
 def placed(gaussians: PixelGaussians, first: Float[Tensor, "b 4 4"]) -> PixelGaussians:
-    """Gaussians in the axes of cameras `first`, in the world; the unit is the same."""
+    """Transform Gaussians from the axes of cameras `first` to the world, without scaling."""
     views = gaussians.depth.shape[1]
     turns = first[:, None, :3, :3].expand(-1, views, -1, -1)
     shift = first[:, None, None, None, :3, 3]

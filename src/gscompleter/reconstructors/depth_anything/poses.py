@@ -1,4 +1,4 @@
-"""Cameras as the networks take and give them: nine numbers each."""
+"""Cameras as nine parameters, the form that the networks use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from gscompleter.geometry import quats_from, rotations_from
 
 MIN_TANGENT = 1e-6
-"""Least tangent of half an opening angle."""
+"""Smallest tangent of half a field of view."""
 
 
 @dataclass(frozen=True)
@@ -20,21 +20,22 @@ class Poses:
     """The cameras of b scenes with v views each."""
 
     c2w: Float[Tensor, "b v 4 4"]
-    """Camera-to-world transforms with OpenCV axes."""
     K: Float[Tensor, "b v 3 3"]
     """Intrinsics in pixels of the network's images."""
 
     @property
     def centers(self) -> Float[Tensor, "b v 3"]:
+        """Camera centres."""
         return self.c2w[..., :3, 3]
 
     @property
     def w2c(self) -> Float[Tensor, "b v 4 4"]:
+        """World-to-camera transforms."""
         return inverse_of(self.c2w)
 
 
 def inverse_of(transforms: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
-    """The inverses of rigid transforms."""
+    """Invert rigid transforms."""
     rotations = transforms[..., :3, :3].transpose(-1, -2)
     inverse = transforms.clone()
     inverse[..., :3, :3] = rotations
@@ -43,13 +44,7 @@ def inverse_of(transforms: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
 
 
 def encoded(poses: Poses, size: tuple[int, int]) -> Float[Tensor, "b v 9"]:
-    """Centre, rotation as an xyzw quaternion with w >= 0, and opening angles (vertical, horizontal)
-    in radians.
-
-    Args:
-        poses: The cameras; where their principal points lie is not told.
-        size: Height and width of the images, in pixels.
-    """
+    """Encode centre, xyzw quaternion with w >= 0, and vertical and horizontal field of view."""
     quats = quats_from(poses.c2w[..., :3, :3])
     quats = torch.where(quats[..., :1] < 0, -quats, quats).roll(-1, -1)
     focal = torch.stack([poses.K[..., 1, 1], poses.K[..., 0, 0]], dim=-1)
@@ -58,7 +53,7 @@ def encoded(poses: Poses, size: tuple[int, int]) -> Float[Tensor, "b v 9"]:
 
 
 def decoded(numbers: Float[Tensor, "b v 9"], size: tuple[int, int]) -> Poses:
-    """The cameras that such numbers stand for, with the principal point at the centre."""
+    """Decode nine parameters into cameras with central principal points."""
     centers, quats, angles = numbers.split([3, 4, 2], dim=-1)
     c2w = F.pad(rotations_from(quats.roll(1, -1)), (0, 1, 0, 1))
     c2w[..., :3, 3] = centers

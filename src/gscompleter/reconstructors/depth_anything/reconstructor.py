@@ -1,4 +1,4 @@
-"""Ψ: what the networks of Depth Anything 3 make of photographs with given cameras."""
+"""Depth Anything 3 as a reconstructor Ψ for photographs with given cameras."""
 
 from __future__ import annotations
 
@@ -29,41 +29,35 @@ from gscompleter.reconstructors.feed_forward.reconstructor import gaussians_of
 from gscompleter.types import DepthMap, Reconstruction, View
 
 UnitOf = Callable[[Float[Tensor, "b v 3"]], Float[Tensor, "b"]]
-"""From camera centres to the unit, in scene units, in which a network is told of them."""
+"""Function from camera centres to the unit of the poses, in scene units."""
 
 
 @dataclass(frozen=True)
 class Inference:
-    """How a network is run."""
+    """Settings of a network's inference."""
 
     sizing: Sizing = Sizing()
-    """How photographs are resized for it."""
     unit_of: UnitOf = scene_units
-    """The unit in which the network is told of the cameras; `authors_units` is the authors'."""
+    """Unit of the poses for the network; `compute_authors_units` is the authors' choice."""
     dtype: torch.dtype = torch.float32
-    """bfloat16 or float16 let a GPU run the transformer in lower precision (autocast); heads and
-    geometry stay in float32. A CPU takes float32 only. No test covers it on a GPU."""
+    """Precision of the transformer under autocast; bfloat16 and float16 need a GPU (untested)."""
 
 
 @dataclass(frozen=True)
 class AnyViewDepth:
-    """Depth of several views at once, in the unit of their cameras."""
+    """Joint depth of several views, in the unit of their cameras."""
 
     network: DepthAnything
-    """With its weights, on the device where it is to run."""
     inference: Inference = Inference()
 
     def __post_init__(self) -> None:
         check_precision(device_of(self.network), self.inference.dtype)
 
     def __call__(self, views: Sequence[View]) -> list[DepthMap]:
-        """z-depths, and how sure the network is of them.
-
-        The network predicts the cameras again. By how much these stand wider apart than the given
-        ones, its depths are too large.
+        """Predict z-depths and confidence, scaled from predicted to given camera distances.
 
         Raises:
-            InputError: fewer than two views, or all of them in one place.
+            InputError: Fewer than two views, or all at one position.
         """
         batch = batch_of(views, self.inference.sizing, fewest=2)
         predicted = predict(self.network, batch, self.inference)
@@ -75,21 +69,19 @@ class AnyViewDepth:
 
 @dataclass(frozen=True)
 class MetricViewDepth:
-    """Depth of each view by itself, brought from metres to the unit of the cameras."""
+    """Metric depth of single views, scaled to the unit of the cameras."""
 
     network: MetricDepthAnything
-    """With its weights, on the device where it is to run."""
     inference: Inference = Inference()
 
     def __post_init__(self) -> None:
         check_precision(device_of(self.network), self.inference.dtype)
 
     def __call__(self, views: Sequence[View]) -> list[DepthMap]:
-        """z-depths; those of the sky are not valid.
+        """Predict z-depths, invalid in the sky.
 
         Raises:
-            InputError: fewer than two views, all in one place, or with too few features in common
-                to tell how long a metre is.
+            InputError: Fewer than two views, all at one position, or too few common features.
         """
         batch = batch_of(views, self.inference.sizing, fewest=2)
         device = device_of(self.network)
@@ -104,24 +96,21 @@ class MetricViewDepth:
 
 @dataclass(frozen=True)
 class AnyViewGaussians:
-    """Gaussians of several views at once, from the network's own head."""
+    """Gaussians of several views from the Gaussian head."""
 
     network: DepthAnything | NestedDepthAnything
-    """With its weights and a head for Gaussians, on the device where it is to run."""
     inference: Inference = Inference()
 
     def __post_init__(self) -> None:
         check_precision(device_of(self.network), self.inference.dtype)
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
-        """A Gaussian for each pixel of the resized photographs, and the z-depths of their means.
+        """Reconstruct a Gaussian per pixel of the resized photographs, and their z-depths.
 
-        The network sets them before cameras that it predicts. The first of these is put where the
-        first given one stands, and all are as wide apart as the given ones. Of the sky, where the
-        network tells it, no depth is valid.
+        Predicted cameras are aligned to the given ones by the first camera and the scale.
 
         Raises:
-            InputError: fewer than two views, or all of them in one place.
+            InputError: Fewer than two views, or all at one position.
         """
         batch = batch_of(views, self.inference.sizing, fewest=2)
         predicted = predict(self.network, batch, self.inference)
@@ -134,28 +123,28 @@ class AnyViewGaussians:
 
 
 def device_of(network: torch.nn.Module) -> torch.device:
-    """Where a network lies."""
+    """Return the device of a network."""
     return next(network.parameters()).device
 
 
 def predict(
     network: DepthAnything | NestedDepthAnything, batch: Batch, inference: Inference
 ) -> Prediction | NestedPrediction:
-    """What a network makes of photographs and their cameras, as it is told of these."""
+    """Run a network on a batch, with poses in normalised units."""
     device = device_of(network)
-    told = seen_from_first(batch.poses, inference.unit_of(batch.poses.centers))
-    # Not torch.inference_mode: the stages that follow optimise what comes from here.
+    poses = seen_from_first(batch.poses, inference.unit_of(batch.poses.centers))
+    # Not torch.inference_mode: later stages optimise these tensors.
     with torch.no_grad(), lower_precision(device, inference.dtype):
-        return network(batch.images.to(device), Poses(told.c2w.to(device), told.K.to(device)))
+        return network(batch.images.to(device), Poses(poses.c2w.to(device), poses.K.to(device)))
 
 
 def centers_of(poses: Poses) -> Float[np.ndarray, "b v 3"]:
-    """Camera centres of each scene."""
+    """Return the camera centres of each scene."""
     return poses.centers.double().cpu().numpy()
 
 
 def certainty(confidence: Float[Tensor, "*n h w"]) -> Float[Tensor, "*n h w"]:
-    """What networks tell from 1 upwards, between 0 and 1."""
+    """Map confidence from [1, ∞) to [0, 1)."""
     return 1 - 1 / confidence
 
 
@@ -165,14 +154,14 @@ def depth_maps(
     batch: Batch,
     views: Sequence[View],
 ) -> list[DepthMap]:
-    """Maps of the windows as those of the photographs, on their device."""
+    """Resample depth maps from the windows to the photographs, on their device."""
     device = views[0].image.device
     maps = zip(batch.windows, depth.to(device), confidence.to(device), views, strict=True)
     return [window.depth_map(z, sure, view.camera) for window, z, sure, view in maps]
 
 
 def in_world(predicted: Prediction, given: Poses) -> PixelGaussians:
-    """The Gaussians in the frame and unit of the given cameras."""
+    """Transform the Gaussians to the frame and unit of the given cameras."""
     pairs = zip(centers_of(predicted.poses), centers_of(given), strict=True)
     factors = [similarity_between(*pair).scale for pair in pairs]
     first = given.c2w[:, 0].to(predicted.depth)
@@ -185,7 +174,7 @@ def reconstruction_of(
     batch: Batch,
     views: Sequence[View],
 ) -> Reconstruction:
-    """The only scene of a batch, on the device of its views."""
+    """Create the reconstruction of one scene, on the device of its views."""
     device = views[0].image.device
     means = gaussians.means[0].to(device)
     per_view = zip(means.flatten(1, 2), views, strict=True)

@@ -1,4 +1,4 @@
-"""Which view's camera the others are told from, where no poses are given."""
+"""Choice of the reference camera if no poses are given."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def balanced_view(tokens: Float[Tensor, "b v c"]) -> Int[Tensor, "b"]:
-    """The view whose token is nowhere extreme: in likeness to others, in length, in spread."""
+    """Select the view whose token is least extreme in similarity, norm and variance."""
     unit = F.normalize(tokens, dim=-1)
     likeness = (unit @ unit.transpose(1, 2)).sum(-1) - 1
     likeness = likeness / (tokens.shape[1] - 1)
@@ -20,7 +20,7 @@ def balanced_view(tokens: Float[Tensor, "b v c"]) -> Int[Tensor, "b"]:
 
 
 def order_from(reference: Int[Tensor, "b"], views: int) -> Int[Tensor, "b v"]:
-    """Numbers of the views: the reference first, the others as they were."""
+    """Order view indices with the reference first."""
     numbers = torch.arange(views, device=reference.device).expand(len(reference), -1)
     first = (numbers != reference[:, None]).int()
     return first.argsort(dim=1, stable=True)

@@ -1,4 +1,4 @@
-"""How long a metre is in a scene whose poses tell no scale: as its features tell."""
+"""Estimation of the scene unit in metres from common features."""
 
 from __future__ import annotations
 
@@ -18,14 +18,10 @@ from gscompleter.types import DepthMap, View
 
 
 def units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) -> float:
-    """Scene units to a metre: the median over features that two photographs share.
-
-    Args:
-        views: Photographs whose poses have any scale.
-        metres: Their z-depths in metres.
+    """Estimate scene units per metre: the median over features that two photographs share.
 
     Raises:
-        InputError: where too few features have a depth.
+        InputError: Too few features have a depth in `metres`.
     """
     images, unit = stereo_images(views)
     neighbours = neighbours_among(images)
@@ -41,14 +37,13 @@ def units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) -> float:
     found = np.concatenate(ratios)
     if len(found) < MIN_MATCHES:
         raise InputError(
-            f"The photographs share {len(found)} features whose depth is known, and the length of "
-            f"a metre in this scene takes {MIN_MATCHES}; choose another reconstructor, or frames "
-            "that show more of the same."
+            f"The photographs share {len(found)} features of known depth, and the scale of the "
+            f"scene needs {MIN_MATCHES}; choose another reconstructor, or frames with more overlap."
         )
     return float(np.median(found))
 
 
 def depths_at(depth: DepthMap, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:
-    """z-depth at pixel coordinates, 0 where it is not valid."""
+    """Sample z-depth at pixel coordinates; 0 if invalid."""
     known = (depth.depth * depth.valid).cpu()[..., None]
     return sample(known, torch.from_numpy(pixels).float(), "nearest")[..., 0].double().numpy()

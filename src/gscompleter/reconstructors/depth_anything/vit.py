@@ -1,4 +1,4 @@
-"""A plain DINOv2 transformer whose later blocks look at one view and at all views by turns."""
+"""A DINOv2 transformer whose later blocks alternate between single views and all views."""
 
 from __future__ import annotations
 
@@ -30,20 +30,18 @@ from gscompleter.reconstructors.feed_forward.dino import (
 
 @dataclass(frozen=True)
 class Tokens:
-    """What a block hands on."""
+    """Patch tokens (row by row) and camera tokens of a block."""
 
     patches: Float[Tensor, "b v p c"]
-    """Of each patch, row by row."""
     camera: Float[Tensor, "b v c"]
-    """Of each view as a whole."""
 
     def float(self) -> Tokens:
-        """The same in float32, which heads take whatever the transformer ran in."""
+        """Convert to float32, the precision of the heads."""
         return Tokens(self.patches.float(), self.camera.float())
 
 
 class PlacedAttention(dino.Attention):
-    """Attention of tokens that know where they lie."""
+    """Self-attention with rotary position embedding."""
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__(channels, heads)
@@ -53,13 +51,14 @@ class PlacedAttention(dino.Attention):
     def forward(  # type: ignore[override]
         self, x: Float[Tensor, "n t c"], turns: Turns
     ) -> Float[Tensor, "n t c"]:
+        """Apply self-attention to tokens rotated by `turns`."""
         q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         q, k = turns(self.q_norm(q)), turns(self.k_norm(k))
         return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 
 
 class GatedMlp(nn.Module):
-    """Two linear layers, the wide one gated (SwiGLU)."""
+    """MLP with a gated hidden layer (SwiGLU)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -68,12 +67,13 @@ class GatedMlp(nn.Module):
         self.w3 = nn.Linear(hidden, channels)
 
     def forward(self, x: Float[Tensor, "n t c"]) -> Float[Tensor, "n t c"]:
+        """Apply the MLP."""
         gate, value = self.w12(x).chunk(2, dim=-1)
         return self.w3(F.silu(gate) * value)
 
 
 class Block(nn.Module):
-    """A layer of a transformer."""
+    """A layer of the transformer."""
 
     def __init__(self, channels: int, attention: nn.Module, mlp: nn.Module, eps: float) -> None:
         super().__init__()
@@ -85,6 +85,7 @@ class Block(nn.Module):
         self.ls2 = LayerScale(channels)
 
     def forward(self, x: Float[Tensor, "n t c"], *turns: Turns) -> Float[Tensor, "n t c"]:
+        """Apply attention, then the MLP."""
         x = x + self.ls1(self.attn(self.norm1(x), *turns))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
@@ -92,8 +93,8 @@ class Block(nn.Module):
 class AnyViewVit(nn.Module):
     """A vision transformer over the views of a scene.
 
-    The first blocks see each view alone, as in DINOv2. Then a token that tells the camera takes
-    the place of the class token, and odd blocks see all views together.
+    The first blocks process single views. From `first_multi_view_block` on, a camera token replaces
+    the class token, and odd blocks process all views jointly.
     """
 
     def __init__(self, config: VitConfig) -> None:
@@ -109,26 +110,21 @@ class AnyViewVit(nn.Module):
         self.norm = nn.LayerNorm(channels)
 
     def block(self, number: int) -> Block:
-        """A new block, which knows of places where views alternate."""
+        """Create a block, with rotary embedding in the multi-view part."""
         c = self.config
         attention = PlacedAttention if self.alternates(number) else dino.Attention
         mlp = GatedMlp(c.channels) if c.gated else Mlp(c.channels)
         return Block(c.channels, attention(c.channels, c.heads), mlp, eps=1e-6)
 
     def alternates(self, number: int) -> bool:
-        """Whether a block is one of those that know of other views."""
+        """Return True for blocks of the multi-view part."""
         start = self.config.alternates_from
         return start is not None and number >= start
 
     def forward(
         self, images: Float[Tensor, "b v 3 h w"], cameras: Float[Tensor, "b v c"] | None = None
     ) -> list[Tokens]:
-        """What the four chosen blocks hand on.
-
-        Args:
-            images: Normalised, their sides multiples of 14.
-            cameras: A token for each camera; None where poses are not known.
-        """
+        """Compute the tokens of the four output blocks; `cameras` is None if poses are unknown."""
         scenes, views = images.shape[:2]
         x = self.embedded(images)
         size = (images.shape[3] // PATCH, images.shape[4] // PATCH)
@@ -136,7 +132,7 @@ class AnyViewVit(nn.Module):
         among = turns_at(places_among_views(views, size[0] * size[1], images.device))
         order = torch.arange(views, device=images.device).expand(scenes, -1)
         start = self.config.alternates_from
-        handed_on, local = [], x
+        outputs, local = [], x
         for number, block in enumerate(self.blocks):
             if start is not None and number == start - 1 and cameras is None and views > 2:
                 order = order_from(balanced_view(x[:, :, 0].float()), views)
@@ -151,11 +147,11 @@ class AnyViewVit(nn.Module):
                 local = x = block(x.flatten(0, 1), within).unflatten(0, (scenes, views))
             if number in self.config.outputs:
                 back = order.argsort(dim=1)
-                handed_on.append(self.handed_on(reordered(local, back), reordered(x, back)))
-        return handed_on
+                outputs.append(self.handed_on(reordered(local, back), reordered(x, back)))
+        return outputs
 
     def embedded(self, images: Float[Tensor, "b v 3 h w"]) -> Float[Tensor, "b v t c"]:
-        """The class token and the patches of each view, with their positions."""
+        """Embed class token and patches of each view, with positions."""
         patches = self.patch_embed(images.flatten(0, 1))
         size = (images.shape[3] // PATCH, images.shape[4] // PATCH)
         tokens = torch.cat([self.cls_token.expand(len(patches), -1, -1), patches], 1)
@@ -165,7 +161,7 @@ class AnyViewVit(nn.Module):
     def camera_tokens(
         self, cameras: Float[Tensor, "b v c"] | None, scenes: int, views: int
     ) -> Float[Tensor, "b v 1 c"]:
-        """Those that are known, or learned ones: one for the first view, one for all others."""
+        """Return the given tokens, or learned ones for the first view and for all others."""
         if cameras is not None:
             return cameras[:, :, None]
         first, other = self.camera_token[:, :1], self.camera_token[:, 1:]
@@ -174,10 +170,7 @@ class AnyViewVit(nn.Module):
         )
 
     def handed_on(self, local: Float[Tensor, "b v t c"], x: Float[Tensor, "b v t c"]) -> Tokens:
-        """The tokens of a block, and beside them those of the last block that saw views alone.
-
-        Of patches only the block's own half is normalised, of cameras neither.
-        """
+        """Join the tokens of a block with those of the last single-view block."""
         normed = self.norm(x)
         if self.config.alternates_from is None:
             return Tokens(normed[:, :, 1:], x[:, :, 0])
@@ -186,5 +179,5 @@ class AnyViewVit(nn.Module):
 
 
 def reordered(x: Float[Tensor, "b v t c"], order: Int[Tensor, "b v"]) -> Float[Tensor, "b v t c"]:
-    """The views of each scene in another order."""
+    """Reorder the views of each scene."""
     return x.take_along_dim(order[:, :, None, None], dim=1)

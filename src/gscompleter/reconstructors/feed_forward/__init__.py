@@ -1,7 +1,6 @@
-"""Ψ with weights: networks that turn posed photographs into Gaussians in a single pass.
+"""Learned reconstructors Ψ that predict Gaussians from posed photographs in a single pass.
 
-The code is our own, written from descriptions of the models; the modules are named as in the
-authors' checkpoints, so that these load without renaming.
+The code is our own. Module names follow the authors' checkpoints, so that these load unchanged.
 """
 
 from gscompleter.reconstructors.feed_forward.depthsplat import (

@@ -1,4 +1,4 @@
-"""From the name of published weights to a reconstructor that holds them."""
+"""Construction of reconstructors from the names of published weights."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ Reconstructs = FeedForward | FromDepth | AnyViewGaussians
 
 @lru_cache(maxsize=1)
 def build(name: str, weights: Path | None = None, device: str = "cpu") -> Reconstructs:
-    """The reconstructor with the published weights of that name; the last one is kept.
+    """Load the reconstructor with the published weights `name`; the last one is cached.
 
     Args:
-        name: A key of `PUBLISHED` whose file gives Gaussians.
-        weights: The file, or a folder that holds it; None takes the published one.
-        device: Where the network runs.
+        name: A key of `PUBLISHED` that belongs to a reconstructor.
+        weights: The file, or the folder that contains it. If None, it is downloaded.
+        device: Device on which the network runs.
 
     Raises:
-        InputError: where the weights cannot be had, are damaged, or belong to another network.
+        InputError: The weights are missing, damaged, or of another network.
     """
     published = PUBLISHED[name]
     path = fetch(published, weights)
@@ -54,12 +54,7 @@ def build(name: str, weights: Path | None = None, device: str = "cpu") -> Recons
 
 
 def around(network: Network, dtype: torch.dtype = torch.float32) -> Reconstructs:
-    """The Ψ of a network.
-
-    Args:
-        network: With its weights, on the device where it is to run.
-        dtype: In which it runs; anything but float32 takes a GPU.
-    """
+    """Wrap a network as a reconstructor; any `dtype` but float32 needs a GPU."""
     inference = Inference(dtype=dtype)
     if isinstance(network, MetricDepthAnything):
         return FromDepth(model=MetricViewDepth(network, inference))
@@ -73,7 +68,7 @@ def around(network: Network, dtype: torch.dtype = torch.float32) -> Reconstructs
 
 
 def network_of(published: PublishedWeights) -> Network:
-    """The network that a file fits, with random weights, set up for what it was trained on."""
+    """Create the network that fits a file of weights, with random parameters."""
     if published.name in depth_anything.VARIANTS:
         return network_with(depth_anything.VARIANTS[published.name])
     if published.model == "DepthSplat":
@@ -82,7 +77,7 @@ def network_of(published: PublishedWeights) -> Network:
 
 
 def network_with(config: DepthAnythingConfig | MetricDepthConfig | NestedConfig) -> DepthAnythings:
-    """A network of Depth Anything 3, with random weights."""
+    """Create a Depth Anything 3 network with random parameters."""
     if isinstance(config, NestedConfig):
         return NestedDepthAnything(config)
     if isinstance(config, MetricDepthConfig):
@@ -91,13 +86,13 @@ def network_with(config: DepthAnythingConfig | MetricDepthConfig | NestedConfig)
 
 
 def variant_of(published: PublishedWeights) -> str:
-    """The key of `VARIANTS`: the published name leaves out a size of 256x256."""
+    """Return the key of `VARIANTS`; published names omit a size of 256x256."""
     key = published.name.removeprefix("depthsplat-")
     return key if key in VARIANTS else f"{key}-256x256"
 
 
 def shapes_of_all() -> dict[str, dict[str, tuple[int, ...]]]:
-    """The tensors of every network there is, by the names of the weights that fit it."""
+    """Collect the tensor shapes of every supported network by the name of its weights."""
     with torch.device("meta"):
         return {
             name: shapes_of(network_of(published).state_dict())

@@ -8,10 +8,7 @@ from torch import Tensor, nn
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions, and a 1x1 convolution beside them where the shape changes.
-
-    Instances are normalised without parameters, so the norms appear in no weight file.
-    """
+    """Two 3x3 convolutions with a skip connection; weight files omit its parameter-free norms."""
 
     def __init__(self, channels: int, out: int, stride: int) -> None:
         super().__init__()
@@ -24,16 +21,14 @@ class ResidualBlock(nn.Module):
             )
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o p q"]:
+        """Apply the block."""
         y = F.relu(F.instance_norm(self.conv1(x)))
         y = F.relu(F.instance_norm(self.conv2(y)))
         return F.relu(self.downsample(x) + y)
 
 
 class ImageEncoder(nn.Module):
-    """Feature maps at three depths of the network.
-
-    The first is half as large as the image; `stride2` and `stride3` lead to the other two.
-    """
+    """Feature maps at three levels: 1/2 resolution, then downsampled by `stride2` and `stride3`."""
 
     def __init__(self, stride2: int, stride3: int) -> None:
         super().__init__()
@@ -44,14 +39,14 @@ class ImageEncoder(nn.Module):
         self.conv2 = nn.Conv2d(128, 128, 1)
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> list[Float[Tensor, "n _ _ _"]]:
-        """Maps of 64, 96 and 128 channels, of images that are normalised."""
+        """Encode normalised images into maps of 64, 96 and 128 channels."""
         first = self.layer1(F.relu(F.instance_norm(self.conv1(images))))
         second = self.layer2(first)
         return [first, second, self.conv2(self.layer3(second))]
 
 
 def normalised(images: Float[Tensor, "*n 3 h w"]) -> Float[Tensor, "*n 3 h w"]:
-    """Images in [0, 1] with the mean and the deviation of ImageNet taken out."""
+    """Normalise images in [0, 1] by the mean and standard deviation of ImageNet."""
     mean = images.new_tensor([0.485, 0.456, 0.406])[:, None, None]
     deviation = images.new_tensor([0.229, 0.224, 0.225])[:, None, None]
     return (images - mean) / deviation

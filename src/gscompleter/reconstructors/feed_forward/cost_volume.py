@@ -1,4 +1,4 @@
-"""How well the features of each view match those of its sources at candidate depths."""
+"""Plane-sweep cost volumes from feature maps."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch import Tensor
 from gscompleter.reconstructors.feed_forward.cameras import Cameras, full_precision
 
 MIN_DEPTH = 1e-3
-"""Points less far in front of a source, or behind it, are projected as if they were there."""
+"""Smallest z-depth in a source view, in scene units; nearer points are clamped to it."""
 
 
 def evenly_spaced(
     first: Float[Tensor, "n 1 h w"], last: Float[Tensor, "n 1 h w"], number: int
 ) -> Float[Tensor, "n {number} h w"]:
-    """`number` candidates for each pixel, from the `first` to the `last`."""
+    """Space `number` candidates evenly from `first` to `last` at each pixel."""
     steps = torch.linspace(0, 1, number, device=first.device)[:, None, None]
     return first + steps * (last - first)
 
@@ -28,15 +28,10 @@ def cost_volume(
     inverse_depths: Float[Tensor, "n d _ _"],
     depth_chunk: int,
 ) -> Float[Tensor, "n d h w"]:
-    """Scaled dot products of the features of n = b v views with those they would have if each
-    pixel lay at each candidate depth, averaged over the sources of a view.
+    """Correlate each view with its source views at candidate depths, averaged over the sources.
 
-    Args:
-        features: Of all views, the views of a scene one after the other.
-        cameras: Of all views.
-        sources: The views that each is compared with.
-        inverse_depths: Candidates for each view, or for each of its pixels.
-        depth_chunk: Candidates that are compared at a time, which bounds the memory.
+    The n = b v views are ordered by scene; `sources` has indices within a scene. Candidates are
+    given per view or per pixel, and processed `depth_chunk` at a time to bound the memory.
     """
     n, _, h, w = features.shape
     K = cameras.intrinsics(h, w).flatten(0, 1)
@@ -64,8 +59,7 @@ def correlation(
     source_from_reference: Float[Tensor, "4 4"],
     depths: Float[Tensor, "d h w"],
 ) -> Float[Tensor, "d h w"]:
-    """Dot products of the reference with the source as sampled at `depths` of the reference,
-    over the square root of the number of channels; 0 outside of the source."""
+    """Correlate the reference with the source sampled at `depths`; 0 outside the source."""
     grid = sampling_grid(K, source_from_reference, depths)
     sampled = F.grid_sample(
         source[None], grid.flatten(0, 1)[None], mode="bilinear", align_corners=True
@@ -80,11 +74,9 @@ def sampling_grid(
     source_from_reference: Float[Tensor, "4 4"],
     depths: Float[Tensor, "d h w"],
 ) -> Float[Tensor, "d h w 2"]:
-    """Where the pixels of the reference at `depths` lie in the source: -1 is the centre of its
-    first, 1 of its last column or row.
+    """Project the pixels of the reference at `depths` into the source, in [-1, 1].
 
-    As the models were trained, centres of pixels have integer coordinates here, and `K` of the
-    reference serves for both views.
+    As in training, pixel centres have integer coordinates and `K` serves for both views.
     """
     _, h, w = depths.shape
     with full_precision(K):

@@ -1,7 +1,4 @@
-"""The depth predictor of DepthSplat, which VolSplat shares: matching and monocular features.
-
-Modules carry the names of the published weights, so that these load as they are.
-"""
+"""The depth predictor that DepthSplat and VolSplat share: matching and monocular features."""
 
 from __future__ import annotations
 
@@ -29,24 +26,22 @@ from gscompleter.reconstructors.feed_forward.transformer import MultiViewTransfo
 from gscompleter.reconstructors.feed_forward.unet import UNet, conv3x3, refiner
 
 MAX_SOURCES = 2
-"""Of more than three views each is matched with the two nearest, else with all others."""
+"""Number of nearest source views for more than three views; else all others are used."""
 
 
 @dataclass(frozen=True)
 class Vit:
-    """Sizes that come with a vision transformer."""
+    """Sizes that depend on the vision transformer, and channels of its two DPT heads."""
 
     channels: int
     num_blocks: int
     heads: int
     tapped: tuple[int, int, int, int]
-    """Blocks whose features are used."""
+    """Indices of the blocks that provide features."""
     widths: tuple[int, int, int, int]
     """Channels of the four levels of the DPT heads, finest first."""
     depth_features: int
-    """Channels of the DPT head that refines depth."""
     gaussian_features: int
-    """Channels of the DPT head whose features become Gaussians."""
 
 
 VITS = {
@@ -69,46 +64,44 @@ LAYOUTS: Mapping[tuple[int, int], Layout] = {
     ),
     (8, 1): (("cnn0", "vit"), ("cnn1", "vit"), ("cnn2", "vit", "matching0", "disparity")),
 }
-"""By upsampling factor and number of scales, what is joined at 1/2, 1/4 and 1/8 of full size."""
+"""Maps joined at 1/2, 1/4 and 1/8 resolution, by upsampling factor and number of scales."""
 
 
 @dataclass(frozen=True)
 class DepthConfig:
+    """Architecture of the depth predictor."""
+
     vit: Literal["vits", "vitb", "vitl"] = "vits"
-    """Size of the vision transformer."""
     num_scales: Literal[1, 2] = 1
-    """Resolutions at which views are matched, each twice the one before."""
+    """Number of matching resolutions; each is twice the one before."""
     upsample_factor: Literal[2, 4, 8] = 4
-    """From the finest matched resolution to the full one."""
+    """Full resolution divided by the finest matching resolution."""
     lowest_feature_resolution: Literal[4, 8] = 4
-    """Full resolution over that of the coarsest features."""
+    """Full resolution divided by that of the coarsest features."""
     num_candidates: int = 128
-    """Inverse depths that are compared at the coarsest resolution; the next has a quarter."""
+    """Number of inverse depths at the coarsest resolution; the next one has a quarter of it."""
     depth_chunk: int = 16
-    """Depths that are compared at a time; fewer need less memory and give the same."""
+    """Number of candidates per step; smaller values need less memory."""
 
     @property
     def patch(self) -> int:
-        """Sides of the images must be multiples of it, in pixels."""
+        """Side lengths of the images must be multiples of this, in pixels."""
         return 16 if self.lowest_feature_resolution == 4 else 64
 
 
 @dataclass(frozen=True)
 class DepthPrediction:
-    """What is known of n = b v views, the views of a scene one after the other."""
+    """z-depth in scene units and features of n = b v views, scene by scene."""
 
     depth: Float[Tensor, "n 1 h w"]
-    """z-depth in scene units."""
     certainty: Float[Tensor, "n 1 p q"]
-    """Probability of the best candidate, at the finest matched resolution."""
+    """Probability of the best candidate, at the finest matching resolution."""
     maps: Mapping[str, Float[Tensor, "n _ _ _"]]
-    """Features that DPT heads join, by name."""
     vit_maps: list[Float[Tensor, "n _ _ _"]]
-    """Features of the vision transformer, at 1/8 of full resolution."""
 
 
 class Pyramid(nn.Module):
-    """A map and, of two scales, another of twice the resolution with half the channels."""
+    """A feature map and, for two scales, one of twice the resolution with half the channels."""
 
     def __init__(self, channels: int, num_scales: int) -> None:
         super().__init__()
@@ -119,6 +112,7 @@ class Pyramid(nn.Module):
             self.stages.append(nn.Sequential(upsampling, nn.GELU(), conv3x3(half, half)))
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> list[Float[Tensor, "n _ _ _"]]:
+        """Compute the maps, coarsest first."""
         return [stage(x) for stage in self.stages]
 
 
@@ -143,17 +137,17 @@ class DepthPredictor(nn.Module):
         self.upsampler = dpt_head(config, features, with_disparity=True, out=to_residual(features))
 
     def add_scale(self, scale: int) -> None:
-        """What turns the cost volume of `scale` (0 is the coarsest) into probabilities."""
+        """Add the layers from the cost volume of `scale` (0 is coarsest) to probabilities."""
         width, candidates = 128 // 2**scale, self.config.num_candidates // 4**scale
-        of_image, of_vit = CHANNELS[f"cnn{2 - scale}"], self.vit.channels // 2**scale
-        channels = candidates + of_image + width + of_vit
+        image_channels, vit_channels = CHANNELS[f"cnn{2 - scale}"], self.vit.channels // 2**scale
+        channels = candidates + image_channels + width + vit_channels
         unet = UNet(width, levels=3 + scale, attention_level=2 + scale, pre_norm=True)
         self.regressor.append(refiner(channels, width, unet))
         self.regressor_residual.append(nn.Conv2d(channels, width, 1))
         self.depth_head.append(two_padded_convolutions(width, 2 * width, candidates))
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> DepthPrediction:
-        """Depth and features of at least two views in [0, 1], their sides multiples of `patch`."""
+        """Predict depth for at least two images in [0, 1], with sides divisible by `patch`."""
         b, v = images.shape[:2]
         few = v <= MAX_SOURCES + 1
         sources = other_views(b, v, images.device) if few else nearest_views(cameras, MAX_SOURCES)
@@ -183,7 +177,7 @@ class DepthPredictor(nn.Module):
         return DepthPrediction(1 / full.clamp(low, high), certainty, maps, vit_maps)
 
     def vit_features(self, images: Float[Tensor, "n 3 h w"]) -> list[Float[Tensor, "n c p q"]]:
-        """Features of four depths of the vision transformer, at 1/8 of full resolution."""
+        """Compute four feature maps of the vision transformer at 1/8 resolution."""
         h, w = images.shape[2:]
         patches = resized(images, (h // PATCH * PATCH, w // PATCH * PATCH))
         return [resized(x, (h // 8, w // 8)) for x in self.pretrained(patches, self.vit.tapped)]
@@ -196,10 +190,7 @@ class DepthPredictor(nn.Module):
         sources: Int[Tensor, "b v s"],
         candidates: Float[Tensor, "n d _ _"],
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n d h w"]]:
-        """Expected inverse depth, and the probability of each candidate.
-
-        `context` are the features of the image, for matching, and of the vision transformer.
-        """
+        """Estimate inverse depth and the probability of each candidate from features `context`."""
         _, to_match, _ = context
         costs = cost_volume(to_match, cameras, sources, candidates, self.config.depth_chunk)
         joined = torch.cat([costs, *context], 1)
@@ -212,7 +203,7 @@ class DepthPredictor(nn.Module):
 def dpt_head(
     config: DepthConfig, features: int, with_disparity: bool, out: nn.Module | None = None
 ) -> DptHead:
-    """A DPT head of `features` channels that fuses the maps of a `DepthPrediction`."""
+    """Create a DPT head that fuses the maps of a `DepthPrediction`."""
     vit = VITS[config.vit]
     levels = LAYOUTS[config.upsample_factor, config.num_scales]
     layout = [[name for name in names if with_disparity or name != "disparity"] for names in levels]
@@ -220,7 +211,7 @@ def dpt_head(
 
 
 def to_residual(features: int) -> nn.Sequential:
-    """From the fused features of the DPT head to a correction of inverse depth."""
+    """Create the layers that map fused features to a correction of inverse depth."""
     return nn.Sequential(
         padded_conv3x3(features, features // 2),
         nn.GELU(),
@@ -237,10 +228,7 @@ def candidates_around(
     low: Float[Tensor, "n 1 1 1"],
     high: Float[Tensor, "n 1 1 1"],
 ) -> Float[Tensor, "n {number} h w"]:
-    """Inverse depths about each pixel's own, `interval` apart, within `low` and `high`.
-
-    The ends are clamped, not the candidates: near the limits these lie closer together.
-    """
+    """Sample inverse depths around `disparity`; only the ends are clamped to [`low`, `high`]."""
     start = (disparity - number // 2 * interval).clamp(low, high)
     stop = (disparity + (number // 2 - 1) * interval).clamp(low, high)
     return evenly_spaced(start, stop, number)

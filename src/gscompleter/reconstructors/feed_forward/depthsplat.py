@@ -1,7 +1,4 @@
-"""DepthSplat (Xu et al., CVPR 2025): Gaussians from cost volumes and monocular depth features.
-
-Modules carry the names of the published weights, so that these load as they are.
-"""
+"""DepthSplat (Xu et al., CVPR 2025): Gaussians from cost volumes and monocular features."""
 
 from __future__ import annotations
 
@@ -24,20 +21,19 @@ from gscompleter.reconstructors.feed_forward.pixel_features import PixelFeatures
 
 @dataclass(frozen=True)
 class DepthSplatConfig:
+    """Architecture of DepthSplat, and its depth range for cameras without one."""
+
     depth: DepthConfig = DepthConfig()
-    """The depth predictor."""
     image_size: tuple[int, int] = (256, 256)
-    """Height and width it was trained at, in pixels; others work too."""
+    """Height and width of the training images, in pixels; other sizes work too."""
     near: float = 0.5
-    """Smallest z-depth, in scene units, where the camera knows none."""
     far: float = 100.0
-    """Largest z-depth, in scene units, where the camera knows none."""
     gaussian_scale_max: float = 3.0
     """Largest standard deviation of a Gaussian, in scene units."""
 
     @property
     def patch(self) -> int:
-        """Sides of the images must be multiples of it, in pixels."""
+        """Side lengths of the images must be multiples of this, in pixels."""
         return self.depth.patch
 
 
@@ -56,11 +52,11 @@ VARIANTS: Mapping[str, DepthSplatConfig] = {
     "small-re10kdl3dv-448x768": DepthSplatConfig(SMALL_WIDE, (448, 768), 0.5, 200.0, 0.1),
     "base-re10kdl3dv-448x768": DepthSplatConfig(BASE_WIDE, (448, 768), 0.5, 200.0, 0.1),
 }
-"""The published ones, by size, data and resolution."""
+"""Published variants by size, data and resolution."""
 
 
 class DepthSplat(PixelFeatures):
-    """The whole network: 38 M (small), 121 M (base) or 354 M (large) parameters."""
+    """The DepthSplat network: 38 M (small), 121 M (base) or 354 M (large) parameters."""
 
     def __init__(self, config: DepthSplatConfig = DepthSplatConfig()) -> None:
         super().__init__(config.depth)
@@ -70,7 +66,7 @@ class DepthSplat(PixelFeatures):
         )
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
-        """The Gaussians of all pixels; see `DepthPredictor` for the images."""
+        """Predict a Gaussian for each pixel; see `DepthPredictor` for the images."""
         depth, features = self.describe(images, cameras)
         raw = self.gaussian_head(features)
         flat = images.flatten(0, 1)

@@ -1,4 +1,4 @@
-"""The DINOv2 vision transformer, whose features DepthSplat adds to those of matching."""
+"""The DINOv2 vision transformer, the source of DepthSplat's monocular features."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 PATCH = 14
-"""Side of a patch in pixels."""
+"""Side length of a patch, in pixels."""
 GRID = 37
-"""Patches along each side of the images it was trained on, for which positions are stored."""
+"""Patches along each side of the training images; position embeddings have this size."""
 
 
 class PatchEmbedding(nn.Module):
-    """A token for each patch, row by row."""
+    """One token per patch, in row-major order."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.proj = nn.Conv2d(3, channels, PATCH, PATCH)
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n t c"]:
+        """Embed the patches."""
         return self.proj(images).flatten(2).transpose(1, 2)
 
 
 class Attention(nn.Module):
-    """Attention of all tokens of an image to each other."""
+    """Self-attention among the tokens of an image."""
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
@@ -36,12 +37,13 @@ class Attention(nn.Module):
         self.proj = nn.Linear(channels, channels)
 
     def forward(self, x: Float[Tensor, "n t c"]) -> Float[Tensor, "n t c"]:
+        """Apply self-attention."""
         q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 
 
 class Mlp(nn.Module):
-    """Two linear layers, four times wider between them."""
+    """Two linear layers with four times the channels between them."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -49,6 +51,7 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(4 * channels, channels)
 
     def forward(self, x: Float[Tensor, "n t c"]) -> Float[Tensor, "n t c"]:
+        """Apply both layers."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -60,6 +63,7 @@ class LayerScale(nn.Module):
         self.gamma = nn.Parameter(torch.ones(channels))
 
     def forward(self, x: Float[Tensor, "n t c"]) -> Float[Tensor, "n t c"]:
+        """Scale the channels."""
         return x * self.gamma
 
 
@@ -76,6 +80,7 @@ class Block(nn.Module):
         self.ls2 = LayerScale(channels)
 
     def forward(self, x: Float[Tensor, "n t c"]) -> Float[Tensor, "n t c"]:
+        """Apply attention, then the MLP."""
         x = x + self.ls1(self.attn(self.norm1(x)))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
@@ -94,12 +99,7 @@ class DinoV2(nn.Module):
     def forward(
         self, images: Float[Tensor, "n 3 h w"], blocks: Sequence[int]
     ) -> list[Float[Tensor, "n c p q"]]:
-        """Normalised feature maps, a value per patch, after each of `blocks`.
-
-        Args:
-            images: Normalised, their sides multiples of 14.
-            blocks: Numbers, from 0 on, in ascending order.
-        """
+        """Compute feature maps after `blocks`, for normalised images with sides divisible by 14."""
         size = (images.shape[2] // PATCH, images.shape[3] // PATCH)
         class_token = self.cls_token.expand(len(images), -1, -1)
         tokens = torch.cat([class_token, self.patch_embed(images)], 1) + self.positions(*size)
@@ -111,17 +111,14 @@ class DinoV2(nn.Module):
         return maps
 
     def positions(self, rows: int, columns: int) -> Float[Tensor, "1 t c"]:
-        """The stored positions on a grid of `rows` x `columns` patches."""
+        """Return position embeddings for `rows` x `columns` patches."""
         return resized_positions(self.pos_embed, rows, columns)
 
 
 def resized_positions(
     stored: Float[Tensor, "1 s c"], rows: int, columns: int
 ) -> Float[Tensor, "1 t c"]:
-    """Positions of the class token and of GRID x GRID patches, resized to `rows` x `columns`.
-
-    The tenth that is added to the size shifts where they are sampled, as in the original.
-    """
+    """Resize position embeddings to `rows` x `columns`, with the original's 0.1 size offset."""
     if rows == columns == GRID:
         return stored
     grid = stored[:, 1:].transpose(1, 2).unflatten(2, (GRID, GRID))

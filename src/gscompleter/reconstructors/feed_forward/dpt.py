@@ -1,4 +1,4 @@
-"""The DPT head of DepthSplat: four maps of a vision transformer, fused to full resolution."""
+"""The DPT head of DepthSplat, which fuses four transformer maps to full resolution."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from torch import Tensor, nn
 from gscompleter.reconstructors.feed_forward.resampling import resized
 
 VIT = "vit"
-"""Stands, among the names of maps that are joined, for the transformer's own."""
+"""Name of the transformer's own map in a `Layout`."""
 CHANNELS = {"cnn0": 64, "cnn1": 96, "cnn2": 128, "matching0": 128, "matching1": 64, "disparity": 1}
-"""Of the maps they are joined with: of the encoder (finest first), of the multi-view transformer
-(coarsest first), and the inverse depth."""
+"""Channels of encoder maps (finest first), matching maps (coarsest first) and disparity."""
 Layout = Sequence[Sequence[str]]
-"""Names of the maps that are joined at 1/2, 1/4 and 1/8 of full resolution, in this order."""
+"""Names of the maps joined at 1/2, 1/4 and 1/8 resolution, in this order."""
 
 
 def padded_conv3x3(channels: int, out: int) -> nn.Conv2d:
-    """A convolution that continues the border."""
+    """Create a 3x3 convolution that replicates the image border."""
     return nn.Conv2d(channels, out, 3, 1, 1, padding_mode="replicate")
 
 
 def two_padded_convolutions(channels: int, width: int, out: int) -> nn.Sequential:
+    """Create two such convolutions with a GELU between them."""
     return nn.Sequential(padded_conv3x3(channels, width), nn.GELU(), padded_conv3x3(width, out))
 
 
 class ResidualUnit(nn.Module):
-    """Two convolutions of what is positive, added to the input."""
+    """Two convolutions of the rectified input, added to it."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -38,11 +38,12 @@ class ResidualUnit(nn.Module):
         self.conv2 = nn.Conv2d(channels, channels, 3, 1, 1)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+        """Apply the unit."""
         return x + self.conv2(F.relu(self.conv1(F.relu(x))))
 
 
 class Coarsest(nn.Module):
-    """Refines the coarsest map and brings it to the size of the next."""
+    """Refinement of the coarsest map, resized to the next level."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -52,11 +53,12 @@ class Coarsest(nn.Module):
     def forward(
         self, x: Float[Tensor, "n c h w"], size: tuple[int, int]
     ) -> Float[Tensor, "n c p q"]:
+        """Refine `x` and resize it to `size`."""
         return self.out_conv(resized(self.resConfUnit2(x), size))
 
 
 class Fusion(Coarsest):
-    """Adds a finer map, then does the same."""
+    """Fusion of a coarse map with a finer one."""
 
     def __init__(self, channels: int) -> None:
         super().__init__(channels)
@@ -68,11 +70,12 @@ class Fusion(Coarsest):
         fine: Float[Tensor, "n c h w"],
         size: tuple[int, int],
     ) -> Float[Tensor, "n c p q"]:
+        """Add the fine map to the coarse one, refine and resize the sum to `size`."""
         return self(coarse + self.resConfUnit1(fine), size)
 
 
 class Scratch(nn.Module):
-    """Fuses maps at 1/2, 1/4, 1/8 and 1/16 of full resolution, coarse to fine."""
+    """Fusion of maps at 1/2, 1/4, 1/8 and 1/16 resolution, coarse to fine."""
 
     def __init__(self, widths: Sequence[int], features: int, out: nn.Module | None) -> None:
         super().__init__()
@@ -87,11 +90,12 @@ class Scratch(nn.Module):
         self.output_conv = nn.Identity() if out is None else out
 
     def forward(self, pyramid: Sequence[Float[Tensor, "n _ _ _"]]) -> Float[Tensor, "n c h w"]:
+        """Fuse the four levels."""
         fusions = (self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4)
         return self.output_conv(fused(self.levels(pyramid), *fusions))
 
     def levels(self, pyramid: Sequence[Float[Tensor, "n _ _ _"]]) -> list[Float[Tensor, "n c _ _"]]:
-        """The maps of all levels, with the same number of channels."""
+        """Map all levels to the same number of channels."""
         layers = (self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn)
         return [layer(x) for layer, x in zip(layers, pyramid, strict=True)]
 
@@ -103,7 +107,7 @@ def fused(
     coarser: Fusion,
     coarsest: Coarsest,
 ) -> Float[Tensor, "n c h w"]:
-    """Four levels, finest first, fused to twice the size of the finest."""
+    """Fuse four levels, finest first, to twice the size of the finest."""
     a, b, c, d = levels
     x = coarsest(d, size_of(c))
     x = coarser.fused(x, c, size_of(b))
@@ -112,17 +116,17 @@ def fused(
 
 
 def size_of(x: Float[Tensor, "n c h w"]) -> tuple[int, int]:
-    """Height and width of a map."""
+    """Return height and width of a map."""
     return x.shape[2], x.shape[3]
 
 
 def projections(channels: int, widths: Sequence[int]) -> nn.ModuleList:
-    """From the maps of a transformer to the channels of the four levels, finest first."""
+    """Create the layers from transformer channels to those of the four levels, finest first."""
     return nn.ModuleList(nn.Conv2d(channels, width, 1) for width in widths)
 
 
 def resizers(widths: Sequence[int]) -> nn.ModuleList:
-    """To 4, 2, 1 and 1/2 times the resolution of the transformer's maps."""
+    """Create the layers to 4, 2, 1 and 1/2 times the resolution of the transformer maps."""
     return nn.ModuleList(
         [
             nn.ConvTranspose2d(widths[0], widths[0], 4, 4),
@@ -134,7 +138,7 @@ def resizers(widths: Sequence[int]) -> nn.ModuleList:
 
 
 class DptHead(nn.Module):
-    """Joins the transformer's maps with others, and fuses them."""
+    """Join the transformer maps with other features and fuse them."""
 
     def __init__(
         self,
@@ -144,14 +148,6 @@ class DptHead(nn.Module):
         layout: Layout,
         out: nn.Module | None = None,
     ) -> None:
-        """
-        Args:
-            vit_channels: Of the maps of the vision transformer.
-            widths: Channels of the four levels, finest first.
-            features: Channels of the fused map.
-            layout: Which maps are joined at the three finest levels.
-            out: What follows the fusion, if anything does.
-        """
         super().__init__()
         self.layout = layout
         self.projects = projections(vit_channels, widths)
@@ -167,12 +163,7 @@ class DptHead(nn.Module):
         vit_maps: Sequence[Float[Tensor, "n c p q"]],
         maps: Mapping[str, Float[Tensor, "n _ _ _"]],
     ) -> Float[Tensor, "n o h w"]:
-        """The fused map at full resolution.
-
-        Args:
-            vit_maps: Four, of all depths of the transformer, at 1/8 of full resolution.
-            maps: The others, by name, at the resolution of the level that joins them.
-        """
+        """Fuse four `vit_maps` at 1/8 resolution with `maps` at the resolution of their levels."""
         pyramid = [
             resize(project(x))
             for resize, project, x in zip(self.resize_layers, self.projects, vit_maps, strict=True)

@@ -1,4 +1,4 @@
-"""From the raw channels of each pixel to its Gaussian in the world."""
+"""Conversion of raw channels per pixel to Gaussians in world space."""
 
 from __future__ import annotations
 
@@ -15,33 +15,30 @@ from gscompleter.reconstructors.feed_forward.spherical_harmonics import rotate_s
 from gscompleter.types import SH_C0
 
 MVSPLAT_SH = 25
-"""Harmonics of MVSplat (degree 4), of which rasterisers of 3DGS show the first 16."""
+"""SH coefficients of MVSplat (degree 4); renderers of 3DGS use the first 16."""
 MVSPLAT_CHANNELS = 2 + 3 + 4 + 3 * MVSPLAT_SH
-"""Offset, scale, rotation, harmonics."""
+"""Channels of offset, scale, rotation and SH."""
 MVSPLAT_SCALES = (0.5, 15.0)
-"""Smallest and largest standard deviation, in fifths of what a pixel covers."""
+"""Smallest and largest standard deviation, in fifths of a pixel's width at that distance."""
 DEPTHSPLAT_SH = 9
-"""Harmonics of DepthSplat (degree 2)."""
+"""SH coefficients of DepthSplat (degree 2)."""
 DEPTHSPLAT_CHANNELS = 1 + 2 + 3 + 4 + 3 * DEPTHSPLAT_SH
-"""Opacity, offset, scale, rotation, harmonics."""
+"""Channels of opacity, offset, scale, rotation and SH."""
 MIN_SCALE = 1e-10
 """Smallest standard deviation of DepthSplat, in scene units."""
 
 
 @dataclass(frozen=True)
 class PixelGaussians:
-    """What a network makes of a batch: one Gaussian for each pixel of each view, in the world."""
+    """One Gaussian per pixel of a batch of views, with the conventions of `Gaussians`."""
 
     depth: Float[Tensor, "b v h w"]
-    """As the network calls it: z-depth (DepthSplat) or distance along the ray (MVSplat)."""
+    """z-depth (DepthSplat) or distance along the ray (MVSplat), in scene units."""
     means: Float[Tensor, "b v h w 3"]
     quats: Float[Tensor, "b v h w 4"]
-    """Rotations as wxyz quaternions."""
     scales: Float[Tensor, "b v h w 3"]
-    """Standard deviations along the rotated axes, in scene units."""
     opacities: Float[Tensor, "b v h w"]
     sh: Float[Tensor, "b v h w k 3"]
-    """Spherical harmonics in the basis of 3DGS."""
 
 
 def mvsplat_gaussians(
@@ -50,10 +47,7 @@ def mvsplat_gaussians(
     opacity: Float[Tensor, "n 1 h w"],
     cameras: Cameras,
 ) -> PixelGaussians:
-    """The Gaussians of MVSplat, which takes its depth for the distance along the unit ray.
-
-    Their size is a multiple of what a pixel covers at that distance.
-    """
+    """Create the Gaussians of MVSplat at `distance` along unit rays, in multiples of a pixel."""
     offset, scale, rotation, sh = per_pixel(raw, cameras).split([2, 3, 4, 3 * MVSPLAT_SH], -1)
     depth = per_pixel(distance, cameras)[..., 0]
     h, w = depth.shape[2:]
@@ -80,10 +74,7 @@ def depthsplat_gaussians(
     cameras: Cameras,
     max_scale: float,
 ) -> PixelGaussians:
-    """The Gaussians of DepthSplat, at z-depth.
-
-    Their size is in scene units, up to `max_scale`. Their colour starts from that of the pixel.
-    """
+    """Create the Gaussians of DepthSplat at `z_depth`, with sizes up to `max_scale` scene units."""
     opacity, offset, scale, rotation, sh = per_pixel(raw, cameras).split(
         [1, 2, 3, 4, 3 * DEPTHSPLAT_SH], -1
     )
@@ -102,15 +93,12 @@ def depthsplat_gaussians(
 
 
 def per_pixel(maps: Float[Tensor, "n c h w"], cameras: Cameras) -> Float[Tensor, "b v h w c"]:
-    """Channels last, views apart, in float32."""
+    """Move channels last and separate the views, in float32."""
     return maps.float().permute(0, 2, 3, 1).unflatten(0, cameras.near.shape)
 
 
 def z_rays(offsets: Float[Tensor, "b v h w 2"], cameras: Cameras) -> Float[Tensor, "b v h w 3"]:
-    """Directions of unit z, in camera axes, through a point of each pixel.
-
-    Raw offsets move it by less than half a pixel from the centre.
-    """
+    """Compute directions of unit z in camera axes, up to half a pixel from each pixel centre."""
     h, w = offsets.shape[2:4]
     x = torch.arange(w, device=offsets.device) + 0.5
     y = torch.arange(h, device=offsets.device) + 0.5
@@ -122,7 +110,7 @@ def z_rays(offsets: Float[Tensor, "b v h w 2"], cameras: Cameras) -> Float[Tenso
 
 
 def damped(sh: Float[Tensor, "*batch c"]) -> Float[Tensor, "*batch k 3"]:
-    """Raw channels, colour by colour, as harmonics whose higher degrees start out small."""
+    """Convert raw channels to SH coefficients, with small factors for higher degrees."""
     coefficients = sh.unflatten(-1, (3, -1)).transpose(-1, -2)
     degrees = range(1, round(coefficients.shape[-2] ** 0.5))
     factors = [1.0] + [0.1 * 0.25**degree for degree in degrees for _ in range(2 * degree + 1)]
@@ -138,10 +126,7 @@ def in_world(
     sh: Float[Tensor, "b v h w k 3"],
     cameras: Cameras,
 ) -> PixelGaussians:
-    """Gaussians at `depth` times their rays, carried from camera to world axes.
-
-    Rotations come as the networks put them: xyzw quaternions of any length.
-    """
+    """Place Gaussians at `depth` along their rays; rotations are xyzw in camera axes."""
     c2w = cameras.c2w[..., :3, :3]
     centers = cameras.c2w[:, :, None, None, :3, 3]
     with full_precision(rays):

@@ -1,4 +1,4 @@
-"""From views to what the networks take."""
+"""Conversion of views to the inputs of the networks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gscompleter.types import Camera, DepthMap, View
 
 @dataclass(frozen=True)
 class Crop:
-    """The window of an image that a network sees."""
+    """The part of an image that a network processes, in pixels."""
 
     top: int
     left: int
@@ -26,16 +26,18 @@ class Crop:
 
     @property
     def rows(self) -> slice:
+        """The rows of the crop."""
         return slice(self.top, self.top + self.height)
 
     @property
     def columns(self) -> slice:
+        """The columns of the crop."""
         return slice(self.left, self.left + self.width)
 
     def padded(
         self, depth: Float[Tensor, "{self.height} {self.width}"], camera: Camera
     ) -> DepthMap:
-        """z-depth of the window in the whole image of `camera`, and where that is; 0 outside."""
+        """Place the z-depth of the crop in the image of `camera`; pixels outside are invalid."""
         whole = depth.new_zeros(camera.height, camera.width)
         within = torch.zeros_like(whole, dtype=torch.bool)
         whole[self.rows, self.columns] = depth
@@ -43,19 +45,15 @@ class Crop:
         return DepthMap(whole, within)
 
     def pixel_index(self, width: int) -> Int[Tensor, "n"]:
-        """Row-major numbers that the pixels of the window have in an image of `width` columns."""
+        """Compute the row-major indices of the crop's pixels in an image of `width` columns."""
         rows = torch.arange(self.height)[:, None] + self.top
         return (rows * width + torch.arange(self.width) + self.left).flatten()
 
 
 def central_crops(cameras: Sequence[Camera], patch: int) -> list[Crop]:
-    """The largest windows of one size about the centres of all images, in whole patches.
+    """Compute the largest central crops of one size for all images, in whole patches.
 
-    Images of several sizes are not resized: where one view is wider than the others, as is the
-    target with its margin, the network sees as much of it as of the others.
-
-    Raises:
-        InputError: where an image is smaller than one patch.
+    Images are not resized, so a padded target is cropped to the size of the other views.
     """
     height = min(camera.height for camera in cameras)
     width = min(camera.width for camera in cameras)
@@ -74,16 +72,12 @@ def central_crops(cameras: Sequence[Camera], patch: int) -> list[Crop]:
 def batch_of(
     views: Sequence[View], patch: int, near: float, far: float
 ) -> tuple[Float[Tensor, "1 v 3 h w"], Cameras, list[Crop]]:
-    """`views` as a batch of one scene, and the windows of them that it holds.
+    """Create a batch of one scene from the central crops of `views`.
 
-    Args:
-        views: At least two.
-        patch: Sides of the windows are multiples of it, in pixels.
-        near: Smallest z-depth, for cameras that know none.
-        far: Largest z-depth, for cameras that know none.
+    Cameras without a depth range get `near` and `far`; side lengths are multiples of `patch`.
 
     Raises:
-        InputError: fewer than two views, images smaller than one patch, an empty depth range.
+        InputError: Fewer than two views, an image below one patch, or an empty depth range.
     """
     if len(views) < 2:
         raise InputError(
@@ -103,11 +97,8 @@ def batch_of(
 
 
 def cropped_intrinsics(camera: Camera, crop: Crop) -> Float[Tensor, "3 3"]:
-    """Intrinsics of the crop, in its widths and heights.
-
-    The principal point keeps its place in the image. The authors' loaders leave (cx, cy) as
-    they are, which is the same where it lies at the centre, as it does in their data.
-    """
+    """Compute the intrinsics of the crop, in units of its width and height."""
+    # The authors' loaders keep (cx, cy), which is the same for central principal points.
     K = camera.K.float().clone()
     K[0, 2] -= crop.left
     K[1, 2] -= crop.top

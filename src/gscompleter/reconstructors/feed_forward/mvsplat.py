@@ -1,7 +1,4 @@
-"""MVSplat (Chen et al., ECCV 2024): Gaussians from cost volumes, in a single pass.
-
-Modules carry the names of the published weights, so that these load as they are.
-"""
+"""MVSplat (Chen et al., ECCV 2024): Gaussians from cost volumes, in a single pass."""
 
 from __future__ import annotations
 
@@ -31,32 +28,30 @@ from gscompleter.reconstructors.feed_forward.unet import (
 )
 
 NUM_CANDIDATES = 128
-"""Inverse depths that are compared."""
+"""Number of candidate inverse depths."""
 DOWNSCALE = 4
-"""Cost volumes have this fraction of the resolution of the images."""
+"""Full resolution divided by the resolution of the cost volumes."""
 
 
 @dataclass(frozen=True)
 class MVSplatConfig:
-    """The weights for RealEstate10K and for ACID share these defaults."""
+    """Settings shared by the weights for RealEstate10K and ACID."""
 
     image_size: tuple[int, int] = (256, 256)
-    """Height and width it was trained at, in pixels; others work too."""
+    """Height and width of the training images, in pixels; other sizes work too."""
     near: float = 1.0
-    """Smallest z-depth, in scene units, where the camera knows none."""
     far: float = 100.0
-    """Largest z-depth, in scene units, where the camera knows none."""
     depth_chunk: int = 16
-    """Depths that are compared at a time; fewer need less memory and give the same."""
+    """Number of candidates per step; smaller values need less memory."""
 
     @property
     def patch(self) -> int:
-        """Sides of the images must be multiples of it, in pixels."""
+        """Side lengths of the images must be multiples of this, in pixels."""
         return 16
 
 
 class Backbone(nn.Module):
-    """Features of each view, alone and informed by those of the others."""
+    """Features of each view, with and without attention to the other views."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,13 +61,13 @@ class Backbone(nn.Module):
     def forward(
         self, images: Float[Tensor, "n 3 h w"], sources: Int[Tensor, "b v s"]
     ) -> tuple[Float[Tensor, "n 128 p q"], Float[Tensor, "n 128 p q"]]:
-        """Features informed by the others, and alone, of images in [0, 1]."""
+        """Encode images in [0, 1] into features with and without attention to the sources."""
         alone = self.backbone(normalised(images))[-1]
         return self.transformer(alone, sources), alone
 
 
 class DepthPredictor(nn.Module):
-    """Depth from a cost volume, refined at full resolution, and the raw channels with it."""
+    """Depth from a cost volume, refined at full resolution, and raw Gaussian channels."""
 
     def __init__(self, depth_chunk: int) -> None:
         super().__init__()
@@ -100,7 +95,7 @@ class DepthPredictor(nn.Module):
         cameras: Cameras,
         sources: Int[Tensor, "b v s"],
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n 1 h w"], Float[Tensor, "n channels h w"]]:
-        """Depth in scene units, opacity, and the raw channels of the Gaussians."""
+        """Predict depth in scene units, opacity, and the raw channels of the Gaussians."""
         views = sources.shape[1]
         coarse, certainty = self.coarse_disparity(informed, cameras, sources)
         features = self.upsampler(torch.cat([informed, alone], 1))
@@ -114,7 +109,7 @@ class DepthPredictor(nn.Module):
     def coarse_disparity(
         self, features: Float[Tensor, "n 128 p q"], cameras: Cameras, sources: Int[Tensor, "b v s"]
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n 1 h w"]]:
-        """Expected inverse depth, and the probability of the best, at full resolution."""
+        """Estimate inverse depth and the probability of the best candidate, at full resolution."""
         candidates = evenly_spaced(*cameras.inverse_range(), NUM_CANDIDATES)
         costs = cost_volume(features, cameras, sources, candidates, self.depth_chunk)
         joined = torch.cat([costs, features], 1)
@@ -126,7 +121,7 @@ class DepthPredictor(nn.Module):
 
 
 class MVSplat(nn.Module):
-    """The whole network: 12 M parameters, trained on pairs of views."""
+    """The MVSplat network: 12 M parameters, trained on pairs of views."""
 
     def __init__(self, config: MVSplatConfig = MVSplatConfig()) -> None:
         super().__init__()
@@ -135,7 +130,7 @@ class MVSplat(nn.Module):
         self.depth_predictor = DepthPredictor(config.depth_chunk)
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
-        """The Gaussians of all pixels of at least two views, whose sides are multiples of 16."""
+        """Predict a Gaussian for each pixel of at least two views with sides divisible by 16."""
         b, v = images.shape[:2]
         sources = other_views(b, v, images.device)
         flat = images.flatten(0, 1)

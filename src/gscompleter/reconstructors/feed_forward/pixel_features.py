@@ -1,4 +1,4 @@
-"""What DepthSplat and VolSplat know of each pixel before it becomes a Gaussian."""
+"""Depth and features per pixel, which DepthSplat and VolSplat share."""
 
 from __future__ import annotations
 
@@ -17,16 +17,13 @@ from gscompleter.reconstructors.feed_forward.depth_predictor import (
 from gscompleter.reconstructors.feed_forward.unet import two_convolutions
 
 REGRESSED = 64
-"""Channels that are made of all others; they come first."""
+"""Number of channels regressed from all others; they come first."""
 COLOUR = slice(REGRESSED, REGRESSED + 3)
-"""Where the colour of the pixel stands among the channels."""
+"""The colour channels of the pixel."""
 
 
 class PixelFeatures(nn.Module):
-    """The part that both networks share: depth, and features at full resolution.
-
-    Modules carry the names of the published weights, so that these load as they are.
-    """
+    """Network part that predicts depth and features at full resolution."""
 
     def __init__(self, config: DepthConfig) -> None:
         super().__init__()
@@ -39,7 +36,7 @@ class PixelFeatures(nn.Module):
     def describe(
         self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n c h w"]]:
-        """z-depth in scene units, and `channels` features, of the n = b v views."""
+        """Compute z-depth in scene units and `channels` features of n = b v views."""
         known = self.depth_predictor(images, cameras)
         features = self.feature_upsampler(known.vit_maps, known.maps)
         certainty = F.interpolate(known.certainty, size=images.shape[-2:])

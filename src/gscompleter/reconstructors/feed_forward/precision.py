@@ -1,4 +1,4 @@
-"""In which precision networks run."""
+"""Numerical precision of the networks."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from gscompleter.errors import InputError
 
 
 def check_precision(device: torch.device, dtype: torch.dtype) -> None:
-    """Raise an InputError where a network on `device` cannot run in `dtype`."""
+    """Raise InputError if a network on `device` cannot run in `dtype`."""
     if dtype != torch.float32 and device.type != "cuda":
         raise InputError(
-            f"The network lies on the {device.type} and {dtype} was asked for, which needs a GPU; "
-            "use float32."
+            f"The network runs on the {device.type} and {dtype} needs a GPU; use float32."
         )
 
 
 def lower_precision(device: torch.device, dtype: torch.dtype) -> torch.autocast:
-    """Within it, networks run in `dtype`; geometry stays in float32 by itself."""
+    """Run networks in `dtype` within this context; geometry stays in float32."""
     return torch.autocast(device.type, dtype, enabled=dtype != torch.float32)

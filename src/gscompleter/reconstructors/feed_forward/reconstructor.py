@@ -1,4 +1,4 @@
-"""Ψ of the paper: MVSplat, DepthSplat and VolSplat as reconstructors."""
+"""MVSplat, DepthSplat and VolSplat as reconstructors Ψ."""
 
 from __future__ import annotations
 
@@ -19,49 +19,39 @@ from gscompleter.reconstructors.feed_forward.volsplat import VolSplat, VoxelGaus
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, observed
 
 MAX_COEFFICIENTS = 16
-"""Spherical harmonics of degree 3, the highest that rasterisers of 3DGS show.
-
-MVSplat predicts degree 4, too, which its own rasteriser ignores as well.
-"""
+"""SH coefficients up to degree 3, the most that renderers of 3DGS use."""
 
 
 @dataclass(frozen=True)
 class FeedForward:
-    """Gaussians of all pixels, or of all voxels, from one pass of a network.
+    """Gaussians per pixel, or per voxel, from one pass of a network.
 
-    The networks have learnt the sizes of rooms in metres and of scenes that structure from
-    motion brought to a similar size. Depths follow the depth range of the cameras, but the
-    Gaussians of DepthSplat, and those and the voxels of VolSplat, have sizes in the unit these
-    were trained in: a scene in another unit, say millimetres, must be scaled to metres first.
+    The networks were trained on scenes in metres or of similar size. The Gaussians of DepthSplat
+    and VolSplat have sizes in that unit: scale a scene in millimetres to metres first.
     """
 
     network: MVSplat | DepthSplat | VolSplat
-    """With its weights, on the device where it is to run."""
     dtype: torch.dtype = torch.float32
-    """bfloat16 or float16 let a GPU run the network in lower precision (autocast); geometry
-    stays in float32. A CPU takes float32 only. No test covers it on a GPU."""
+    """Precision of the network under autocast; bfloat16 and float16 need a GPU (untested)."""
 
     def __post_init__(self) -> None:
         check_precision(self.device, self.dtype)
 
     @property
     def device(self) -> torch.device:
+        """The device of the network."""
         return next(self.network.parameters()).device
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
-        """A Gaussian for each pixel that the network sees (VolSplat: for each voxel that holds
-        such a pixel, without a note of which), and z-depths per view.
-
-        Images are cropped about their centres to one size, in multiples of 16 or 64 pixels;
-        outside of the crop depths are not valid.
+        """Reconstruct Gaussians and a z-depth map per view from central crops of equal size.
 
         Raises:
-            InputError: fewer than two views, images smaller than one patch, an empty depth range;
-                for VolSplat, poses or depths that spread its voxels too widely to be counted.
+            InputError: Fewer than two views, images smaller than one patch, an empty depth range,
+                or a scene too large for the voxels of VolSplat.
         """
         config = self.network.config
         images, cameras, crops = batch_of(views, config.patch, config.near, config.far)
-        # Not torch.inference_mode: the stages that follow optimise what comes from here.
+        # Not torch.inference_mode: later stages optimise these tensors.
         with torch.no_grad(), lower_precision(self.device, self.dtype):
             predicted = self.network(images.to(self.device), cameras.to(self.device))
         if isinstance(predicted, VoxelGaussians):
@@ -72,10 +62,7 @@ class FeedForward:
 def reconstruction_of(
     predicted: PixelGaussians, views: Sequence[View], crops: Sequence[Crop]
 ) -> Reconstruction:
-    """The only scene of a batch, on the device of its views.
-
-    z-depths follow from the means, which serves networks of z-depth and of distance alike.
-    """
+    """Create the reconstruction of one scene; z-depths follow from the means."""
     device = views[0].image.device
     gaussians = gaussians_of(predicted).to(device)
     per_view = crops[0].height * crops[0].width
@@ -88,7 +75,7 @@ def reconstruction_of(
 def reconstruction_of_voxels(
     predicted: VoxelGaussians, views: Sequence[View], crops: Sequence[Crop]
 ) -> Reconstruction:
-    """The scene on the device of its views; its Gaussians belong to no particular pixel."""
+    """Create the reconstruction of one scene, without source pixels."""
     device = views[0].image.device
     depths = [
         crop.padded(depth, view.camera)
@@ -98,7 +85,7 @@ def reconstruction_of_voxels(
 
 
 def gaussians_of(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
-    """Those of pixels view by view and row by row; without the harmonics that nothing shows."""
+    """Flatten the Gaussians view by view and row by row, with at most `MAX_COEFFICIENTS`."""
     return observed(
         predicted.means.flatten(0, -2),
         predicted.quats.flatten(0, -2),
@@ -109,6 +96,6 @@ def gaussians_of(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
 
 
 def depth_map_of(means: Float[Tensor, "n 3"], view: View, crop: Crop) -> DepthMap:
-    """z-depth of the Gaussians of the crop, in the whole image."""
+    """Compute the z-depth of the Gaussians of the crop, in the whole image."""
     z = z_depths(means, view.camera)
     return crop.padded(z.view(crop.height, crop.width), view.camera)

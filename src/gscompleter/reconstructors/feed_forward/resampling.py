@@ -1,4 +1,4 @@
-"""Maps of another size."""
+"""Bilinear resizing of feature maps."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from torch import Tensor
 
 
 def resized(x: Float[Tensor, "n c h w"], size: tuple[int, int]) -> Float[Tensor, "n c p q"]:
-    """Bilinear, with the corners' centres kept in place."""
+    """Resize a map bilinearly; the centres of the corner pixels stay in place."""
     return F.interpolate(x, size=size, mode="bilinear", align_corners=True)
 
 
 def enlarged(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c p q"]:
-    """`factor` times as high and as wide."""
+    """Enlarge a map by `factor` in both directions."""
     return resized(x, (factor * x.shape[2], factor * x.shape[3]))

@@ -1,4 +1,4 @@
-"""The sparse U-Net that refines the features of VolSplat's voxels."""
+"""The sparse U-Net that refines VolSplat's voxel features."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from gscompleter.reconstructors.feed_forward.sparse import (
 )
 
 CHANNELS = (64, 128, 256, 512)
-"""Widths of the levels, from twice the stride of the input to sixteen times."""
+"""Channels of the levels, from 2 to 16 times the stride of the input."""
 
 
 class RowNorm(nn.Module):
-    """Batch normalisation with every cell as a sample."""
+    """Batch normalisation with each cell as a sample."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.bn = nn.BatchNorm1d(channels)
 
     def forward(self, features: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+        """Normalise the features."""
         return self.bn(features)
 
 
@@ -41,11 +42,12 @@ class ConvBlock(nn.Module):
     def forward(
         self, features: Float[Tensor, "n channels_in"], neighbours: Neighbours
     ) -> Float[Tensor, "m channels_out"]:
+        """Apply the block."""
         return F.relu(self.norm(self.conv(features, neighbours)))
 
 
 class UpBlock(nn.Module):
-    """Transposed convolution, normalisation, ReLU; `downward` is the table it goes back along."""
+    """Transposed convolution, normalisation, ReLU."""
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
@@ -55,11 +57,12 @@ class UpBlock(nn.Module):
     def forward(
         self, features: Float[Tensor, "m channels_in"], downward: Neighbours
     ) -> Float[Tensor, "n channels_out"]:
+        """Apply the block along the transpose of `downward`."""
         return F.relu(self.norm(self.upconv(features, downward.transposed())))
 
 
 class DecoderBlock(nn.ModuleList):
-    """Up to the next grid, where the features of the encoder join."""
+    """Upsampling to the next grid, joined with the features of the encoder."""
 
     def __init__(self, width: int) -> None:
         super().__init__([UpBlock(2 * width, width), PointwiseConv(2 * width, width)])
@@ -70,15 +73,13 @@ class DecoderBlock(nn.ModuleList):
         downward: Neighbours,
         encoded: Float[Tensor, "n width"],
     ) -> Float[Tensor, "n width"]:
+        """Upsample `features` and join them with `encoded`."""
         up, join = self
         return join(torch.cat([up(features, downward), encoded], dim=1))
 
 
 class SparseUNet(nn.Module):
-    """Four halvings of the grid and four doublings, each joined with what the halving saw.
-
-    The names of the modules are those of the published weights.
-    """
+    """Four halvings and four doublings of the grid, with skip connections."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -89,7 +90,7 @@ class SparseUNet(nn.Module):
         self.final_upsample = UpBlock(a, channels)
 
     def forward(self, features: Float[Tensor, "n c"], grid: Grid) -> Float[Tensor, "n c"]:
-        """Refined features of the cells of `grid`."""
+        """Refine the features of the cells of `grid`."""
         tables, coarsest = hierarchy_over(grid, len(CHANNELS))
         x, encoded = features, []
         for encoder, downward in zip(self.encoders, tables[:-1], strict=True):

@@ -1,10 +1,8 @@
-"""How the networks turn view-dependent colour into the world: a rotation in the basis of e3nn.
+"""Rotation of spherical harmonics (SH) in the basis of e3nn.
 
-MVSplat and DepthSplat predict spherical harmonics in camera axes and rotate them with matrices
-for the basis of e3nn, whose polar axis is y: degree 1 is (x, y, z). Then they render them in the
-basis of 3DGS, where degree 1 is (-y, z, -x), without conversion. That is no rotation of the
-colours, but the published weights were trained with it, so that this is what they need. This
-file is the only place that knows; all else takes the result for harmonics of 3DGS.
+MVSplat and DepthSplat rotate SH from camera to world axes in the basis of e3nn, where degree 1 is
+(x, y, z), but render them in the basis of 3DGS, where it is (-y, z, -x). This does not rotate
+colours correctly, but the published weights were trained with it.
 """
 
 from __future__ import annotations
@@ -19,33 +17,33 @@ from torch import Tensor
 from gscompleter.reconstructors.feed_forward.cameras import full_precision
 
 NUM_DIRECTIONS = 64
-"""Directions at which harmonics are compared; 2 * degree + 1 would be the least."""
+"""Number of sample directions for the least-squares fit; 2 * degree + 1 is the minimum."""
 
 
 def rotate_sh(
     sh: Float[Tensor, "b v h w k 3"], rotations: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w k 3"]:
-    """Harmonics of k = (degree + 1)² coefficients, rotated in the basis of e3nn."""
-    turned = [sh[..., :1, :]]
+    """Rotate k = (degree + 1)² SH coefficients in the basis of e3nn."""
+    rotated = [sh[..., :1, :]]
     with full_precision(sh):
         for degree in range(1, isqrt(sh.shape[-2])):
             part = sh[..., degree**2 : (degree + 1) ** 2, :]
             matrices = rotation_of_degree(degree, rotations)
-            turned.append(torch.einsum("bvij,bvhwjc->bvhwic", matrices, part))
-    return torch.cat(turned, dim=-2)
+            rotated.append(torch.einsum("bvij,bvhwjc->bvhwic", matrices, part))
+    return torch.cat(rotated, dim=-2)
 
 
 def rotation_of_degree(degree: int, rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n m m"]:
-    """The Wigner matrices D with `Y(R d) = D Y(d)` for all directions d, by least squares."""
+    """Compute Wigner matrices D with `Y(R d) = D Y(d)` for all directions d, by least squares."""
     directions, inverse = sampled_harmonics(degree)
-    turned = directions.to(rotations.device) @ rotations.double().transpose(-1, -2)
-    matrices = inverse.to(rotations.device) @ harmonics(degree, turned)
+    rotated = directions.to(rotations.device) @ rotations.double().transpose(-1, -2)
+    matrices = inverse.to(rotations.device) @ harmonics(degree, rotated)
     return matrices.transpose(-1, -2).to(rotations.dtype)
 
 
 @cache
 def sampled_harmonics(degree: int) -> tuple[Float64[Tensor, "d 3"], Float64[Tensor, "m d"]]:
-    """Directions all over the sphere, and the pseudo-inverse of the harmonics at them."""
+    """Sample directions on the sphere, with the pseudo-inverse of the SH at them."""
     number = torch.arange(NUM_DIRECTIONS, dtype=torch.float64)
     y = 1 - (2 * number + 1) / NUM_DIRECTIONS
     azimuth = number * pi * (3 - sqrt(5))
@@ -55,7 +53,7 @@ def sampled_harmonics(degree: int) -> tuple[Float64[Tensor, "d 3"], Float64[Tens
 
 
 def harmonics(degree: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n m"]:
-    """Real spherical harmonics of orders -degree to degree at unit directions, with pole y."""
+    """Evaluate real SH of orders -degree to degree at unit directions, with polar axis y."""
     x, y, z = directions.unbind(-1)
     values = {}
     cosine, sine = torch.ones_like(x), torch.zeros_like(x)  # of order * azimuth, from z to x
@@ -69,7 +67,7 @@ def harmonics(degree: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "
 
 
 def associated_legendre(degree: int, order: int, t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """`P(t) / (1 - t²)^(order / 2)`, without the Condon-Shortley sign."""
+    """Evaluate `P(t) / (1 - t²)^(order / 2)` without the Condon-Shortley sign."""
     before, value = torch.zeros_like(t), torch.full_like(t, prod(range(1, 2 * order, 2)))
     for n in range(order + 1, degree + 1):
         following = ((2 * n - 1) * t * value - (n + order - 1) * before) / (n - order)

@@ -1,4 +1,4 @@
-"""The multi-view transformer of MVSplat and DepthSplat: window attention in and across views."""
+"""The multi-view transformer of MVSplat and DepthSplat, with window attention."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gscompleter.reconstructors.feed_forward.cameras import select
 
 SPLITS = 2
-"""Windows along each side of a feature map."""
+"""Number of windows along each side of a feature map."""
 
 
 class WindowAttention(nn.Module):
@@ -32,7 +32,7 @@ class WindowAttention(nn.Module):
         sources: Float[Tensor, "n s h w c"],
         mask: Float[Tensor, "windows p p"] | None,
     ) -> Float[Tensor, "n h w c"]:
-        """What each pixel of `x` learns from `sources`; with a `mask`, windows are shifted."""
+        """Attend from `x` to `sources`; with a `mask`, windows are shifted."""
         _, h, w, _ = x.shape
         shift = (0, 0) if mask is None else (h // SPLITS // 2, w // SPLITS // 2)
         back = (-shift[0], -shift[1])
@@ -40,16 +40,15 @@ class WindowAttention(nn.Module):
         sources = sources.roll(back, (2, 3))
         key, value = to_windows(self.k_proj(sources)), to_windows(self.v_proj(sources))
         if mask is not None:
-            # Keys of several views lie pixel by pixel, while the published models were trained
-            # with the mask repeated view by view. We do as they did: it matters from two
-            # source views on.
+            # The keys are ordered pixel by pixel, but the mask is repeated view by view, as in
+            # the training of the published models. It matters with two or more source views.
             mask = mask.repeat(1, 1, sources.shape[1])
         attended = F.scaled_dot_product_attention(query, key, value, mask)
         return self.norm1(self.merge(from_windows(attended, h, w).roll(shift, (1, 2))))
 
 
 class WindowAttentionAndMlp(WindowAttention):
-    """Window attention whose message passes a multi-layer perceptron together with `x`."""
+    """Window attention followed by an MLP on its result and the input."""
 
     def __init__(self, channels: int) -> None:
         super().__init__(channels)
@@ -66,6 +65,7 @@ class WindowAttentionAndMlp(WindowAttention):
         sources: Float[Tensor, "n s h w c"],
         mask: Float[Tensor, "windows p p"] | None,
     ) -> Float[Tensor, "n h w c"]:
+        """Apply attention, then the MLP."""
         message = super().forward(x, sources, mask)
         return self.norm2(self.mlp(torch.cat([x, message], -1)))
 
@@ -84,14 +84,15 @@ class TransformerLayer(nn.Module):
         sources: Int[Tensor, "b v s"],
         mask: Float[Tensor, "windows p p"] | None,
     ) -> Float[Tensor, "b v h w c"]:
-        seen = select(x, sources).flatten(0, 1)
+        """Apply self-attention, then cross-attention."""
+        source_maps = select(x, sources).flatten(0, 1)
         own = x.flatten(0, 1)
         own = own + self.self_attn(own, own[:, None], mask)
-        return (own + self.cross_attn_ffn(own, seen, mask)).view_as(x)
+        return (own + self.cross_attn_ffn(own, source_maps, mask)).view_as(x)
 
 
 class MultiViewTransformer(nn.Module):
-    """Six layers; every other one has its windows shifted by half their size."""
+    """Six layers; every other one has windows shifted by half their size."""
 
     def __init__(self, channels: int = 128, num_layers: int = 6) -> None:
         super().__init__()
@@ -100,7 +101,7 @@ class MultiViewTransformer(nn.Module):
     def forward(
         self, features: Float[Tensor, "n c h w"], sources: Int[Tensor, "b v s"]
     ) -> Float[Tensor, "n c h w"]:
-        """Features of all n = b v views, informed by those of their `sources`."""
+        """Enrich the features of n = b v views with those of their `sources`."""
         x = (features + position_in_window(features)).unflatten(0, sources.shape[:2])
         x = x.permute(0, 1, 3, 4, 2)
         height, width = x.shape[2:4]
@@ -111,7 +112,7 @@ class MultiViewTransformer(nn.Module):
 
 
 def to_windows(x: Float[Tensor, "n s h w c"]) -> Float[Tensor, "n windows p c"]:
-    """Windows of p pixels of s views: the view changes fastest, then column and row."""
+    """Split maps into windows of p pixels of s views; the view index changes fastest."""
     x = x.unflatten(3, (SPLITS, -1)).unflatten(2, (SPLITS, -1))
     return x.permute(0, 2, 4, 3, 5, 1, 6).flatten(3, 5).flatten(1, 2)
 
@@ -119,7 +120,7 @@ def to_windows(x: Float[Tensor, "n s h w c"]) -> Float[Tensor, "n windows p c"]:
 def from_windows(
     windows: Float[Tensor, "n windows p c"], height: int, width: int
 ) -> Float[Tensor, "n {height} {width} c"]:
-    """The inverse of `to_windows` for a single view."""
+    """Invert `split_windows` for a single view."""
     x = windows.unflatten(1, (SPLITS, SPLITS)).unflatten(3, (height // SPLITS, width // SPLITS))
     return x.permute(0, 1, 3, 2, 4, 5).flatten(3, 4).flatten(1, 2)
 
@@ -127,7 +128,7 @@ def from_windows(
 def shifted_window_mask(
     height: int, width: int, device: torch.device
 ) -> Float[Tensor, "windows p p"]:
-    """What is added to scores in shifted windows: -100 where the roll joined opposite borders."""
+    """Create the attention bias of shifted windows: -100 between opposite image borders."""
 
     def bands(size: int) -> Tensor:
         window = size // SPLITS
@@ -142,7 +143,7 @@ def shifted_window_mask(
 
 
 def position_in_window(features: Float[Tensor, "n c h w"]) -> Float[Tensor, "c h w"]:
-    """Sines and cosines of the row, then of the column, within each window (as in DETR)."""
+    """Encode row and column within each window by sines and cosines (as in DETR)."""
     _, channels, height, width = features.shape
     order = torch.arange(channels // 2, device=features.device)
     period = 10000 ** (2 * (order // 2) / len(order))

@@ -1,7 +1,6 @@
-"""The U-Net that both networks refine their cost volumes with: that of latent diffusion without
-time steps, with attention across the pixels of all views of a scene.
+"""The U-Net of latent diffusion without time steps, with attention across views.
 
-MVSplat normalises after each convolution, DepthSplat before it; `pre_norm` tells them apart.
+MVSplat normalises after each convolution, DepthSplat before it (`pre_norm`).
 """
 
 from __future__ import annotations
@@ -16,10 +15,12 @@ HEAD = 32
 
 
 def conv3x3(channels: int, out: int, stride: int = 1) -> nn.Conv2d:
+    """Create a 3x3 convolution with zero padding."""
     return nn.Conv2d(channels, out, 3, stride, 1)
 
 
 def group_norm(channels: int) -> nn.GroupNorm:
+    """Create a norm over 8 groups of channels."""
     return nn.GroupNorm(8, channels)
 
 
@@ -30,7 +31,7 @@ class ResidualBlock(nn.Module):
         super().__init__()
         if pre_norm:
             self.in_layers = nn.Sequential(group_norm(channels), nn.SiLU(), conv3x3(channels, out))
-            # The dropout does nothing; it stands here because keys count the layers.
+            # The dropout has no effect but keeps the indices in the keys of the weights.
             self.out_layers = nn.Sequential(
                 group_norm(out), nn.SiLU(), nn.Dropout(0.0), conv3x3(out, out)
             )
@@ -40,11 +41,12 @@ class ResidualBlock(nn.Module):
         self.skip_connection = nn.Identity() if channels == out else nn.Conv2d(channels, out, 1)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
+        """Apply the block."""
         return self.skip_connection(x) + self.out_layers(self.in_layers(x))
 
 
 class ViewAttention(nn.Module):
-    """Attention of every pixel to all pixels of all views of its scene."""
+    """Self-attention over the pixels of all views of a scene."""
 
     def __init__(self, channels: int, pre_norm: bool) -> None:
         super().__init__()
@@ -54,7 +56,7 @@ class ViewAttention(nn.Module):
         self.proj_out = nn.Conv1d(channels, channels, 1)
 
     def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n c h w"]:
-        """Only the attention joins the views of a scene; the norm sees each view alone."""
+        """Apply attention across the views of a scene; the norm treats each view separately."""
         y = self.norm(x) if self.pre_norm else x
         y = y.flatten(2).unflatten(0, (-1, views)).transpose(1, 2).flatten(2)
         y = self.proj_out(self.attended(self.qkv(y)))
@@ -62,54 +64,58 @@ class ViewAttention(nn.Module):
         return x + (y if self.pre_norm else self.norm(y))
 
     def attended(self, qkv: Float[Tensor, "b three_c t"]) -> Float[Tensor, "b c t"]:
-        """Values as each of t tokens attends to them; channels lie head by head as q, k, v."""
+        """Attend among t tokens; each head has its q, k and v as consecutive channels."""
         q, k, v = qkv.unflatten(1, (-1, 3, HEAD)).transpose(-1, -2).unbind(2)
         return F.scaled_dot_product_attention(q, k, v).transpose(-1, -2).flatten(1, 2)
 
 
 class Downsample(nn.Module):
-    """To half the size."""
+    """Convolution to half the resolution."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.op = conv3x3(channels, channels, stride=2)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c p q"]:
+        """Downsample the map."""
         return self.op(x)
 
 
 class Upsample(nn.Module):
-    """To twice the size."""
+    """Convolution at twice the resolution."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.conv = conv3x3(channels, channels)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c 2*h 2*w"]:
+        """Upsample the map."""
         return self.conv(F.interpolate(x, scale_factor=2, mode="nearest"))
 
 
 class Steps(nn.ModuleList):
-    """Modules one after the other, of which some look across the views of a scene."""
+    """A sequence of modules, some of which need the number of views per scene."""
 
     def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n o p q"]:
+        """Apply the modules in order."""
         for step in self:
             x = step(x, views) if isinstance(step, ViewAttention | UNet) else step(x)
         return x
 
 
 def refiner(channels: int, width: int, unet: UNet) -> Steps:
-    """A U-Net of `width` on maps of `channels`, with a convolution before and after it."""
+    """Create a U-Net of `width` channels between two convolutions."""
     before = [conv3x3(channels, width), group_norm(width), nn.GELU()]
     return Steps([*before, unet, conv3x3(width, width)])
 
 
 def two_convolutions(channels: int, width: int, out: int) -> nn.Sequential:
+    """Create two 3x3 convolutions with a GELU between them."""
     return nn.Sequential(conv3x3(channels, width), nn.GELU(), conv3x3(width, out))
 
 
 class UNet(nn.Module):
-    """A U-Net of constant width, with attention at the level `attention_level` (0 is finest)."""
+    """A U-Net of constant width, with attention at `attention_level` (0 is finest)."""
 
     def __init__(self, channels: int, levels: int, attention_level: int, pre_norm: bool) -> None:
         super().__init__()
@@ -140,7 +146,7 @@ class UNet(nn.Module):
         self.out = nn.Sequential(*out)
 
     def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n c h w"]:
-        """Maps of n = b v images, the `views` of a scene one after the other."""
+        """Refine the maps of n = b v images, with `views` consecutive images per scene."""
         skipped = []
         for block in self.input_blocks:
             x = block(x, views)

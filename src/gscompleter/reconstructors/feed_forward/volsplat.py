@@ -1,8 +1,4 @@
-"""VolSplat (Wang et al., 2025): Gaussians from voxels that gather the pixels of all views.
-
-Modules carry the names of the published weights (`spare_unet` among them), so that these load as
-they are.
-"""
+"""VolSplat (Wang et al., 2025): Gaussians from voxels that average the pixels of all views."""
 
 from __future__ import annotations
 
@@ -29,43 +25,37 @@ from gscompleter.reconstructors.feed_forward.voxels import Voxels, voxelize
 from gscompleter.types import sh_from_rgb
 
 NUM_SH = 9
-"""Harmonics (degree 2)."""
+"""SH coefficients (degree 2)."""
 PARTS = (1, 3, 3, 4, 3 * NUM_SH)
-"""Channels of opacity, offset, scale, rotation and harmonics."""
+"""Channels of opacity, offset, scale, rotation and SH."""
 REACH = 1.5
-"""How far a Gaussian may lie from the mean of its voxel along each axis, in voxels."""
+"""Largest offset of a Gaussian from the mean of its voxel along each axis, in voxels."""
 
 
 @dataclass(frozen=True)
 class VolSplatConfig(DepthSplatConfig):
-    """What DepthSplat base has, and voxels."""
+    """Settings of DepthSplat base, and the voxel size."""
 
     depth: DepthConfig = BASE
-    """The depth predictor, that of DepthSplat base."""
     voxel_resolution: float = 0.001
-    """Side of a voxel, in scene units."""
+    """Side length of a voxel, in scene units."""
 
 
 @dataclass(frozen=True)
 class VoxelGaussians:
-    """What the network makes of a scene: one Gaussian for each voxel, and depths per view."""
+    """One Gaussian per voxel of `grid`, with the conventions of `Gaussians`, and z-depth maps."""
 
     depth: Float[Tensor, "v h w"]
-    """z-depth of the pixels."""
     grid: Grid
-    """The voxels, in the order of the Gaussians."""
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
-    """Rotations as wxyz quaternions."""
     scales: Float[Tensor, "n 3"]
-    """Standard deviations along the rotated axes, in scene units."""
     opacities: Float[Tensor, "n"]
     sh: Float[Tensor, "n 9 3"]
-    """Spherical harmonics in the basis of 3DGS."""
 
 
 class GaussianHead(nn.Module):
-    """From the features of voxels to the raw channels of their Gaussians."""
+    """Two sparse convolutions from voxel features to raw Gaussian channels."""
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
@@ -75,12 +65,13 @@ class GaussianHead(nn.Module):
     def forward(
         self, features: Float[Tensor, "n channels_in"], grid: Grid
     ) -> Float[Tensor, "n channels_out"]:
+        """Apply both convolutions."""
         neighbours = neighbours_within(grid)
         return self.conv2(F.gelu(self.conv1(features, neighbours)), neighbours)
 
 
 class VolSplat(PixelFeatures):
-    """The whole network: 138 M parameters."""
+    """The VolSplat network: 138 M parameters."""
 
     def __init__(self, config: VolSplatConfig = VolSplatConfig()) -> None:
         super().__init__(config.depth)
@@ -89,12 +80,7 @@ class VolSplat(PixelFeatures):
         self.gaussian_head = GaussianHead(self.channels, sum(PARTS))
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> VoxelGaussians:
-        """The Gaussians of all voxels of one scene; see `DepthPredictor` for the images.
-
-        Raises:
-            InputError: depths that are not finite, or voxels spread too widely to be counted.
-            ValueError: several scenes, whose numbers of voxels would differ.
-        """
+        """Predict a Gaussian for each voxel of one scene; see `DepthPredictor` for the images."""
         if len(images) != 1:
             raise ValueError(f"VolSplat takes one scene at a time, got {len(images)}")
         depth, features = self.describe(images, cameras)
@@ -108,7 +94,7 @@ class VolSplat(PixelFeatures):
 
 
 def world_points(depth: Float[Tensor, "n 1 h w"], cameras: Cameras) -> Float[Tensor, "p 3"]:
-    """The centres of all pixels at their z-depth, in the world, view by view and row by row."""
+    """Unproject all pixel centres to world space, view by view and row by row."""
     along = per_pixel(depth, cameras)
     centered = along.new_zeros((*along.shape[:4], 2))
     in_camera = z_rays(centered, cameras) * along
@@ -123,11 +109,7 @@ def voxel_gaussians(
     depth: Float[Tensor, "v h w"],
     config: VolSplatConfig,
 ) -> VoxelGaussians:
-    """The Gaussians of the voxels.
-
-    Offsets, axes and harmonics are those of the world. The constant harmonic is the mean colour
-    of the pixels of the voxel; what the network says of it counts for nothing.
-    """
+    """Create the Gaussians of the voxels; the constant SH is the mean pixel colour."""
     opacity, offset, scale, rotation, sh = raw.split(PARTS, dim=1)
     reach = REACH * config.voxel_resolution
     return VoxelGaussians(

@@ -1,4 +1,4 @@
-"""Points with features gathered into voxels."""
+"""Averaging of point features in voxels."""
 
 from __future__ import annotations
 
@@ -14,24 +14,21 @@ from gscompleter.reconstructors.feed_forward.sparse import Grid, unique_rows
 
 @dataclass(frozen=True)
 class Voxels:
-    """The occupied voxels of a cloud of points, in the order of their coordinates."""
+    """The occupied voxels of a point cloud, with mean point and mean features of each."""
 
     grid: Grid
-    """Coordinates of the voxels: those of their centres, in units of the resolution."""
+    """Centres of the voxels, in units of the resolution."""
     points: Float[Tensor, "n 3"]
-    """Mean of the points of each voxel."""
     features: Float[Tensor, "n c"]
-    """Mean of their features."""
 
 
 def voxelize(
     points: Float[Tensor, "p 3"], features: Float[Tensor, "p c"], resolution: float
 ) -> Voxels:
-    """The voxels of side `resolution`, in the unit of `points`, that hold a point.
+    """Group points into voxels of side `resolution`, in the unit of `points`.
 
     Raises:
-        InputError: a resolution that is not positive, no points, points that are not finite, or
-            so far apart that their voxels cannot be counted.
+        InputError: Resolution not positive, or points missing, not finite, or too far apart.
     """
     if not resolution > 0:
         raise InputError(f"The side of a voxel is {resolution:g}; it must be positive.")
@@ -40,7 +37,7 @@ def voxelize(
             "Some points to voxelize are not finite, or farther away than 64-bit numbers count; "
             "check poses and depth range."
         )
-    # Halves are rounded to even, as the published models were trained.
+    # torch.round rounds halves to even, as in the training of the published models.
     coordinates = torch.round(points / resolution).long()
     rows, voxel = unique_rows(torch.nn.functional.pad(coordinates, (1, 0)))
     return Voxels(
@@ -51,6 +48,6 @@ def voxelize(
 def mean_rows(
     rows: Float[Tensor, "p c"], group: Int64[Tensor, "p"], num_groups: int
 ) -> Float[Tensor, "groups c"]:
-    """The mean of the rows of each group; every group has one."""
+    """Average the rows of each group; no group may be empty."""
     total = rows.new_zeros((num_groups, rows.shape[1])).index_add_(0, group, rows)
     return total / group.bincount(minlength=num_groups)[:, None]

@@ -1,4 +1,4 @@
-"""Ψ without weights: plane-sweep stereo, from posed photographs to pixel-sized Gaussians."""
+"""Ψ without weights: plane-sweep stereo that turns posed photographs into Gaussians."""
 
 from gscompleter.reconstructors.plane_sweep.reconstructor import PlaneSweep
 

@@ -1,4 +1,4 @@
-"""Semi-global aggregation: neighbouring pixels of like colour prefer like depths."""
+"""Semi-global aggregation of costs: neighbours of similar colour get similar depths."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from gscompleter.kernels.stereo import Bands
 from gscompleter.matching.stereo_image import StereoImage, contrast
 
 SMALL_PENALTY = 25
-"""Cost of a change by one plane between neighbours."""
+"""Cost of a change by one plane between neighbouring pixels."""
 LARGE_PENALTY = 300
-"""Cost of a jump between neighbours of the same colour."""
+"""Cost of a larger jump between neighbouring pixels of the same colour."""
 EDGE_CONTRAST = 0.06
-"""Difference of colour at which the penalty of a jump has halved."""
+"""Colour difference at which the penalty of a jump is halved."""
 
 
 def aggregate(
     costs: UInt8[np.ndarray, "cells"], bands: Bands, reference: StereoImage
 ) -> Int16[np.ndarray, "cells"]:
-    """Costs summed along eight paths through the image; jumps are cheap at its edges."""
+    """Sum the costs along eight paths through the image; jumps are cheap at image edges."""
     image = reference.image
 
     def jump(

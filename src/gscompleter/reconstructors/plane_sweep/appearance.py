@@ -1,8 +1,7 @@
-"""Opacities and colours that bring the Gaussians nearer to their photographs; geometry stays.
+"""Opacities and colours fitted to two photographs; the geometry stays fixed.
 
-Pixels become Gaussians at the depth that stereo gave them, all of them opaque. Where two views
-disagree, one of them stands in the other's way; drawn on top of each other they blur. A few steps
-of descent tell which of the two to believe, and give the colours the sharpness that drawing takes.
+Stereo gives every pixel an opaque Gaussian; views that disagree on a surface occlude each other. A
+few gradient steps fade the wrong Gaussians and sharpen the colours.
 """
 
 from __future__ import annotations
@@ -17,26 +16,25 @@ from gscompleter.render import Renderer
 from gscompleter.types import SH_C0, Gaussians, View, sh_from_rgb
 
 OPACITY_STEPS = 6
-"""Steps of Adam on the opacities, each by one of the photographs in turn."""
+"""Adam steps on the opacities; each step uses one photograph, in turn."""
 LEARNING_RATE = 1.0
-"""Step of Adam, on the logit."""
 BETAS = 0.7, 0.99
-"""Decay of Adam's means: shorter than usual, as the steps are few."""
+"""Adam decay rates, short because there are few steps."""
 REMOVAL_PENALTY = 0.01
-"""Cost of an opacity taken away, so that what no photograph objects to stays."""
+"""Loss per unit of removed opacity; keeps Gaussians that no photograph contradicts."""
 COLOUR_STEPS = 4
-"""Rounds of correcting the colours."""
+"""Iterations of the colour correction."""
 RELAXATION = 1.7
-"""How far a round goes, as a multiple of the mean difference; under 2 the rounds converge."""
+"""Step size as a multiple of the mean residual; below 2 the iterations converge."""
 
 
 def fit_appearance(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
-    """`gaussians` with opacities and colours fitted to `views`."""
+    """Fit opacities, then colours, to the photographs."""
     return fit_colours(fit_opacities(gaussians, views, renderer), views, renderer)
 
 
 def fit_opacities(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
-    """The L1 difference from the photographs, plus a cost of whatever is taken away."""
+    """Minimize the L1 image difference plus a penalty on removed opacity."""
     nothing = gaussians[:0]
     plans = [(renderer.freeze(nothing, v.camera).plan(gaussians), v.image) for v in views]
     logits = gaussians.opacities.logit(eps=1e-4).requires_grad_()
@@ -52,16 +50,12 @@ def fit_opacities(gaussians: Gaussians, views: Sequence[View], renderer: Rendere
 
 
 def fit_colours(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
-    """Each colour moved, again and again, along the mean difference from the photographs.
-
-    The mean is weighted by the share that the Gaussian has in each pixel: SIRT (Gilbert 1972), as
-    the image is linear in the colours.
-    """
+    """Fit the colours by SIRT (Gilbert 1972), as the image is linear in them."""
     nothing, colours = gaussians[:0], gaussians.sh[:, 0] * SH_C0 + 0.5
     plans = [(renderer.freeze(nothing, v.camera).plan_colours(gaussians), v.image) for v in views]
     for _ in range(COLOUR_STEPS):
         sums, weights = zip(*(errors(colours, image) for errors, image in plans), strict=True)
-        # What is hardly drawn is hardly known.
-        drawn = torch.stack(weights).sum(0).clamp_min(0.05)
-        colours = colours + RELAXATION * torch.stack(sums).sum(0) / drawn[:, None]
+        # The lower bound damps Gaussians that hardly contribute to any image.
+        total = torch.stack(weights).sum(0).clamp_min(0.05)
+        colours = colours + RELAXATION * torch.stack(sums).sum(0) / total[:, None]
     return replace(gaussians, sh=sh_from_rgb(colours))

@@ -1,4 +1,4 @@
-"""Which planes each tile of an image is matched at: all of them, or those around a first guess."""
+"""Depth bands: the range of planes that each image tile is matched at."""
 
 from __future__ import annotations
 
@@ -10,27 +10,23 @@ from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS, Bands
 
 Map = Float32[np.ndarray, "h w"]
 MEDIAN = 5
-"""Side of the square whose median stands for a first guess, so that outliers widen no band."""
+"""Size in pixels of the median filter that removes outliers from a first guess."""
 REACH = 1
-"""Tiles meet what lies so many pixels beside them, in the image that the guess was made in."""
+"""Margin in pixels of the first guess by which a band includes surrounding depths."""
 SPARE = 3
-"""Planes on either side of those that were guessed."""
+"""Extra planes on both sides of the guessed range."""
 
 
 def every_plane(size: tuple[int, int], planes: int) -> Bands:
-    """The band of all planes, for an image of that height and width."""
+    """Create bands with all planes for an image of `size` (height, width)."""
     shape = tiles_of(size)
     return bands_of(np.zeros(shape, int), np.full(shape, planes), size)
 
 
 def around(guess: Map, shrinkage: int, size: tuple[int, int], planes: int) -> Bands:
-    """Bands around the planes that were guessed in a smaller image.
+    """Create bands around the planes `guess` of an image `1 / shrinkage` the size.
 
-    Args:
-        guess: Fractions of planes, of an image of `1 / shrinkage` the size.
-        shrinkage: How many pixels one of its pixels stands for, across and down.
-        size: Height and width of the image that is to be matched.
-        planes: How many there are.
+    `size` is the height and width of the full image, `planes` the number of planes.
     """
     likely = cv2.medianBlur(guess, MEDIAN)
     window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
@@ -44,7 +40,7 @@ def around(guess: Map, shrinkage: int, size: tuple[int, int], planes: int) -> Ba
 def over_tiles(
     extreme: np.ufunc, values: Map, shrinkage: int, size: tuple[int, int]
 ) -> Float32[np.ndarray, "r c"]:
-    """The extreme of the values of each tile."""
+    """Reduce the values of each tile with `extreme` (minimum or maximum)."""
     tops, lefts = (
         np.arange(count) * side // shrinkage
         for count, side in zip(tiles_of(size), (TILE_ROWS, TILE_COLUMNS), strict=True)
@@ -53,14 +49,14 @@ def over_tiles(
 
 
 def tiles_of(size: tuple[int, int]) -> tuple[int, int]:
-    """Rows and columns of tiles."""
+    """Count the rows and columns of tiles."""
     return -(-size[0] // TILE_ROWS), -(-size[1] // TILE_COLUMNS)
 
 
 def bands_of(
     low: Int[np.ndarray, "r c"], high: Int[np.ndarray, "r c"], size: tuple[int, int]
 ) -> Bands:
-    """Bands from plane `low` up to `high`, which is excluded, one for each tile."""
+    """Build one band per tile, from plane `low` up to but excluding `high`."""
     rows, columns = tiles_of(size)
     heights = np.diff(np.append(np.arange(rows) * TILE_ROWS, size[0]))
     widths = np.diff(np.append(np.arange(columns) * TILE_COLUMNS, size[1]))

@@ -1,10 +1,8 @@
-"""Small errors of the poses, as far as stereo suffers from them.
+"""Correction of small rotation errors in the given poses.
 
-A match is looked for on its epipolar line. Where poses are off by a pixel it lies beside the line,
-and what is found on it is something else. A small rotation of one camera brings the lines back to
-the matches. Only the motion across the lines can be told: along them, an error of the pose looks
-like another depth. The rotation is therefore the one that moves pixels along their lines as little
-as possible, and depths keep the scale that the given poses imply.
+A pose error of one pixel puts a match beside its epipolar line; a small rotation of one camera
+moves the lines back onto the feature matches. Motion along a line cannot be separated from depth,
+so it is kept small, and depths keep the scale of the given poses.
 """
 
 from __future__ import annotations
@@ -19,23 +17,17 @@ from gscompleter.matching.features import Pixels
 from gscompleter.matching.stereo_image import StereoImage, source_from_reference
 
 MIN_MATCHES = 20
-"""Fewest matches that tell a rotation; with fewer the poses stay as they are."""
+"""Fewest matches for a correction; with fewer the pose is kept."""
 MAX_DISTANCE = 8.0
-"""Pixels beside its line beyond which a match is none."""
+"""Largest distance of a valid match from its epipolar line, in pixels."""
 ITERATIONS = 20
-"""Of reweighting, which makes false matches harmless."""
+"""Iterations of reweighted least squares, which suppresses false matches."""
 
 
 def rotated_to_matches(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> StereoImage:
-    """`source`, rotated about its centre so that `matched` lie on the lines of `pixels`.
-
-    Args:
-        reference, source: The two views.
-        pixels: Features of `reference` [m, 2].
-        matched: The same features in `source` [m, 2].
-    """
+    """Rotate `source` about its centre so that matches lie on their epipolar lines."""
     if len(pixels) == 0:
         return source
     distance, normal = distances(reference, source, pixels, matched)
@@ -63,7 +55,7 @@ def rotated_to_matches(
 def distances(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
-    """How far `matched` lie beside their epipolar lines, in pixels, and the lines' normals."""
+    """Compute signed distances from the epipolar lines, in pixels, and the line normals."""
     transform = source_from_reference(reference, source).astype(np.float64)
     ones = np.ones((len(pixels), 1))
     at_infinity = np.concatenate([pixels, ones], axis=1) @ transform[:, :3].T
@@ -73,8 +65,8 @@ def distances(
 
 
 def motion_by_rotation(view: StereoImage, pixels: Pixels) -> Float[np.ndarray, "m 2 3"]:
-    """How `pixels` move when rays turn about the camera's three axes, in pixels per radian."""
+    """Compute the pixel motion per radian of rotation about each camera axis."""
     rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(view.K).T
     turned = np.cross(np.eye(3)[None], rays[:, None])
-    slopes = turned[..., :2] - rays[:, None, :2] * turned[..., 2:]
-    return (slopes @ view.K[:2, :2].T).transpose(0, 2, 1)
+    motion = turned[..., :2] - rays[:, None, :2] * turned[..., 2:]
+    return (motion @ view.K[:2, :2].T).transpose(0, 2, 1)

@@ -1,8 +1,7 @@
-"""How brightly each photograph was exposed, told by the surfaces that several of them show.
+"""Exposure gains of photographs, from the surfaces that several of them observe.
 
-Cameras choose exposure and white balance anew for each photograph. What two of them measured as the
-same surface tells the ratio of their gains in each colour channel; all pairs together tell the gain
-of each, relative to the mean of all.
+Each pair of photographs gives a colour ratio per channel; least squares over all pairs gives the
+gains.
 """
 
 from __future__ import annotations
@@ -17,52 +16,45 @@ from jaxtyping import Float, Float32, Int
 from gscompleter.reconstructors.plane_sweep.fusion import Layer, Transforms, meetings
 
 DARKEST, BRIGHTEST = 0.05, 0.95
-"""Values between which a colour tells a ratio: darker ones are noise, brighter ones may be
-clipped."""
+"""Range of usable colours: darker values are noise, brighter ones may be clipped."""
 MIN_SHARED = 0.01
-"""Share of a photograph's pixels that another one has to show well exposed, so that the two are
-compared."""
+"""Fraction of well exposed pixels that two photographs must share to be compared."""
 SAME_PATCH = 0.01
-"""Share of a photograph's pixels that are wrong together, as far as they are wrong."""
+"""Fraction of a photograph's pixels whose errors are correlated."""
 SIDE = 128
-"""Rows and columns of a photograph whose pixels are compared, about: more tell no more."""
+"""Approximate number of rows and columns that are sampled in a photograph."""
 PAIR_NOISE = 0.02
-"""Standard deviation of the log-ratio of a pair that shares everything: surfaces shine, and images
-darken towards their corners."""
+"""Standard deviation of a pair's log-ratio, due to reflections and vignetting."""
 EXPOSURE, TINT = 0.3, 0.1
-"""Standard deviation of the log-gains of photographs: of all channels together, and of each beside
-that. What pairs hardly tell stays near 0."""
+"""Prior standard deviations of the log-gains: common to all channels, and per channel."""
 HALF_A_STOP = 0.5 * math.log(2)
-"""Logarithm of the ratio between the brightest and the darkest photograph, in any channel, from
-which on they are evened out. Less hardly shows, and every render would be farther from its
-photograph."""
+"""Smallest spread of the log-gains that is corrected; less is hardly visible."""
 
 Gains = Float[np.ndarray, "views 3"]
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """How much brighter one photograph shows the same surfaces than another, in logarithms."""
+    """Log colour ratio of two photographs on the same surfaces."""
 
     pair: tuple[int, int]
     log: Float[np.ndarray, "3"]
-    """Log of the first one's colours over the second one's."""
+    """Logarithm of the first photograph's colours over the second's."""
     weight: Float[np.ndarray, "3"]
-    """Inverse variance; 0 where a channel tells nothing."""
+    """Inverse variance; 0 for a channel without data."""
 
 
 def gains_of(layers: Sequence[Layer], transforms: Transforms) -> Gains:
-    """Factors by which each photograph is brighter than the mean of all, by channel.
+    """Estimate how much brighter each photograph is than their mean, per channel.
 
-    They are the most likely ones, given the ratios of all pairs, and their logarithms have the mean
-    0. Where the photographs are exposed about alike all of them are exactly 1.
+    The log-gains have mean 0. All gains are exactly 1 if they differ by less than `MIN_LOG_SPREAD`.
     """
     logs = log_gains(ratios_among(layers, transforms), len(layers))
     return np.exp(logs) if np.ptp(logs, axis=0).max() > HALF_A_STOP else np.ones_like(logs)
 
 
 def log_gains(ratios: Iterable[Ratio], count: int) -> Gains:
-    """The log-gains of `count` photographs, by least squares."""
+    """Solve for the log-gains of `count` photographs by least squares with a prior."""
     usual = EXPOSURE**2 * np.ones((3, 3)) + TINT**2 * np.eye(3)
     precision = np.kron(np.eye(count), np.linalg.inv(usual))
     pull = np.zeros((count, 3))
@@ -75,7 +67,7 @@ def log_gains(ratios: Iterable[Ratio], count: int) -> Gains:
 
 
 def ratios_among(layers: Sequence[Layer], transforms: Transforms) -> Iterator[Ratio]:
-    """The ratio of every two photographs, as the pixels of either tell it."""
+    """Yield the colour ratio of every ordered pair of photographs."""
     measured = [layer.measured for layer in layers]
     for number, layer in enumerate(layers):
         step = max(1, min(layer.image.size) // SIDE)
@@ -94,13 +86,12 @@ def ratio_between(
     other: Float[np.ndarray, "n 3"],
     compared: int,
 ) -> Ratio:
-    """The ratio of two photographs by the colours of the same surfaces: the median, which does not
-    mind reflections and wrong depths. `compared` pixels were looked at."""
+    """Compute the median log-ratio of two photographs over `num_sampled` pixels."""
     log, weight = np.zeros(3), np.zeros(3)
     exposed = (np.minimum(own, other) > DARKEST) & (np.maximum(own, other) < BRIGHTEST)
     for channel in np.flatnonzero(exposed.sum(axis=0) > MIN_SHARED * compared):
-        told = exposed[:, channel]
-        logs = np.log(own[told, channel] / other[told, channel])
+        valid = exposed[:, channel]
+        logs = np.log(own[valid, channel] / other[valid, channel])
         log[channel] = np.median(logs)
         spread = 1.4826 * np.median(np.abs(logs - log[channel]))
         weight[channel] = 1 / (PAIR_NOISE**2 + spread**2 * SAME_PATCH * compared / len(logs))
@@ -113,7 +104,7 @@ def carried(
     columns: Int[np.ndarray, "n"],
     transform: Float32[np.ndarray, "3 4"],
 ) -> Float[np.ndarray, "n 2"]:
-    """Where the surfaces at some pixels of a view lie in another view, in pixels."""
+    """Project the surfaces at some pixels into another view, in pixels."""
     inverse = layer.inverse[rows, columns]
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows)), inverse], axis=-1)
     moved = pixels @ transform.T
@@ -121,7 +112,7 @@ def carried(
 
 
 def colours_at(layer: Layer, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """What a photograph shows at the pixels nearest to `pixels`."""
+    """Sample the colours of a photograph at the nearest pixels."""
     h, w = layer.image.size
     columns, rows = pixels.astype(int).clip(0, [w - 1, h - 1]).T
     return layer.image.image[rows, columns]

@@ -1,9 +1,4 @@
-"""Each surface once, by the view that sees it best, and nothing where another view sees through.
-
-Every view tells a depth for all of its pixels, some of them measured, the others filled in. Of many
-views most surfaces come several times, never quite in one place, and what one view fills in stands
-before what another one measures.
-"""
+"""Fusion of many depth maps: each surface once, and nothing in observed free space."""
 
 from __future__ import annotations
 
@@ -19,34 +14,33 @@ from gscompleter.reconstructors.plane_sweep.confidence import MAX_RETURN_ERROR, 
 from gscompleter.reconstructors.plane_sweep.occlusion import UNKNOWN
 
 SAME_DEPTH = 0.05
-"""Share of its depth by which a surface may miss another view's and still be the same."""
+"""Largest relative depth difference between two views of the same surface."""
 FINER = 0.9
-"""Share of a pixel's own footprint below which another view's is finer. Of those about as fine the
-view that comes first keeps the surface."""
+"""Footprint ratio below which another view is finer; otherwise the first view is kept."""
 
 
 Transforms = Mapping[tuple[int, int], Float32[np.ndarray, "3 4"]]
-"""`transforms[i, j]` is j_from_i: from the pixels of view i, at an inverse depth, to those of j."""
+"""`transforms[i, j]` is j_from_i: pixels of view i with inverse depth -> pixels of view j."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """What stereo says of one view."""
+    """The inverse depth of one view."""
 
     image: StereoImage
     inverse: Map
-    """Inverse depths of all pixels, per widest baseline."""
+    """Inverse depth of every pixel, per widest baseline."""
     confidence: Map
-    """In [0, 1]: how sure it is of them; 0 where they were filled in."""
+    """Confidence in [0, 1]; 0 for interpolated depths."""
 
     @property
     def measured(self) -> Mask:
-        """Where the depth was measured."""
+        """True at pixels with a measured depth."""
         return self.confidence > 0
 
 
 def free_pixels(layers: Sequence[Layer], transforms: Transforms) -> list[Mask]:
-    """Which pixels of each view lie where no other view sees through them."""
+    """Find the pixels of each view that are outside the free space of all other views."""
     everywhere = [np.ones_like(layer.measured) for layer in layers]
     return [
         in_free_space(layer, meetings(number, layers, everywhere, transforms))
@@ -57,7 +51,7 @@ def free_pixels(layers: Sequence[Layer], transforms: Transforms) -> list[Mask]:
 def finest_pixels(
     layers: Sequence[Layer], free: Sequence[Mask], transforms: Transforms
 ) -> list[Mask]:
-    """Which of the `free` pixels of each view show what no other view shows better."""
+    """Find the `free` pixels of each view that no other view resolves better."""
     return [
         free[number]
         & ~better_elsewhere(number, layers, meetings(number, layers, free, transforms), transforms)
@@ -67,19 +61,19 @@ def finest_pixels(
 
 @dataclass(frozen=True)
 class Meeting:
-    """How the pixels of a view lie to what another view measured."""
+    """Pixels of one view compared with the measured depths of another view."""
 
     other: int
     through: Mask
-    """The other one sees through them, to a surface behind."""
+    """True if the other view sees a surface behind the pixel."""
     same: Mask
-    """The other one measured the same surface."""
+    """True if the other view measured the same surface."""
 
 
 def meetings(
     number: int, layers: Sequence[Layer], kept: Sequence[Mask], transforms: Transforms
 ) -> Iterator[Meeting]:
-    """The pixels of view `number` beside each other view, as far as that is `kept`."""
+    """Compare view `number` with the measured and `kept` pixels of each other view."""
     inverse = layers[number].inverse
     for other, layer in enumerate(layers):
         if other == number:
@@ -94,8 +88,7 @@ def meetings(
 
 
 def in_free_space(layer: Layer, met: Iterator[Meeting]) -> Mask:
-    """Which pixels may stay: those that no view sees through, and measured ones that more views
-    confirm."""
+    """Mark pixels that no view sees through, or that more views confirm than refute."""
     balance = np.zeros(layer.inverse.shape, np.int32)
     seen_through = np.zeros(layer.inverse.shape, bool)
     for meeting in met:
@@ -107,8 +100,7 @@ def in_free_space(layer: Layer, met: Iterator[Meeting]) -> Mask:
 def better_elsewhere(
     number: int, layers: Sequence[Layer], met: Iterator[Meeting], transforms: Transforms
 ) -> Mask:
-    """Which pixels of view `number` show what another view measured with a finer footprint, or at
-    all where they were filled in."""
+    """Mark interpolated or coarse pixels whose surface another view measured better."""
     layer = layers[number]
     own = 1 / layer.inverse / layer.image.K[0, 0]
     better = np.zeros(own.shape, bool)
@@ -121,7 +113,7 @@ def better_elsewhere(
 
 
 def depth_ratio(inverse: Map, transform: Float32[np.ndarray, "3 4"]) -> Float[np.ndarray, "h w"]:
-    """z-depth of each pixel's surface in another view over that in its own."""
+    """Compute the z-depth of each surface in another view over that in its own view."""
     h, w = inverse.shape
     x, y = np.arange(w) + 0.5, np.arange(h)[:, None] + 0.5
     a, b, c, d = transform[2]

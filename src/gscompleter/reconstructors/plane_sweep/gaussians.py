@@ -1,4 +1,4 @@
-"""One disc per pixel, sized and turned like the surface it lies on."""
+"""One disc-shaped Gaussian per pixel, oriented like the surface."""
 
 from __future__ import annotations
 
@@ -10,23 +10,20 @@ from gscompleter.geometry import quats_from
 from gscompleter.types import Gaussians, View, observed, sh_from_rgb
 
 THICKNESS = 0.15
-"""Standard deviation along the surface's normal, relative to that across the line of sight."""
+"""Standard deviation along the normal, relative to that across the viewing ray."""
 MAX_STRETCH = 3.0
-"""Longest a disc on a slanted surface may get, relative to a frontal one."""
+"""Largest elongation of a disc on a slanted surface, relative to a frontal one."""
 OPACITY = 0.98
-"""Of every disc, before the photographs have their say."""
+"""Initial opacity of every disc."""
 
 
 def discs(
     view: View, depth: Float[Tensor, "h w"], normals: Float[Tensor, "h w 3"], sigma: float
 ) -> Gaussians:
-    """A Gaussian for every pixel of `view`, row by row, at its z-depth.
+    """Create one Gaussian per pixel of `view`, row by row, at z-depth `depth`.
 
-    Args:
-        view: Colours and camera.
-        depth: z-depth in scene units.
-        normals: Of the surface, in camera axes and towards the camera.
-        sigma: Standard deviation across the line of sight, in pixels.
+    `normals` are in camera axes, towards the camera; `sigma` is the standard deviation across the
+    viewing ray, in pixels.
     """
     camera = view.camera
     rays = camera.z_rays()
@@ -36,7 +33,7 @@ def discs(
     normal = normals.reshape(-1, 3) @ camera.c2w[:3, :3].T
     towards = -torch.nn.functional.normalize(rays, dim=-1).reshape(-1, 3)
     cosine = (normal * towards).sum(-1, keepdim=True).clamp_min(1 / MAX_STRETCH)
-    # Along the slope the disc spans as much of the ray's width as across it.
+    # On a slanted surface the disc is elongated, so that its projection stays round.
     across = torch.linalg.cross(normal, towards)
     flat = across.norm(dim=-1, keepdim=True) < 1e-3
     across = torch.where(flat, camera.c2w[:3, 0].expand_as(across), across)
@@ -57,22 +54,22 @@ def discs(
 
 
 def normals_of(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w 3"]:
-    """Surface normals in camera axes, towards the camera, from the nearer of two differences."""
+    """Compute normals in camera axes, towards the camera, by one-sided differences."""
     camera = view.camera
     rays = camera.z_rays() @ camera.c2w[:3, :3]
-    # A power of two scales without rounding, and squares neither overflow nor vanish.
+    # Scale by a power of two, which is exact, so that squares neither overflow nor vanish.
     unit = 2.0 ** depth.median().log2().round().item()
     points = rays * (depth / unit)[..., None]
 
-    def slope(p: Float[Tensor, "a b 3"]) -> Float[Tensor, "a b 3"]:
+    def difference(p: Float[Tensor, "a b 3"]) -> Float[Tensor, "a b 3"]:
         step = p[:, 1:] - p[:, :-1]
         after = torch.cat([step, step[:, -1:]], 1)
         before = torch.cat([step[:, :1], step], 1)
         nearer = before[..., 2:].abs() < after[..., 2:].abs()
         return torch.where(nearer, before, after)
 
-    dx = slope(points)
-    dy = slope(points.transpose(0, 1)).transpose(0, 1)
+    dx = difference(points)
+    dy = difference(points.transpose(0, 1)).transpose(0, 1)
     normal = torch.nn.functional.normalize(torch.linalg.cross(dy, dx), dim=-1)
     facing = (normal * rays).sum(-1, keepdim=True) < 0
     return torch.where(facing, normal, -normal)

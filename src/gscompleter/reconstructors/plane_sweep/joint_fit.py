@@ -1,8 +1,6 @@
-"""Gaussians of many views, brought nearer to all photographs at once.
+"""Joint fit of the Gaussians of many views, with positions, sizes and rotations.
 
-What several views measured lies a fraction of a pixel off in some of them. So not only opacities
-and colours are fitted here, as for two views, but places, sizes and directions too; one photograph
-a step, so that the time grows with their number.
+The depths of several views differ by fractions of a pixel. Each step uses one photograph.
 """
 
 from __future__ import annotations
@@ -19,16 +17,15 @@ from gscompleter.render import Renderer
 from gscompleter.types import Gaussians, View
 
 PASSES = 10
-"""How often each photograph is asked."""
+"""Number of steps per photograph."""
 RATES = {"moved": 0.2, "quats": 0.0375, "grown": 0.1875, "logits": 0.75, "sh": 0.1125}
-"""First steps of Adam: on the place, in units of the Gaussian's own size; on the quaternion; on the
-logarithm of the size; on the logit of the opacity; and on the colour."""
+"""Initial Adam step sizes; positions are in units of the Gaussian's size."""
 LAST = 0.2
-"""What is left of these steps in the end; they shrink evenly."""
+"""Final step size relative to the initial one; the decay is linear."""
 BETAS = 0.9, 0.99
-"""Decay of Adam's means: shorter than usual, as the steps are few."""
+"""Adam decay rates, short because there are few steps."""
 FAINTEST = 0.02
-"""Opacity below which a Gaussian has faded."""
+"""Margin from 0 and 1 to which the initial opacities are clamped."""
 
 
 def fit_jointly(
@@ -37,8 +34,7 @@ def fit_jointly(
     gains: Float[Tensor, "views 3"],
     renderer: Renderer,
 ) -> Gaussians:
-    """`gaussians` fitted to `views` by the squared difference, once what is drawn is exposed as
-    each view is: brighter by its gain."""
+    """Minimize the squared image error, with renders scaled by each view's exposure gain."""
     unknown = unknowns(gaussians)
     optimizer = Adam([(unknown[name], rate) for name, rate in RATES.items()], BETAS)
     order = order_of(len(views))
@@ -51,7 +47,7 @@ def fit_jointly(
 
 
 def unknowns(gaussians: Gaussians) -> dict[str, Tensor]:
-    """What is fitted, by the names of RATES."""
+    """Initialize the optimized parameters, with the keys of `RATES`."""
     start = {
         "moved": torch.zeros_like(gaussians.means),
         "quats": gaussians.quats,
@@ -63,7 +59,7 @@ def unknowns(gaussians: Gaussians) -> dict[str, Tensor]:
 
 
 def moved_by(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussians:
-    """`gaussians` changed by what was found so far."""
+    """Apply the parameters to the Gaussians."""
     size = gaussians.scales.amax(dim=-1, keepdim=True)
     return replace(
         gaussians,
@@ -76,7 +72,7 @@ def moved_by(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussians:
 
 
 def order_of(count: int) -> list[int]:
-    """Whose turn it is: each of `count` views PASSES times, in random order."""
+    """Create a random order in which each of `count` views occurs `STEPS_PER_VIEW` times."""
     generator = torch.Generator().manual_seed(0)
     rounds = [torch.randperm(count, generator=generator) for _ in range(PASSES)]
     return torch.cat(rounds).tolist()

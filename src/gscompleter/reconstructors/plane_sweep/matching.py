@@ -1,4 +1,4 @@
-"""How well each pixel matches the other views at each of a set of depth planes."""
+"""Matching costs of each pixel against the other views, at a set of depth planes."""
 
 from __future__ import annotations
 
@@ -12,29 +12,26 @@ from gscompleter.kernels.stereo import Bands
 from gscompleter.matching.stereo_image import StereoImage
 
 Source = tuple[StereoImage, Float[np.ndarray, "3 4"]]
-"""Another view, and the transform to its pixels from those of the reference."""
+"""Another view, and the transform from reference pixels to its pixels."""
 
 STEP = 0.5
-"""Pixels by which neighbouring planes move in the other image, at most pixels."""
+"""Largest image motion between neighbouring planes, in pixels."""
 MIN_PLANES, MAX_PLANES = 48, 256
-"""Fewest and most planes."""
+"""Smallest and largest number of planes."""
 RADIUS = 2
-"""Of the windows that are correlated, in pixels."""
+"""Radius of the correlation window, in pixels."""
 NOISE = 0.015
-"""Standard deviation of noise in colour; weaker texture correlates with nothing."""
+"""Standard deviation of the image noise; weaker texture does not correlate."""
 DETAIL = 0.4
-"""Share of the pixels' own difference in the cost; the rest is correlation of windows."""
+"""Weight of the per-pixel difference in the cost; the rest is window correlation."""
 UNSEEN_COST = 140
-"""Cost (0 to 254) of a plane at which no other view sees the pixel."""
+"""Cost, from 0 to 254, of a plane at which no other view observes the pixel."""
 
 
 def inverse_depth_planes(
     reference: StereoImage, sources: Sequence[Source], near: float, far: float
 ) -> Float[np.ndarray, "d"]:
-    """Inverse depths from far to near, evenly spaced, so that planes move by about STEP pixels.
-
-    Planes so near that hardly any pixel stays within a source are left out: nothing matches there.
-    """
+    """Space inverse depths evenly from far to near, without planes outside all sources."""
     h, w = reference.size
     x, y = np.meshgrid(np.linspace(0.5, w - 0.5, 9), np.linspace(0.5, h - 0.5, 9))
     pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
@@ -61,7 +58,7 @@ def inverse_depth_planes(
 def quantiles(
     values: Float[np.ndarray, "r c"], counted: Bool[np.ndarray, "r c"], share: float
 ) -> Float[np.ndarray, "r"]:
-    """Of each row, the quantile of the values that are counted; 0 where none is."""
+    """Compute a quantile of the `valid` values of each row; 0 for rows without any."""
     ordered = np.sort(np.where(counted, values, np.inf), axis=1)
     ordered[~counted.any(axis=1)] = 0
     last = (counted.sum(axis=1) - 1).clip(0)
@@ -77,11 +74,7 @@ def matched_costs(
     inverse_depths: Float[np.ndarray, "d"],
     bands: Bands,
 ) -> UInt8[np.ndarray, "cells"]:
-    """Costs in 0 to 254 of the planes that `bands` names; of several sources the best counts.
-
-    A surface that is hidden from one of them costs there whatever hides it; a view that sees it
-    decides.
-    """
+    """Compute costs (0 to 254) of the planes in `bands`; the best source view counts."""
     settings = (RADIUS, np.float32(NOISE), np.float32(DETAIL))
     planes = (inverse_depths, bands)
     costs = [

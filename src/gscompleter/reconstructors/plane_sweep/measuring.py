@@ -1,4 +1,4 @@
-"""What stereo measures in each of the views, before surfaces are made of it."""
+"""Stereo depth of each view, before surfaces are fitted."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ Map = Float32[np.ndarray, "_ _"]
 Planes = Float32[np.ndarray, "d"]
 """Inverse depths from far to near, evenly spaced."""
 GUIDED_FROM = 192
-"""Pixels of the shortest side from which images of half the size say first where to look."""
+"""Shortest image side, in pixels, from which a half-size sweep narrows the search."""
 BACKGROUND_WEIGHT = np.float32(0.3)
-"""How much the background's depth counts where an object hides it from the other views."""
+"""Weight of a background depth at pixels occluded in the other views."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """The planes that match best in one view."""
+    """The best plane of each pixel of one view."""
 
     planes: Planes
     index: Map
-    """The best plane of each pixel, to a fraction."""
+    """Best plane, to a fraction."""
     margin: Map
-    """How much more the second best costs."""
+    """Cost gap to the second best plane."""
 
     @cached_property
     def inverse(self) -> Map:
@@ -51,18 +51,17 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Measured:
-    """The planes of one view's pixels, and how far they count."""
+    """The plane of each pixel of one view, with weights."""
 
     planes: Planes
     index: Map
-    """The plane of each pixel, to a fraction."""
     weight: Map
-    """How much it counts for surfaces, in [0, 1]."""
+    """Weight for the surface fit, in [0, 1]."""
     confidence: Map
-    """The same, and 0 where it was told by what surrounds the pixel."""
+    """Like `weight`, but 0 for depths taken from surrounding pixels."""
 
     def at_size(self, size: tuple[int, int]) -> Measured:
-        """The same for an image of `size`, which may have been halved."""
+        """Upsample to `size` if the image was halved."""
         if self.index.shape == size:
             return self
         index, weight, confidence = (
@@ -72,7 +71,7 @@ class Measured:
 
 
 def measured(rig: Rig, near: float, far: float) -> list[Measured]:
-    """What matching says of each view, between z-depths in scene units."""
+    """Measure the depth of each view, between two z-depths in scene units."""
     sweeps = sweeps_of(rig, near / rig.unit, far / rig.unit)
     confidences = confidences_of(sweeps, rig)
     sure = [
@@ -86,10 +85,7 @@ def measured(rig: Rig, near: float, far: float) -> list[Measured]:
 
 
 def sweeps_of(rig: Rig, near: float, far: float) -> list[Sweep]:
-    """The planes that match best in each view, between depths in widest baselines.
-
-    A pyramid: what images of half the size say leaves a band of planes to each tile.
-    """
+    """Sweep all views, coarse to fine; `near` and `far` are in widest baselines."""
     numbers = range(len(rig.images))
     if min(min(image.size) for image in rig.images) < GUIDED_FROM:
         return [swept(i, rig, near, far) for i in numbers]
@@ -98,10 +94,7 @@ def sweeps_of(rig: Rig, near: float, far: float) -> list[Sweep]:
 
 
 def swept(number: int, rig: Rig, near: float, far: float, guess: Sweep | None = None) -> Sweep:
-    """The planes that match best in view `number`, between depths in widest baselines.
-
-    `guess` is what an image of half the size says; only planes around it are looked at then.
-    """
+    """Find the best planes of one view, near the half-size `guess` if there is one."""
     image = rig.images[number]
     sources = [(rig.images[i], rig.transforms[number, i]) for i in rig.neighbours.of[number]]
     planes = inverse_depth_planes(image, sources, near, far)
@@ -117,7 +110,7 @@ def swept(number: int, rig: Rig, near: float, far: float, guess: Sweep | None = 
 
 
 def confidences_of(sweeps: Sequence[Sweep], rig: Rig) -> list[Map]:
-    """How much each pixel's match counts: 0 where no other view agrees with it."""
+    """Compute the confidence of each view; 0 for pixels that no other view confirms."""
     inverses = [sweep.inverse for sweep in sweeps]
     confidences = []
     for i, sweep in enumerate(sweeps):
@@ -132,10 +125,7 @@ def confidences_of(sweeps: Sequence[Sweep], rig: Rig) -> list[Map]:
 def with_background(
     number: int, sweep: Sweep, confidence: Map, sure: Sequence[Map], rig: Rig
 ) -> Measured:
-    """The planes of view `number`, those of what is hidden from the other views too.
-
-    `sure` are the inverse depths of all views, next to 0 where a view is not sure of them.
-    """
+    """Give pixels occluded in the other views (inverse depths `sure`) the background depth."""
     background = stereo.background(sweep.index, confidence > 0)
     neighbours = [
         Neighbour(sure[i], rig.transforms[number, i], rig.transforms[i, number])
@@ -149,17 +139,17 @@ def with_background(
 
 
 def inverse_at(planes: Planes, index: Map) -> Map:
-    """Inverse depths at fractions of `planes`, none farther than twice the farthest plane."""
+    """Convert plane indices to inverse depths, at most twice as far as the last plane."""
     step = planes[1] - planes[0]
     within = index.clip(-0.5, len(planes) - 0.5)
     return np.maximum(planes[0] + within * step, planes[0] / 2).astype(np.float32)
 
 
 def fractions(planes: Planes, inverse: Map) -> Map:
-    """Where inverse depths lie among `planes`."""
+    """Convert inverse depths to plane indices."""
     return ((inverse - planes[0]) / (planes[1] - planes[0])).astype(np.float32)
 
 
 def doubled(values: Map, size: tuple[int, int]) -> Map:
-    """Each value four times, cut to `size`."""
+    """Repeat each pixel 2 x 2 and crop to `size`."""
     return np.ascontiguousarray(values.repeat(2, axis=0).repeat(2, axis=1)[: size[0], : size[1]])

@@ -1,4 +1,4 @@
-"""What one view sees past the edge of an object and the others do not lies on the background."""
+"""Pixels that only one view observes past an object edge; they lie on the background."""
 
 from __future__ import annotations
 
@@ -12,24 +12,20 @@ from gscompleter.kernels import stereo
 from gscompleter.reconstructors.plane_sweep.confidence import MAX_RETURN_ERROR, Map, Mask
 
 UNKNOWN = np.float32(1e-9)
-"""Inverse depth of what a view is not sure of."""
+"""Inverse depth of pixels without a confident depth."""
 
 
 @dataclass(frozen=True)
 class Neighbour:
-    """Another view: what it knows of its depths, and the transforms to and from its pixels."""
+    """Confident depths of another view, and the transforms to and from its pixels."""
 
     inverse: Float32[np.ndarray, "other_h other_w"]
-    """Inverse depths; next to 0 where it is not sure of them."""
     other_from_this: Float32[np.ndarray, "3 4"]
     this_from_other: Float32[np.ndarray, "3 4"]
 
 
 def hidden_from_others(background: Map, neighbours: Sequence[Neighbour]) -> Mask:
-    """Where a surface at inverse depth `background` [h, w] is hidden from some and seen by none.
-
-    A neighbour hides it whose own surface in that direction is nearer.
-    """
+    """Mark background surfaces that some view occludes and no view observes."""
     hidden = np.zeros(background.shape, bool)
     seen = np.zeros(background.shape, bool)
     for other in neighbours:

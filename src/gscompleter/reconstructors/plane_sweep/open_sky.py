@@ -1,11 +1,9 @@
-"""Which pixels of a photograph show the sky, told by what lies around it.
+"""Detection of the sky from its surroundings.
 
-Stereo knows nothing of a sky: it is even, so that any depth matches, and aggregation lends it that
-of roofs and trees. A ceiling or a blank wall is even, too, but bounded by a room: what surrounds it
-lies on the plane that it is, and not much farther than the rest of the room. So a sky needs all of:
-no texture and no parallax, a wide and high region in the upper half of the image that nothing cuts
-off from its top, and an outline of which a good part is far away. A sky that lacks one of them is
-not found, and stays at the depth of what surrounds it.
+Stereo cannot measure a uniform sky. A ceiling or blank wall is uniform too, but its outline lies on
+one plane, not much farther than the rest. A sky therefore needs all of: no texture, no parallax, a
+wide and high region connected to the top of the image, and an outline of which a large part is far
+away. An undetected sky keeps the depth of its surroundings.
 """
 
 from __future__ import annotations
@@ -24,53 +22,50 @@ from gscompleter.reconstructors.plane_sweep.rig import Rig
 Map = Float32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 OtherMask = Bool[np.ndarray, "a b"]
-"""Of an image that may have another size."""
 Plane = Float64[np.ndarray, "3"]
 
 EVEN = 0.012
-"""Largest slope of colour per pixel, in images of [0, 1], within a sky."""
+"""Largest colour gradient inside a sky, per pixel, for colours in [0, 1]."""
 LIKE = 0.06
-"""Difference of colour to the sky beside it up to which a pixel at its edge is sky, too."""
+"""Largest colour difference of an edge pixel to the sky beside it."""
 EDGE = 3
-"""Pixels by which edges blur the slope of the sky beside them."""
+"""Distance in pixels at which an edge still raises the gradient of the sky."""
 OUTLINE = 3
-"""Width in pixels of what counts as the outline of a sky."""
+"""Width of the outline of a sky, in pixels."""
 MIN_WIDTH = 0.4
-"""Smallest share of the image's top row that a sky fills."""
+"""Smallest fraction of the top image row that a sky covers."""
 MIN_HEIGHT = 0.1
-"""Smallest mean height of a sky, over the columns in which it reaches the top, as a share of the
-image's height."""
+"""Smallest mean height of a sky over its columns, as a fraction of the image height."""
 MIN_UNBROKEN = 0.6
-"""Smallest share of a sky with nothing between it and the top of the image."""
+"""Smallest fraction of a sky that is directly connected to the top of the image."""
 LOWEST, MOST = 0.55, 0.95
-"""Share of the image's height, from the top, above which at least this share of a sky lies."""
+"""Image height fraction, and the smallest fraction of a sky that lies above it."""
 MIN_OUTLINE = 64
-"""Fewest measured pixels of an outline that can tell a sky."""
+"""Fewest measured outline pixels for a decision."""
 END_SHARE = 0.05
-"""Share of the outline, the farthest, that has to come close to infinity."""
+"""Fraction of the outline, the farthest, that must be close to infinity."""
 END_PLANES = 3.0
-"""Planes from infinity within which it has to come: half a pixel of parallax each."""
+"""Largest distance from infinity of that part, in planes of half a pixel of parallax."""
 FAR_PLANE_MARGIN, MAX_FAR_PLANE = 2.0, 10.0
-"""Or planes from the far plane, where that itself lies no more planes than this from infinity."""
+"""Alternative limit in planes beyond the far plane, and the largest sum that is far."""
 FAR_SHARE = 0.2
-"""Share of the outline, the farthest, that has to be far away."""
+"""Fraction of the outline, the farthest, that must be far away."""
 FAR_RATIO = 2.5
-"""Depth of that part of the outline, in medians of what is measured below the sky, at least."""
+"""Smallest depth of that part, in median depths of the measured scene."""
 MAX_ON_PLANE = 0.8
-"""Share of the outline on one plane from which the region is that plane: a ceiling or a wall."""
+"""Fraction of the outline on one plane from which the region is a ceiling or wall."""
 NEAR_PLANES, MAX_NEAR_ON_PLANE = 5.0, 0.9
-"""The same for that part of the outline which is more planes than this from infinity, where all
-planes meet, and twice as many as its far end."""
+"""Planes from infinity of near outline pixels, and the same limit for these alone."""
 PLANE_TOLERANCE = 2.0
-"""Planes of the sweep by which a pixel may miss a plane that it lies on."""
+"""Largest distance of a pixel from a plane it lies on, in sweep planes."""
 ROUNDS = 20
-"""Of reweighted least squares."""
+"""Iterations of reweighted least squares."""
 AGREEMENT = 0.5
-"""Share of a sky that must be sky in the other views, too, as far as they look there."""
+"""Fraction of a sky that must also be sky in the other views."""
 
 
 def skies(rig: Rig, found: Sequence[Measured]) -> list[Mask]:
-    """Where each view shows the sky; every view must agree with those that look the same way."""
+    """Find the sky of each view that the other views confirm."""
     own = [sky_above(image, f) for image, f in zip(rig.images, found, strict=True)]
     return [
         sky if confirmed(number, sky, own, rig) else np.zeros_like(sky)
@@ -79,13 +74,13 @@ def skies(rig: Rig, found: Sequence[Measured]) -> list[Mask]:
 
 
 def sky_shown(rig: Rig, sky_of_second: OtherMask) -> Mask:
-    """The sky in the first view of a pair, as far as the second shows it in the same direction."""
+    """Find the sky of the first view of a pair in the directions of the second view's sky."""
     first = rig.images[0]
     return even_above(first) & (at_infinity(first.size, sky_of_second, rig, 0, 1) == 1)
 
 
 def without(found: Measured, where: Mask) -> Measured:
-    """Leave out what was measured `where` it does not count, as in the sky."""
+    """Set the weight and confidence to 0 at the pixels of a mask, such as the sky."""
     full = found.at_size(where.shape)
     weight, confidence = (
         np.where(where, np.float32(0), share) for share in (full.weight, full.confidence)
@@ -94,13 +89,13 @@ def without(found: Measured, where: Mask) -> Measured:
 
 
 def sky_above(image: StereoImage, found: Measured) -> Mask:
-    """The even region from the top of the image, where what surrounds it tells that it is open."""
+    """Find the uniform region at the top of the image if its outline is that of a sky."""
     region = even_above(image)
     return region if is_open(image, found, region) else np.zeros_like(region)
 
 
 def is_open(image: StereoImage, found: Measured, region: Mask) -> bool:
-    """Whether what surrounds `region` tells that nothing is behind it."""
+    """Test the outline of `region` for an open sky."""
     full = found.at_size(image.size)
     measured = full.confidence > 0
     outline = dilated(region, OUTLINE) & ~region & measured
@@ -119,7 +114,7 @@ def is_open(image: StereoImage, found: Measured, region: Mask) -> bool:
 
 
 def is_overhead(region: Mask) -> bool:
-    """Tell whether `region` fills a good part of the top of the image, as a sky does."""
+    """Test if `region` covers a large part of the top of the image."""
     width, area = region[0].mean(), region.mean()
     if width < MIN_WIDTH or area < MIN_HEIGHT * width:
         return False
@@ -129,7 +124,7 @@ def is_overhead(region: Mask) -> bool:
 
 
 def even_above(image: StereoImage) -> Mask:
-    """What is even and connected to the top of the image, up to the edges around it."""
+    """Find the uniform region connected to the top of the image, up to its edges."""
     even = cv2.erode((slope_of(image) < EVEN).astype(np.uint8), np.ones((3, 3), np.uint8))
     _, labels = cv2.connectedComponents(even, connectivity=4)
     top = labels[0][labels[0] > 0]
@@ -138,7 +133,7 @@ def even_above(image: StereoImage) -> Mask:
 
 
 def slope_of(image: StereoImage) -> Map:
-    """The steepest change of a colour, per pixel."""
+    """Compute the largest colour gradient of each pixel."""
     smooth = cv2.GaussianBlur(image.image.astype(np.float32), (0, 0), 1.0)
     across, down = (
         cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1))
@@ -147,7 +142,7 @@ def slope_of(image: StereoImage) -> Map:
 
 
 def difference_from(core: Mask, image: StereoImage) -> Map:
-    """How far each pixel is from the mean colour of `core` around it, in its worst channel."""
+    """Compute the largest channel difference to the mean colour of `core` nearby."""
     colour, weight = image.image.astype(np.float32), core.astype(np.float32)
     size = (4 * EDGE + 1, 4 * EDGE + 1)
     total = cv2.boxFilter(weight, -1, size)
@@ -158,21 +153,14 @@ def difference_from(core: Mask, image: StereoImage) -> Map:
 def reaches_far(
     outline: Float32[np.ndarray, "n"], measured: Float32[np.ndarray, "m"], far_plane: float
 ) -> bool:
-    """Tell whether an outline comes close to infinity, and far beyond most of what is measured.
-
-    Args:
-        outline: Inverse depths, in planes from infinity.
-        measured: The same of all pixels that were measured and may not be sky.
-        far_plane: The same of the far plane, beyond which nothing is measured.
-    """
+    """Test if an outline is near infinity and far behind the scene (planes from infinity)."""
     end, far = np.quantile(outline, [END_SHARE, FAR_SHARE])
     is_far = end <= END_PLANES or (end <= far_plane + FAR_PLANE_MARGIN <= MAX_FAR_PLANE)
     return bool(is_far and far * FAR_RATIO <= np.median(measured))
 
 
 def on_one_plane(outline: Mask, heights: Map) -> float:
-    """Share of the outline that lies on the plane that fits it best, by absolute differences; 0 of
-    fewer than `MIN_OUTLINE` pixels."""
+    """Compute the fraction of an outline on its best plane; 0 if there are too few pixels."""
     if outline.sum() < MIN_OUTLINE:
         return 0.0
     rows, columns = np.nonzero(outline)
@@ -186,7 +174,7 @@ def on_one_plane(outline: Mask, heights: Map) -> float:
 
 
 def confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig) -> bool:
-    """Whether most of `sky` is that of the views that look there, too."""
+    """Test if most of `sky` is sky in the other views that show its direction."""
     shown = [
         at_infinity(sky.shape, other, rig, number, i)[sky]
         for i, other in enumerate(others)
@@ -200,8 +188,7 @@ def confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig) ->
 def at_infinity(
     size: tuple[int, ...], mask: OtherMask, rig: Rig, this: int, other: int
 ) -> Float32[np.ndarray, "h w"]:
-    """What `mask` of view `other` says in the direction of each pixel of view `this`: 1 or 0, and
-    -1 where it does not look."""
+    """Sample the mask of another view in each pixel's direction; -1 if outside."""
     x, y = np.arange(size[1]) + 0.5, np.arange(size[0])[:, None] + 0.5
     turn = rig.transforms[this, other][:, :3]
     u, v, w = (a * x + b * y + c for a, b, c in turn)
@@ -214,5 +201,5 @@ def at_infinity(
 
 
 def dilated(mask: Mask, radius: int) -> Mask:
-    """`mask` grown by `radius` pixels on every side."""
+    """Dilate `mask` by a square of `radius` pixels."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0

@@ -1,4 +1,4 @@
-"""From posed photographs to Gaussians, step by step."""
+"""The plane-sweep reconstructor, from posed photographs to Gaussians."""
 
 from __future__ import annotations
 
@@ -24,22 +24,20 @@ from gscompleter.sky import SKY_DEPTH, is_sky
 from gscompleter.types import DepthMap, Reconstruction, View
 
 HALVED_FROM = 192
-"""Pixels of the shortest side from which images are matched at half their size, but for two
-photographs."""
+"""Shortest side, in pixels, from which three or more images are matched at half size."""
 
 
 @dataclass(frozen=True)
 class PlaneSweep(Splatter):
-    """Plane-sweep stereo, completed by surfaces, splatted, and fitted to the photographs."""
+    """Reconstructor by plane-sweep stereo, surface completion and splatting."""
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
-        """Gaussians of what `views` show, as `scene` tells, and the depths of all of their pixels.
+        """Reconstruct the scene and the depth of every pixel.
 
-        More views than two, unless they are small, are matched at half their size: surfaces and the
-        joint fit find what that leaves out, in an eighth of the time.
+        More than two large views are matched at half size, which takes an eighth of the time.
 
         Raises:
-            InputError: fewer than two views, no baseline between them, an empty depth range.
+            InputError: There are fewer than two views, no baseline, or the depth range is empty.
         """
         views = ranged(views)
         rig = rig_of(views)
@@ -47,16 +45,11 @@ class PlaneSweep(Splatter):
         return self.scene(views, depth_maps(layers, rig.unit, views), layers, rig.transforms)
 
     def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
-        """The Gaussians of the pixels `wanted` of the first view, a synthesized image.
+        """Lift the pixels of `pixel_mask` in the first view, a synthesized image.
 
-        What fills a hole is seen by no photograph, so that its opacities are left alone; and its
-        depth is that of the surfaces around it, measured at the full size, so that it agrees with
-        the context as well as a reconstruction of the pair would. Its colours are fitted to the
-        synthesized image itself, for drawing takes the half of its sharpness. Other views' depths
-        are those that were measured. The sky tells no depth here; the scene has it.
-
-        Raises:
-            InputError: as a call.
+        No photograph observes a hole, so its opacities are not fitted; its depth continues the
+        surfaces around it, at full size. Colours are fitted to the image itself. The sky gets no
+        depth.
         """
         views = ranged(views)
         rig = rig_of(views)
@@ -69,13 +62,13 @@ class PlaneSweep(Splatter):
         return self.wanted_of(views, depth_maps(layers, rig.unit, views), wanted)
 
     def depths(self, views: Sequence[View]) -> list[DepthMap]:
-        """z-depth of all pixels of `views`, valid where it was measured, and how sure of it."""
+        """Estimate z-depth and confidence of every pixel, in scene units."""
         views = ranged(views)
         rig = rig_of(views)
         return depth_maps(self.layers(rig, views), rig.unit, views)
 
     def layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
-        """What stereo says of each view."""
+        """Compute the completed inverse depth of each view."""
         found = matched(rig, views)
         seen = skies(rig, found)
         surfaces = side_by_side(surfaces_of, rig.images, map(without, found, seen))
@@ -83,18 +76,13 @@ class PlaneSweep(Splatter):
 
 
 def ranged(views: Sequence[View]) -> list[View]:
-    """`views` with one depth range.
-
-    Raises:
-        InputError: where it is empty, or photographs that were given none do not tell it.
-    """
+    """Give all views the same depth range, estimated if unknown."""
     near, far = depth_range_of(views)
     return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
 
 
 def matched(rig: Rig, views: Sequence[View]) -> list[Measured]:
-    """Measure depth in each of `views` by stereo, outside of what is ignored; more than two large
-    views at half their size."""
+    """Measure depth outside the ignored pixels, at half size for three or more large views."""
     is_halved = len(views) > 2 and min(min(image.size) for image in rig.images) >= HALVED_FROM
     found = measured(rig.halved() if is_halved else rig, *depth_range_of(views))
     return [
@@ -104,20 +92,20 @@ def matched(rig: Rig, views: Sequence[View]) -> list[Measured]:
 
 
 def surfaces_of(image: StereoImage, found: Measured) -> Layer:
-    """The surfaces of a view through what was measured there."""
+    """Fit surfaces to the measured depths of a view."""
     full = found.at_size(image.size)
     heights = fit_surfaces(full.index, full.weight, image.image)
     return Layer(image, inverse_at(full.planes, heights), full.confidence)
 
 
 def as_measured(image: StereoImage, found: Measured) -> Layer:
-    """What was measured in a view, without surfaces."""
+    """Convert the measured depths of a view without surface completion."""
     full = found.at_size(image.size)
     return Layer(image, inverse_at(full.planes, full.index), full.confidence)
 
 
 def before_sky(layer: Layer, found: Measured, sky: Mask) -> Layer:
-    """`layer` with the sky of its view behind it, which is sure."""
+    """Set the sky of a layer to the sky depth, with full confidence."""
     beyond = np.float32(found.planes[0] / SKY_DEPTH)
     inverse = np.where(sky, beyond, layer.inverse)
     return replace(
@@ -126,7 +114,7 @@ def before_sky(layer: Layer, found: Measured, sky: Mask) -> Layer:
 
 
 def depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> list[DepthMap]:
-    """z-depths in scene units, on the device of the views; those of the sky tell nothing."""
+    """Convert layers to z-depths in scene units; the sky is not valid."""
     depths = []
     for layer, view in zip(layers, views, strict=True):
         depth = torch.from_numpy(np.float32(unit) / layer.inverse)

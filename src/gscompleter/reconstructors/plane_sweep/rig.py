@@ -1,4 +1,4 @@
-"""How the views stand to each other."""
+"""Images of the views and the transforms between them."""
 
 from __future__ import annotations
 
@@ -18,26 +18,22 @@ from gscompleter.types import View
 
 @dataclass(frozen=True)
 class Rig:
-    """Images, and the way from the pixels of each to those of the others."""
+    """Images, and the transforms between their pixels."""
 
     images: list[StereoImage]
     unit: float
-    """The widest baseline, in scene units; lengths of stereo are multiples of it."""
+    """Widest baseline in scene units; stereo lengths are multiples of it."""
     neighbours: Neighbours
     transforms: Transforms
 
     def halved(self) -> Rig:
-        """The same with images of half the size."""
+        """Halve the size of all images."""
         transforms = {pair: at_half_size(t) for pair, t in self.transforms.items()}
         return replace(self, images=[halved(i) for i in self.images], transforms=transforms)
 
 
 def rig_of(views: Sequence[View]) -> Rig:
-    """Relate `views` to each other, through poses that agree with the matched features.
-
-    Raises:
-        InputError: fewer than two views, no baseline between them.
-    """
+    """Relate the views by their poses, corrected to fit the feature matches."""
     images, unit = stereo_images(views)
     neighbours = neighbours_among(images)
     transforms = {}
@@ -51,7 +47,7 @@ def rig_of(views: Sequence[View]) -> Rig:
 
 
 def halved(image: StereoImage) -> StereoImage:
-    """An image of half the size; the last row or column of an odd one is doubled before."""
+    """Halve an image; the last row or column of an odd size is repeated first."""
     h, w = image.size
     even = np.pad(image.image, ((0, h % 2), (0, w % 2), (0, 0)), mode="edge")
     rows = even[::2] + even[1::2]
@@ -62,6 +58,6 @@ def halved(image: StereoImage) -> StereoImage:
 
 
 def at_half_size(transform: Float32[np.ndarray, "3 4"]) -> Float32[np.ndarray, "3 4"]:
-    """A transform between the pixels of two views, once both are halved."""
+    """Convert a transform between two views to their halved images."""
     half, twice = np.diag([0.5, 0.5, 1.0]), np.diag([2.0, 2.0, 1.0, 1.0])
     return (half @ transform @ twice).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A scene of what is known of depth in every pixel of each view."""
+"""Gaussians from per-pixel depths."""
 
 from __future__ import annotations
 
@@ -26,17 +26,16 @@ from gscompleter.sky import is_sky, sky_behind, with_sky_of
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
 
 MIN_ALPHA = 0.7
-"""Alpha below which a surface that no view was to show is shown by the view that meets the gap."""
+"""Alpha below which a removed pixel is restored to close a gap."""
 
 
 @dataclass(frozen=True)
 class Splatter:
-    """Splats depths and fits the Gaussians to the photographs."""
+    """Base of reconstructors that splat depth maps and fit the Gaussians."""
 
     disc_sigma: float = 0.6
-    """Standard deviation of a Gaussian across the line of sight, in pixels."""
+    """Standard deviation of a Gaussian across the viewing ray, in pixels."""
     renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
-    """Draws Gaussians while they are fitted."""
 
     def scene(
         self,
@@ -45,26 +44,21 @@ class Splatter:
         layers: Sequence[Layer],
         transforms: Transforms,
     ) -> Reconstruction:
-        """Gaussians of what `views` show.
+        """Build the Gaussians of `views` and fit them to the photographs.
 
-        Two views keep all of their pixels. Of more views each surface is kept once, by the view
-        that sees it best, and nothing where another view sees through it. Where their exposures
-        differ clearly, they are evened out: the Gaussians have the mean one.
-
-        Args:
-            views: Photographs.
-            depths: Of all of their pixels, in scene units.
-            layers: The same, per widest baseline.
-            transforms: From the pixels of each view to those of the others.
+        Two views keep all pixels. With more views each surface is kept once, from the view that
+        resolves it best; observed free space stays empty, and clearly different exposures are
+        normalized to their mean. `depths` are in scene units, `layers` are the same per widest
+        baseline.
         """
         gains = gains_among(layers, transforms)
         device = views[0].image.device
-        even = list(map(View.evened, views, gains.to(device)))
-        parts = [self.splat(view, depth) for view, depth in zip(even, depths, strict=True)]
+        normalized = list(map(View.evened, views, gains.to(device)))
+        parts = [self.splat(view, depth) for view, depth in zip(normalized, depths, strict=True)]
         every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
         counted = as_rows([view.counted for view in on_cpu])
         chosen = self.chosen(every, on_cpu, layers, transforms) & counted
-        behind = self.skies_behind(even, depths)
+        behind = self.skies_behind(normalized, depths)
         made = merge([every[chosen], *(gaussians.to("cpu") for _, gaussians, _ in behind)])
         known = [self.without_ignored(made, *pair) for pair in zip(on_cpu, gains, strict=True)]
         fitted = with_sky_of(made, self.fitted(made, known, gains), on_cpu[0].camera)
@@ -82,7 +76,7 @@ class Splatter:
     def wanted_of(
         self, views: Sequence[View], depths: Sequence[DepthMap], wanted: Bool[Tensor, "h w"]
     ) -> Reconstruction:
-        """The Gaussians of the pixels `wanted` of the first view, in colours fitted to it."""
+        """Lift the pixels of `pixel_mask` in the first view and fit their colours to it."""
         rows = torch.nonzero(wanted.reshape(-1))[:, 0]
         blurred = self.splat(views[0], depths[0])[rows]
         gaussians = fit_colours(blurred.to("cpu"), [views[0].to("cpu")], self.renderer)
@@ -97,7 +91,7 @@ class Splatter:
         layers: Sequence[Layer],
         transforms: Transforms,
     ) -> Bool[Tensor, "n"]:
-        """Which of the Gaussians of all pixels make the scene."""
+        """Select the pixels that form the scene, over all views in turn."""
         if len(views) == 2:
             return torch.ones(len(every), dtype=torch.bool)
         free = free_pixels(layers, transforms)
@@ -111,30 +105,28 @@ class Splatter:
         return kept
 
     def without_ignored(self, made: Gaussians, view: View, gain: Float[Tensor, "3"]) -> View:
-        """`view`, with the scene as it is made in place of what is ignored, so that nothing is
-        fitted to that."""
+        """Replace ignored pixels by the render, so that nothing is fitted to them."""
         if view.ignored is None:
             return view
-        drawn = self.renderer.render(made, view.camera).image * gain
-        return replace(view, image=torch.where(view.ignored[..., None], drawn, view.image))
+        image = self.renderer.render(made, view.camera).image * gain
+        return replace(view, image=torch.where(view.ignored[..., None], image, view.image))
 
     def fitted(
         self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
     ) -> Gaussians:
-        """`gaussians` fitted to `views`, which are brighter by `gains` than they are."""
+        """Fit the Gaussians to views that are brighter by `gains`."""
         if len(views) == 2:
             return fit_appearance(gaussians, views, self.renderer)
         return fit_jointly(gaussians, views, gains, self.renderer)
 
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
-        """A disc for every pixel of `view`."""
+        """Create one disc per pixel of `view`."""
         return discs(view, depth.depth, normals_of(depth.depth, view), self.disc_sigma)
 
     def skies_behind(
         self, views: Sequence[View], depths: Sequence[DepthMap]
     ) -> list[tuple[int, Gaussians, Int[Tensor, "n"]]]:
-        """Of each view that shows the sky its number, the sky behind what stands before it, and the
-        pixels that lies at."""
+        """List view number, Gaussians and pixels of the sky behind each view's objects."""
         shown = [is_sky(d.depth, v.camera) for v, d in zip(views, depths, strict=True)]
         return [
             (i, *sky_behind(view, sky, self.disc_sigma))
@@ -144,11 +136,11 @@ class Splatter:
 
 
 def gains_among(layers: Sequence[Layer], transforms: Transforms) -> Float[Tensor, "views 3"]:
-    """By how much each photograph is brighter than the mean of all; two keep their exposures."""
+    """Estimate exposure gains for three or more views; two views get ones."""
     gains = gains_of(layers, transforms) if len(layers) > 2 else np.ones((len(layers), 3))
     return torch.from_numpy(gains).float()
 
 
 def as_rows(masks: Sequence[Mask | Tensor]) -> Bool[Tensor, "n"]:
-    """Masks of the views one after the other, row by row."""
+    """Flatten and concatenate the masks of all views."""
     return torch.cat([torch.as_tensor(mask).reshape(-1) for mask in masks])

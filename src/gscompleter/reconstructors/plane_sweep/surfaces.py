@@ -1,9 +1,7 @@
-"""Plane pieces from uncertain depths: total generalized variation (Bredies, Kunisch and Pock 2010;
-for stereo Ranftl et al. 2012).
+"""Piecewise planar surfaces from uncertain depths, by total generalized variation.
 
-The inverse depth of a plane is linear in the pixel. A map of inverse depths that bends as little as
-its measurements allow is therefore made of planes, and where nothing was measured, at the border of
-the frame or on a blank wall, the planes around go on; they end at the edges of the image.
+After Bredies, Kunisch and Pock (2010), and Ranftl et al. (2012) for stereo. Inverse depth is linear
+on a plane, so a map with little bending consists of planes, which continue into unmeasured areas.
 """
 
 from __future__ import annotations
@@ -21,58 +19,53 @@ Image = Float32[np.ndarray, "h w 3"]
 Map = Float32[np.ndarray, "h w"]
 AnyMap = Float32[np.ndarray, "_ _"]
 Level = tuple[AnyMap, AnyMap, Float32[np.ndarray, "_ _ 3"]]
-"""Measurements, their weights, and the image, all of one size."""
 
-# Heights are inverse depths, in steps between the planes of the sweep.
+# Heights are inverse depths, in planes of the sweep.
 STEP_PENALTY = 3.0
-"""Cost of a step by one plane where the image is even; a measurement that counts in full costs 1
-per plane that is missed."""
+"""Cost of a one-plane step in a uniform area; a measurement costs 1 per missed plane."""
 BEND_PENALTY = 12.0
-"""Cost of a change of slope by one plane per pixel."""
+"""Cost of a gradient change by one plane per pixel."""
 EDGE_CONTRAST = 0.1
-"""Difference of colour at which a step costs 1/e of that."""
+"""Colour difference at which the cost of a step falls to 1/e."""
 LEAST_PENALTY = 0.02
-"""Cost of a step at the strongest edge, relative to one where the image is even."""
+"""Relative cost of a step at the strongest edge."""
 TOLERANCE = 0.15
-"""Planes by which a measurement may be off as a matter of course."""
+"""Measurement error without cost, in planes."""
 LEVELS = 5
-"""Levels of the pyramid, each of half the size; planes travel far on the coarse ones."""
+"""Number of pyramid levels; coarse ones carry planes over long distances."""
 ITERATIONS = 100
-"""Steps on the finest level, and twice as many on each coarser one, where they cost little."""
+"""Iterations on the finest level, doubled on each coarser one."""
 
 
 def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
-    """Heights [h, w] that follow `measured` as far as `confidence` [h, w] in [0, 1] goes.
-
-    Where nothing at all is measured, the result is `measured`.
-    """
+    """Fit inverse depths to measurements with weights in [0, 1]; keep them if all are 0."""
     if not (confidence > 0).any():
         return measured
     levels: list[Level] = [(measured, confidence, image)]
     while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
         levels.append(halved(*levels[-1]))
     heights = beginning(*levels[-1][:2])
-    slopes = np.zeros((2, *heights.shape), np.float32)
+    gradients = np.zeros((2, *heights.shape), np.float32)
     for number, (data, weight, colours) in reversed(list(enumerate(levels))):
         if heights.shape != data.shape:
             heights = doubled(heights, data.shape)
-            slopes = np.stack([doubled(slope, data.shape) / 2 for slope in slopes])
-        # A coarse pixel holds 4 ** number fine ones; its steps are 2 ** number times as high.
+            gradients = np.stack([doubled(part, data.shape) / 2 for part in gradients])
+        # A coarse pixel covers 4 ** number fine ones, and its steps are 2 ** number times higher.
         scale = 2.0**number
         across, down = (cost / np.float32(scale) for cost in step_costs(colours))
         bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
         steps = ITERATIONS * 2**number
-        variation.fit(heights, slopes, data, weight, across, down, bend, tolerance, steps)
+        variation.fit(heights, gradients, data, weight, across, down, bend, tolerance, steps)
     return heights
 
 
 def beginning(data: AnyMap, weight: AnyMap) -> AnyMap:
-    """What was measured, continued smoothly."""
+    """Continue the measurements smoothly as a starting point."""
     return fill_smoothly(torch.from_numpy(data), torch.from_numpy(weight > 0)).numpy().copy()
 
 
 def step_costs(image: Image) -> tuple[Map, Map]:
-    """What a step to the right neighbour costs, and to the one below: less at an edge."""
+    """Compute the cost of a step to the right and lower neighbour; low at edges."""
 
     def cost(beside: Image) -> Map:
         share = np.maximum(np.exp(-contrast(image, beside) / EDGE_CONTRAST), LEAST_PENALTY)
@@ -83,7 +76,7 @@ def step_costs(image: Image) -> tuple[Map, Map]:
 
 
 def halved(data: Map, weight: Map, image: Image) -> Level:
-    """A level of half the size; measurements are averaged by their weights."""
+    """Halve a pyramid level; measurements are averaged by weight."""
     h, w = data.shape
     size = (h + 1) // 2, (w + 1) // 2
 
@@ -99,4 +92,5 @@ def halved(data: Map, weight: Map, image: Image) -> Level:
 
 
 def doubled(values: AnyMap, shape: tuple[int, ...]) -> AnyMap:
+    """Upsample bilinearly to `shape`."""
     return cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
