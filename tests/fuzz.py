@@ -77,7 +77,7 @@ class Outcome:
 
     name: str
     command: list[str]
-    refused: bool
+    refusal: bool
     finding: str | None
     """Problem in one line, if any."""
 

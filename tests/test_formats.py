@@ -55,7 +55,7 @@ def test_all_formats_give_the_same_views(tmp_path, resolution):
     truth = clips[0].views([1, 4], resolution)
     for clip in clips:
         assert isinstance(clip, PosedPhotographs)
-        assert (clip.name, len(clip), clip.reason_to_skip((SIZE, SIZE))) == ("room", 5, None)
+        assert (clip.name, len(clip), clip.find_skip_reason((SIZE, SIZE))) == ("room", 5, None)
         for view, true in zip(clip.views([1, 4], resolution), truth, strict=True):
             assert view.frame == true.frame
             assert torch.equal(view.image, true.image)
@@ -120,7 +120,7 @@ def test_a_missing_photograph_is_named_when_asked_for(tmp_path):
     assert len(clip.views([0, 1, 3])) == 3
     with pytest.raises(InputError, match=r"image of frame 2 of .*room.txt is missing; put .*66732"):
         clip.views([2])
-    assert clip.reason_to_skip((SIZE, SIZE)) == "frame 2: its image is missing"
+    assert clip.find_skip_reason((SIZE, SIZE)) == "frame 2: its image is missing"
     with pytest.raises(InputError, match="no frame 5 in .*room.txt"):
         clip.views([5])
 

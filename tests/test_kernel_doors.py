@@ -17,7 +17,7 @@ import torch
 from gscompleter import InputError, View
 from gscompleter.kernels import stereo
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.render.cpu import MAX_SIDE, CpuRenderer, arrays_of, length_of
+from gscompleter.render.cpu import MAX_SIDE, CpuRenderer, check_lengths, to_arrays
 from scenes import camera_at, random_gaussians, unchecked
 
 ODD = [np.nan, np.inf, -np.inf, 3e38, -3e38, 1e19, -1e19, 1e-38, 0.0]
@@ -113,9 +113,9 @@ def test_more_entries_than_can_be_numbered_are_refused(monkeypatch):
 
 
 def test_fields_of_different_lengths_are_refused():
-    arrays = arrays_of(random_gaussians(5))
+    arrays = to_arrays(random_gaussians(5))
     with pytest.raises(ValueError, match=r"different lengths: \[3, 5\]"):
-        length_of(arrays._replace(opacities=np.ones(3, np.float32)))
+        check_lengths(arrays._replace(opacities=np.ones(3, np.float32)))
 
 
 @pytest.mark.parametrize("size", [(1, 40), (40, 1), (7, 7)])

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import gscompleter
-from gscompleter.geometry import distance_from_depth
+from gscompleter.geometry import depth_to_distance
 from gscompleter.stages import alignment, anchor, context, integration, registration
 from gscompleter.types import DepthAffine
 
@@ -15,13 +15,13 @@ EQUATIONS = {
     6: (r"\Phi(\mathbf{I}_n, \mathbf{P}_t)", [anchor.synthesize]),
     7: (r"\Psi(\mathcal{V}_{\text{pair}}; \Theta)", [anchor.lift]),
     8: (r"(s \cdot D_{\text{pred}}^{\text{anc}}", [alignment.fit_affine, DepthAffine]),
-    9: (r"d_i^{\text{init}} = \frac", [distance_from_depth, registration.apply_affine]),
-    10: (r"\mathbf{c}_{\text{tgt}} + d_i \cdot \mathbf{r}_i", [registration.displace]),
+    9: (r"d_i^{\text{init}} = \frac", [depth_to_distance, registration.apply_affine]),
+    10: (r"\mathbf{c}_{\text{tgt}} + d_i \cdot \mathbf{r}_i", [registration.move_along_rays]),
     11: (
         r"\lambda_s \mathcal{L}_{\text{stereo}}",
         [registration.Objective, registration.register_along_rays],
     ),
-    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [integration.hole_mask]),
+    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [integration.compute_hole_mask]),
     13: (r"\mathcal{L}_{\text{mv}} =", [integration.refine_opacities]),
 }
 """For each equation of the paper by number, a piece of it and the code that implements it."""

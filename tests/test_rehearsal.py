@@ -15,7 +15,7 @@ from rich.console import Console
 from command import run
 from gscompleter import GSCompleter, compilation, kernels, rehearsal
 from gscompleter.kernels import compiled
-from gscompleter.progress import shown_on
+from gscompleter.progress import show_progress
 from scenes import Room, camera_at, view_of
 
 COMPLETE = """
@@ -101,7 +101,7 @@ def test_kernels_are_compiled_anew_for_another_processor(marked, monkeypatch):
 
 def test_one_line_says_so_before_it_happens(marked):
     console = Console(record=True, file=io.StringIO(), width=200)
-    with shown_on(console):
+    with show_progress(console):
         compilation.compile_kernels(["cpu"])
         compilation.compile_kernels(["cpu"])
     said = console.export_text()
@@ -148,23 +148,23 @@ def test_what_was_begun_is_waited_for_once(monkeypatch, marked):
 
     monkeypatch.setattr(compilation, "begun_apart", idle)
     monkeypatch.setattr(compilation, "threads", lambda: 2)
-    compilation.begin(["plane-sweep"])
-    compilation.begin(["plane-sweep"])
+    compilation.begin_compilation(["plane-sweep"])
+    compilation.begin_compilation(["plane-sweep"])
     assert compilation.compile_kernels(["cpu", "plane-sweep"]) > 0
     assert [(process.args[-1], process.returncode) for process in begun] == [("plane-sweep", 0)]
     assert marked == ["cpu"]
-    assert compilation._begun == {}
+    assert compilation._started == {}
 
 
 def test_one_process_alone_begins_nothing(monkeypatch, marked):
-    compilation.begin(["cpu", "plane-sweep"])
-    assert compilation._begun == {}
+    compilation.begin_compilation(["cpu", "plane-sweep"])
+    assert compilation._started == {}
 
 
 def test_a_part_that_fails_in_its_process_is_no_success(monkeypatch):
     with (
         pytest.raises(subprocess.CalledProcessError),
-        compilation.rehearsed_apart(["no such part"]),
+        compilation.rehearse_in_subprocess(["no such part"]),
     ):
         pass
 

@@ -144,7 +144,10 @@ def test_what_lies_on_the_hub_has_an_address_and_what_does_not_has_a_page():
         "depthsplat-gs-small-re10k-256x256-view2-cfeab6b1.pth"
     )
     assert MVSPLAT.url == MVSPLAT.source
-    assert [w.pinned_by for w in (DEPTHSPLAT, MVSPLAT)] == ["first 8 digits of SHA-256", "nothing"]
+    assert [w.integrity_check for w in (DEPTHSPLAT, MVSPLAT)] == [
+        "first 8 digits of SHA-256",
+        "nothing",
+    ]
     assert replace(MVSPLAT, sha256="0" * 64).pinned_by == "SHA-256"
 
 
@@ -173,7 +176,7 @@ def test_the_page_of_models_has_a_row_for_every_file():
             f"{weights.code_licence} / {weights.weights_licence}",
             weights.caution or "allowed",
             f"[{weights.file}]({weights.url})",
-            weights.pinned_by,
+            weights.integrity_check,
         ]
 
 

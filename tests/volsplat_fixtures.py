@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from feed_forward_fixtures import EVERY, STORED, Case, rule_v1
-from gscompleter.geometry import rotations_from
+from gscompleter.geometry import quats_to_rotations
 from gscompleter.reconstructors.feed_forward.volsplat import VoxelGaussians
 from parity import relative_error
 
@@ -70,7 +70,7 @@ class VoxelPass:
             hook.remove()
         return VoxelPass(predicted, between)
 
-    def rows_of(self, case: Case) -> Tensor:
+    def get_row_paths(self, case: Case) -> Tensor:
         """Find our row of each of the authors' voxels; -1 if there is none."""
         ours = {tuple(row): i for i, row in enumerate(self.predicted.grid.coordinates.tolist())}
         return torch.tensor([ours.get(tuple(row), -1) for row in case.values["voxel_coords"]])
@@ -96,9 +96,9 @@ class VoxelPass:
             errors[name] = relative_error(ours, case.tensor(f"mid_{name}")[shared])
         return errors
 
-    def outputs(self) -> dict[str, Tensor]:
+    def output_block_ids(self) -> dict[str, Tensor]:
         g = self.predicted
-        spread = rotations_from(g.quats) * g.scales[:, None, :]
+        spread = quats_to_rotations(g.quats) * g.scales[:, None, :]
         values = {
             "means": g.means,
             "covariances": spread @ spread.transpose(-1, -2),

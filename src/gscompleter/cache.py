@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 
-def cache_folder() -> Path:
+def get_download_folder() -> Path:
     """Return $GSCOMPLETER_HOME, or else ~/.cache/gscompleter."""
     home = os.environ.get("GSCOMPLETER_HOME")
     return Path(home).expanduser() if home else Path.home() / ".cache" / "gscompleter"

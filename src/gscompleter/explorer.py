@@ -11,39 +11,39 @@ from torch import Tensor
 
 from gscompleter.completer import Clock, GSCompleter
 from gscompleter.config import NextBestViewConfig
-from gscompleter.geometry import same_camera
+from gscompleter.geometry import is_same_camera
 from gscompleter.progress import stage, track
-from gscompleter.render import each_view
-from gscompleter.render.antialiasing import in_mode_of
+from gscompleter.render import get_view_map
+from gscompleter.render.antialiasing import adapt_to_mode
 from gscompleter.stages.anchor import select_anchor
 from gscompleter.stages.candidates import (
     Candidate,
-    candidates,
+    compute_spacing,
     is_close,
-    shrunk,
-    spacing,
-    spread_cameras,
+    propose_candidates,
+    select_spread_cameras,
+    shrink_camera,
 )
 from gscompleter.stages.exploration import (
     Choice,
-    best,
-    gain,
-    miniature,
-    overlap_of,
-    stand_ins,
+    choose_best,
+    compute_gain,
+    compute_overlap,
+    make_placeholders,
+    simplify_completion,
 )
-from gscompleter.stages.integration import hole_mask
+from gscompleter.stages.integration import compute_hole_mask
 from gscompleter.types import Camera, Completion, Render, merge
 
-MAX_BYSTANDERS = 40
+MAX_FREE_SPACE_CAMERAS = 40
 """Most cameras of photographs, besides the context views, whose free space is kept empty."""
 
-Complete = Callable[[Completion, Camera], Completion]
+CompletionStep = Callable[[Completion, Camera], Completion]
 """Step that is taken at a chosen camera."""
 
 
 @dataclass(frozen=True)
-class Look:
+class SmallView:
     """A small render of a scene and its hole mask."""
 
     camera: Camera
@@ -52,7 +52,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Explorer:
+class ViewPlanner:
     """Plans next-best target views greedily, re-scoring candidates after each completion."""
 
     completer: GSCompleter
@@ -73,8 +73,10 @@ class Explorer:
             count: Largest number of targets; there are fewer if little is left to gain.
         """
         clock, begun = Clock(()), completion.seconds["total"]
-        completion = with_bystanders(completion, cameras)
-        completion, choices = self.take(completion, cameras, count, self.completer.advance)
+        completion = add_free_space_cameras(completion, cameras)
+        completion, choices = self.complete_greedily(
+            completion, cameras, count, self.completer.advance
+        )
         completed = completion.seconds["total"]
         spent = begun + clock.seconds["total"]
         seconds = {**completion.seconds, "explore": spent - completed, "total": spent}
@@ -87,26 +89,34 @@ class Explorer:
 
         Grey placeholders close the holes of each chosen camera.
         """
-        return self.take(miniature(completion), cameras, count, self.with_stand_ins)[1]
+        return self.complete_greedily(
+            simplify_completion(completion), cameras, count, self.add_placeholders
+        )[1]
 
-    def holes(self, completion: Completion, cameras: Sequence[Camera]) -> list[float]:
+    def compute_hole_fractions(
+        self, completion: Completion, cameras: Sequence[Camera]
+    ) -> list[float]:
         """Compute the hole fraction at each camera after those before it are completed."""
-        small, shares = miniature(completion), []
+        small, shares = simplify_completion(completion), []
         for camera in cameras:
-            shares.append(self.look(small, camera).holes.float().mean().item())
-            small = self.with_stand_ins(small, camera)
+            shares.append(self.render_small_view(small, camera).holes.float().mean().item())
+            small = self.add_placeholders(small, camera)
         return shares
 
-    def take(
-        self, completion: Completion, cameras: Sequence[Camera], count: int, complete: Complete
+    def complete_greedily(
+        self,
+        completion: Completion,
+        cameras: Sequence[Camera],
+        count: int,
+        complete: CompletionStep,
     ) -> tuple[Completion, tuple[Choice, ...]]:
         """Repeatedly choose the best camera and complete the scene there."""
         with stage("finding targets"):
-            remaining, step = self.offers(completion, cameras)
+            remaining, step = self.find_candidates(completion, cameras)
         chosen: list[Choice] = []
         for _ in track(range(count), "target"):
-            choices = self.judged(completion, remaining)
-            choice = best(choices, [v.camera for v in completion.views], step, self.config)
+            choices = self.score_candidates(completion, remaining)
+            choice = choose_best(choices, [v.camera for v in completion.views], step, self.config)
             if choice is None:
                 break
             completion = complete(completion, choice.camera)
@@ -115,67 +125,83 @@ class Explorer:
             remaining = [candidate for candidate in left if candidate is not choice.candidate]
         return completion, tuple(chosen)
 
-    def offers(
+    def find_candidates(
         self, completion: Completion, cameras: Sequence[Camera]
     ) -> tuple[list[Candidate], float]:
         """Propose candidate cameras; also return the step length in scene units."""
-        bases = spread_cameras(cameras, self.config.bases)
-        near = [completion.ranged(cameras[index]) for index in bases]
-        step = spacing(near)
-        small = miniature(completion)
-        renders = [self.look(small, camera).render for camera in near]
-        found = candidates(near, renders, step, self.config)
+        bases = select_spread_cameras(cameras, self.config.bases)
+        near = [completion.with_depth_range(cameras[index]) for index in bases]
+        step = compute_spacing(near)
+        small = simplify_completion(completion)
+        renders = [self.render_small_view(small, camera).render for camera in near]
+        found = propose_candidates(near, renders, step, self.config)
         return [replace(candidate, base=bases[candidate.base]) for candidate in found], step
 
-    def judged(self, completion: Completion, offers: Sequence[Candidate]) -> list[Choice]:
+    def score_candidates(
+        self, completion: Completion, candidates_left: Sequence[Candidate]
+    ) -> list[Choice]:
         """Score all candidates in the current scene."""
-        small = miniature(completion)
-        anchors = [self.look(small, view.camera) for view in small.views]
-        choose = partial(self.choice, small, anchors)
-        choices = each_view(small.drawn)(choose, offers)
-        counted = zip(track(offers, "finding targets"), choices, strict=True)
+        small = simplify_completion(completion)
+        anchors = [self.render_small_view(small, view.camera) for view in small.views]
+        choose = partial(self.score_candidate, small, anchors)
+        choices = get_view_map(small.rendered_scene)(choose, candidates_left)
+        counted = zip(track(candidates_left, "finding targets"), choices, strict=True)
         return [choice for _, choice in counted]
 
-    def choice(
-        self, completion: Completion, anchors: Sequence[Look], candidate: Candidate
+    def score_candidate(
+        self, completion: Completion, anchors: Sequence[SmallView], candidate: Candidate
     ) -> Choice:
         """Score one candidate; its gain is 0 if it is too close to a surface."""
-        small_view = self.look(completion, candidate.camera)
+        small_view = self.render_small_view(completion, candidate.camera)
         hole = small_view.holes.float().mean().item()
         if is_close(small_view.render, candidate.nearest, self.config):
             return Choice(candidate, hole, 0.0)
         overlaps = [
-            overlap_of(small_view.camera, small_view.render, anchor.camera, anchor.render)
+            compute_overlap(small_view.camera, small_view.render, anchor.camera, anchor.render)
             for anchor in anchors
         ]
         config, views = self.completer.config.anchor, completion.views
         anchor = select_anchor(candidate.camera, views, config, overlaps).index
-        return Choice(candidate, hole, gain(small_view.holes, overlaps[anchor], self.config))
+        return Choice(
+            candidate, hole, compute_gain(small_view.holes, overlaps[anchor], self.config)
+        )
 
-    def look(self, completion: Completion, camera: Camera) -> Look:
+    def render_small_view(self, completion: Completion, camera: Camera) -> SmallView:
         """Render the scene at a camera in a small image."""
-        camera = shrunk(completion.ranged(camera), self.config.image_size)
-        frozen = self.completer.renderer.freeze(completion.drawn, camera)
-        render, trusted = frozen.context, self.completer.believed(completion, frozen, camera)
+        camera = shrink_camera(completion.with_depth_range(camera), self.config.image_size)
+        frozen = self.completer.renderer.freeze(completion.rendered_scene, camera)
+        render, trusted = (
+            frozen.render,
+            self.completer.compute_trusted_alpha(completion, frozen, camera),
+        )
         alpha = render.alpha if trusted is None else trusted
-        return Look(camera, render, hole_mask(alpha, self.completer.config.holes))
+        return SmallView(camera, render, compute_hole_mask(alpha, self.completer.config.holes))
 
-    def with_stand_ins(self, completion: Completion, camera: Camera) -> Completion:
+    def add_placeholders(self, completion: Completion, camera: Camera) -> Completion:
         """Close the holes at a camera by grey placeholders."""
-        view = self.look(completion, self.completer.window(completion, camera).wide)
-        scene, placeholders = completion.drawn, stand_ins(view.render, view.holes, view.camera)
-        added = in_mode_of(scene, placeholders, view.camera)
-        return replace(completion, drawn=merge([scene, added]))
+        view = self.render_small_view(
+            completion, self.completer.pad_target(completion, camera).padded
+        )
+        scene, placeholders = (
+            completion.rendered_scene,
+            make_placeholders(view.render, view.holes, view.camera),
+        )
+        added = adapt_to_mode(scene, placeholders, view.camera)
+        return replace(completion, rendered_scene=merge([scene, added]))
 
 
-def with_bystanders(completion: Completion, cameras: Sequence[Camera]) -> Completion:
+def add_free_space_cameras(completion: Completion, cameras: Sequence[Camera]) -> Completion:
     """Keep the free space of a spread subset of cameras empty.
 
     An input splat gets none: its renders may be wrong there, and check views protect it better.
     """
     taken = [view.camera for view in completion.views]
-    others = [completion.ranged(c) for c in cameras if not any(same_camera(c, t) for t in taken)]
-    if completion.evidence is not None or not others:
+    others = [
+        completion.with_depth_range(c)
+        for c in cameras
+        if not any(is_same_camera(c, t) for t in taken)
+    ]
+    if completion.observations is not None or not others:
         return completion
-    chosen = spread_cameras(others, MAX_BYSTANDERS)
-    return replace(completion, bystanders=tuple(others[index] for index in chosen))
+    chosen = select_spread_cameras(others, MAX_FREE_SPACE_CAMERAS)
+    return replace(completion, free_space_cameras=tuple(others[index] for index in chosen))

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def staying() -> Iterator[None]:
+def freeze_objects() -> Iterator[None]:
     """Exclude all objects that exist after the block from garbage collection.
 
     Such objects are imported modules and compiled kernels. Each search of torch alone takes 0.2 s.

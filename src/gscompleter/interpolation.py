@@ -19,11 +19,11 @@ def fill_smoothly(
     weight = known.to(values.dtype)
     filled = push_pull(values[..., None], weight)[..., 0]
     for _ in range(num_relaxations):
-        filled = torch.where(known, values, mean_of_neighbours(filled))
+        filled = torch.where(known, values, average_four_neighbours(filled))
     return filled
 
 
-def mean_of_neighbours(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+def average_four_neighbours(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Compute the mean of the four neighbours of each pixel, extending the border."""
     padded = pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     total = padded[:-2, 1:-1] + padded[2:, 1:-1]
@@ -59,7 +59,7 @@ def _fill(
     return torch.where(weight > 0, own, below)
 
 
-def smoothed(
+def smooth_masked(
     values: Float[Tensor, "h w c"], mask: Bool[Tensor, "h w"], radius: int
 ) -> Float[Tensor, "h w c"]:
     """Average `values` over the pixels of `mask` in a square of 2 radius + 1 pixels."""

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 
-def treat_stops_alike() -> None:
+def handle_stop_signals() -> None:
     """Let SIGTERM and SIGHUP raise KeyboardInterrupt, so that everything is cleaned up.
 
     Signals that are ignored (`nohup`) or handled already stay so. This works in the main thread
@@ -22,7 +22,7 @@ def treat_stops_alike() -> None:
 
 
 @contextmanager
-def stops_deferred(state: str = "") -> Iterator[None]:
+def defer_interrupts(state: str = "") -> Iterator[None]:
     """Defer KeyboardInterrupt to the end of the block, in the main thread.
 
     `state` is its message, if it differs from the usual one.

@@ -10,7 +10,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 
 MAX_BYTES = 1 << 33
 """Largest file that is read at once, in bytes."""
@@ -36,10 +36,10 @@ def check_file(path: Path) -> None:
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        raise _unreadable(path, error) from error
+        raise _make_read_error(path, error) from error
     if not stat.S_ISREG(mode):
         kind = _KINDS.get(stat.S_IFMT(mode), "device")
-        raise InputError(f"{quoted(path)} is not a file but a {kind}; correct the path.")
+        raise InputError(f"{quote_value(path)} is not a file but a {kind}; correct the path.")
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -48,7 +48,7 @@ def open_file(path: Path) -> BinaryIO:
     try:
         return path.open("rb")
     except OSError as error:
-        raise _unreadable(path, error) from error
+        raise _make_read_error(path, error) from error
 
 
 def read_head(path: Path, count: int) -> bytes:
@@ -58,18 +58,18 @@ def read_head(path: Path, count: int) -> bytes:
     return b""
 
 
-def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
+def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     """Read a file of at most `max_bytes` bytes; raise InputError if that fails."""
     try:
         with open_file(path) as file:
-            _check_size(path, file, most)
+            _check_size(path, file, max_bytes)
             return file.read()
     except OSError as error:
-        raise _unreadable(path, error) from error
+        raise _make_read_error(path, error) from error
 
 
 def read_lines(
-    path: Path, longest: int = MAX_LINE, most: int = MAX_TEXT, errors: str = "replace"
+    path: Path, max_length: int = MAX_LINE, max_bytes: int = MAX_TEXT, errors: str = "replace"
 ) -> Iterator[str]:
     """Read the lines of a UTF-8 text file one by one; raise InputError if it is too long.
 
@@ -78,20 +78,21 @@ def read_lines(
     """
     try:
         with open_file(path) as file:
-            _check_size(path, file, most)
+            _check_size(path, file, max_bytes)
             text = TextIOWrapper(file, encoding="utf-8-sig", errors=errors)
-            while line := text.readline(longest + 1):
-                if len(line) > longest:
+            while line := text.readline(max_length + 1):
+                if len(line) > max_length:
                     raise InputError(
-                        f"{quoted(path)} has a line of more than {longest:,} characters, which "
+                        f"{quote_value(path)} has a line of more than {max_length:,} characters, "
+                        "which "
                         "its format does not allow; copy the file again."
                     )
                 yield line
     except OSError as error:
-        raise _unreadable(path, error) from error
+        raise _make_read_error(path, error) from error
 
 
-def check_plain(value: Any, path: Path, most: int) -> None:
+def check_plain(value: Any, path: Path, max_values: int) -> None:
     """Raise InputError if values read from `path` are nested too deeply or too many.
 
     Repeated values count again, so that a value that contains itself is refused as endless.
@@ -103,19 +104,22 @@ def check_plain(value: Any, path: Path, most: int) -> None:
             continue
         parts = held.values() if isinstance(held, dict) else held
         count += len(parts)
-        if depth > MAX_DEPTH or count > most:
-            raise InputError(f"{quoted(path)} is nested too deeply or without end; write it again.")
+        if depth > MAX_DEPTH or count > max_values:
+            raise InputError(
+                f"{quote_value(path)} is nested too deeply or without end; write it again."
+            )
         waiting += [(part, depth + 1) for part in parts if isinstance(part, _HOLDERS)]
 
 
-def _check_size(path: Path, file: BinaryIO, most: int) -> None:
+def _check_size(path: Path, file: BinaryIO, max_bytes: int) -> None:
     size = os.fstat(file.fileno()).st_size
-    if size > most:
+    if size > max_bytes:
         raise InputError(
-            f"{quoted(path)} has {size:,} bytes, and at most {most:,} are read; name a smaller one."
+            f"{quote_value(path)} has {size:,} bytes, and at most {max_bytes:,} are read; name a "
+            "smaller one."
         )
 
 
-def _unreadable(path: Path, error: Exception) -> InputError:
+def _make_read_error(path: Path, error: Exception) -> InputError:
     reason = getattr(error, "strerror", None) or "no file can have that name"
-    return InputError(f"{quoted(path)} cannot be read: {reason}; correct the path.")
+    return InputError(f"{quote_value(path)} cannot be read: {reason}; correct the path.")

@@ -8,32 +8,32 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-LIBRARIES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Environment variables that torch, numba and OpenCV read on import."""
 
-QUOTA = Path("/sys/fs/cgroup/cpu.max")
+QUOTA_FILE = Path("/sys/fs/cgroup/cpu.max")
 """File of a Linux container's CPU quota: microseconds per period."""
 
 
-def bound_threads(count: int | None) -> None:
+def limit_threads(count: int | None) -> None:
     """Limit the threads of all libraries and of new processes.
 
     None means all usable cores, unless the environment has a number. Call it before the libraries
     are imported.
     """
-    for name in LIBRARIES:
+    for name in THREAD_VARIABLES:
         if count is not None or name not in os.environ:
-            os.environ[name] = str(count or usable_cores())
+            os.environ[name] = str(count or count_available_cores())
 
 
-def threads() -> int:
+def get_thread_count() -> int:
     """Return the number of threads."""
-    value = os.environ.get(LIBRARIES[0], "")
-    return int(value) if value.isdecimal() and int(value) > 0 else usable_cores()
+    value = os.environ.get(THREAD_VARIABLES[0], "")
+    return int(value) if value.isdecimal() and int(value) > 0 else count_available_cores()
 
 
 @contextmanager
-def torch_on_one_thread() -> Iterator[None]:
+def use_one_torch_thread() -> Iterator[None]:
     """Let torch compute with one thread inside the block.
 
     Its waiting threads otherwise slow down our own kernels, which run between short torch loops.
@@ -48,14 +48,14 @@ def torch_on_one_thread() -> Iterator[None]:
         torch.set_num_threads(count)
 
 
-def usable_cores() -> int:
+def count_available_cores() -> int:
     """Count the cores of this process, limited by its CPU quota."""
     pinned = hasattr(os, "sched_getaffinity")  # Windows and macOS have none
     cores = len(os.sched_getaffinity(0)) if pinned else os.cpu_count() or 1
-    return max(1, round(min(cores, granted(QUOTA))))
+    return max(1, round(min(cores, read_quota(QUOTA_FILE))))
 
 
-def granted(file: Path) -> float:
+def read_quota(file: Path) -> float:
     """Read a CPU quota in cores; infinite if there is none."""
     words = file.read_text().split() if file.is_file() else []
     bounded = len(words) == 2 and all(word.isdecimal() for word in words)

@@ -27,7 +27,7 @@ class Mixture:
     weights: Float[Tensor, "n"]
 
 
-def reduced(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
+def reduce_mixture(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
     """Merge each cluster into one component with its mean and covariance."""
     count = int(clusters.max()) + 1
     weight = mixture.weights.new_zeros(count).index_add(0, clusters, mixture.weights)
@@ -43,27 +43,27 @@ def reduced(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
     return Mixture(means[filled], covariances[filled], weights)
 
 
-def pairwise_costs(a: Mixture, b: Mixture) -> Float[Tensor, "n m"]:
+def compute_pairwise_costs(a: Mixture, b: Mixture) -> Float[Tensor, "n m"]:
     """Compute squared 2-Wasserstein distances between components.
 
     |μ_i - μ_j|² + tr Σ_i + tr Σ_j - 2 tr (Σ_i^½ Σ_j Σ_i^½)^½
     """
     offsets = a.means[:, None] - b.means[None]
-    root = matrix_root(a.covariances)
+    root = compute_matrix_root(a.covariances)
     middle = root[:, None] @ b.covariances[None] @ root[:, None]
     traces = torch.diagonal(a.covariances, dim1=-2, dim2=-1).sum(-1)[:, None]
     traces = traces + torch.diagonal(b.covariances, dim1=-2, dim2=-1).sum(-1)[None]
-    crossed = torch.diagonal(matrix_root(middle), dim1=-2, dim2=-1).sum(-1)
+    crossed = torch.diagonal(compute_matrix_root(middle), dim1=-2, dim2=-1).sum(-1)
     return offsets.square().sum(-1) + traces - 2 * crossed
 
 
-def matrix_root(matrices: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3 3"]:
+def compute_matrix_root(matrices: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3 3"]:
     """Compute square roots of positive matrices, differentiable at equal eigenvalues."""
     identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
-    return _Root.apply(matrices + 1e-6 * identity)
+    return _MatrixRoot.apply(matrices + 1e-6 * identity)
 
 
-class _Root(torch.autograd.Function):
+class _MatrixRoot(torch.autograd.Function):
     """R with R R = M by eigenvalues; the gradient solves dM = R dR + dR R."""
 
     @staticmethod
@@ -82,9 +82,9 @@ class _Root(torch.autograd.Function):
         return vectors @ inner @ vectors.transpose(-1, -2)
 
 
-def mixture_wasserstein(a: Mixture, b: Mixture) -> Float[Tensor, ""]:
+def compute_mixture_wasserstein(a: Mixture, b: Mixture) -> Float[Tensor, ""]:
     """Compute Σ plan * cost by Sinkhorn iterations; the largest plan entry is 1 as in RegGS."""
-    cost = pairwise_costs(a, b)
+    cost = compute_pairwise_costs(a, b)
     log_a, log_b = (a.weights + 1e-10).log(), (b.weights + 1e-10).log()
     log_kernel = -cost / EPSILON
     log_u, log_v = torch.zeros_like(log_a), torch.zeros_like(log_b)

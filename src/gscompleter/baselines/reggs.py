@@ -14,8 +14,12 @@ from jaxtyping import Float
 from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
-from gscompleter.baselines.mixture_wasserstein import Mixture, mixture_wasserstein, reduced
-from gscompleter.geometry import quats_product, rotations_from
+from gscompleter.baselines.mixture_wasserstein import (
+    Mixture,
+    compute_mixture_wasserstein,
+    reduce_mixture,
+)
+from gscompleter.geometry import multiply_quats, quats_to_rotations
 from gscompleter.progress import track
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, View
@@ -30,7 +34,7 @@ class RegGSConfig:
     rotation_rate: float = 2e-4
     translation_rate: float = 2e-3
     """Step size of the translation, in scene units."""
-    colour_weight: float = 1.0
+    color_weight: float = 1.0
     depth_weight: float = 0.1
     mixture_weight: float = 0.1
     components: int = 1000
@@ -52,11 +56,11 @@ class Similarity:
     @property
     def rotation(self) -> Float[Tensor, "3 3"]:
         """Rotation matrix R."""
-        return rotations_from(self.quaternion)
+        return quats_to_rotations(self.quaternion)
 
 
 @dataclass(frozen=True)
-class Registered:
+class RegisteredScene:
     """The registered Gaussians, and their similarity."""
 
     gaussians: Gaussians
@@ -71,7 +75,7 @@ def register_by_similarity(
     renderer: Renderer,
     seed: int = 42,
     config: RegGSConfig = RegGSConfig(),
-) -> Registered:
+) -> RegisteredScene:
     """Fit one similarity between `lifted` and `scene` at the camera of `reference`."""
     camera = reference.camera
     own = renderer.render(lifted, camera)
@@ -91,23 +95,23 @@ def register_by_similarity(
         ],
         amsgrad=True,
     )
-    small_lifted = clustered(lifted, camera, config.components, seed)
-    small_scene = clustered(scene, camera, config.components, seed)
+    small_lifted = cluster_gaussians(lifted, camera, config.components, seed)
+    small_scene = cluster_gaussians(scene, camera, config.components, seed)
     best, best_loss = None, np.inf
     losses: list[float] = []
     distances: list[float] = []
     compare_mixtures = config.mixture_weight > 0
     for _ in track(range(config.iterations), "Registering"):
         fit = Similarity(scale, quaternion, translation)
-        moved = renderer.render(carried(scene, fit), camera)
+        moved = renderer.render(move_scene(scene, fit), camera)
         alpha = own.alpha.detach()
         colour = ((moved.image - reference.image).abs() * alpha[..., None] ** 3).sum()
         overlap = own.depth_map().valid & moved.depth_map().valid
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
-        loss = config.colour_weight * colour + config.depth_weight * depth
+        loss = config.color_weight * colour + config.depth_weight * depth
         if compare_mixtures:
-            distance = mixture_wasserstein(
-                scaled(small_lifted, scale), turned(small_scene, fit, camera)
+            distance = compute_mixture_wasserstein(
+                scale_mixture(small_lifted, scale), rotate_mixture(small_scene, fit, camera)
             )
             recent = distances[-config.patience :]
             if len(distances) >= config.patience and distance.item() >= max(recent):
@@ -123,17 +127,17 @@ def register_by_similarity(
         optimizer.step()
         losses.append(loss.item())
     similarity = best or Similarity(scale.detach(), quaternion.detach(), translation.detach())
-    return Registered(into_scene(lifted, similarity, camera), similarity, tuple(losses))
+    return RegisteredScene(move_into_scene(lifted, similarity, camera), similarity, tuple(losses))
 
 
-def carried(scene: Gaussians, fit: Similarity) -> Gaussians:
+def move_scene(scene: Gaussians, fit: Similarity) -> Gaussians:
     """Move the scene to the lifted Gaussians, differentiable in `fit`."""
     unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
     means = scene.means @ fit.rotation.T + fit.translation
-    return replace(scene, means=means, quats=quats_product(unit, scene.quats), encoded=None)
+    return replace(scene, means=means, quats=multiply_quats(unit, scene.quats), encoded=None)
 
 
-def into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
+def move_into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
     """Scale the lifted Gaussians about their camera and move them to the scene."""
     means = camera.center + fit.scale * (lifted.means - camera.center)
     unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
@@ -141,16 +145,16 @@ def into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
     return replace(
         lifted,
         means=(means - fit.translation) @ fit.rotation,
-        quats=quats_product(back, lifted.quats),
+        quats=multiply_quats(back, lifted.quats),
         scales=lifted.scales * fit.scale,
         encoded=None,
     )
 
 
-def clustered(gaussians: Gaussians, camera: Camera, components: int, seed: int) -> Mixture:
+def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, seed: int) -> Mixture:
     """Merge the Gaussians into k-means clusters, in camera axes."""
     rotation = camera.c2w[:3, :3]
-    axes = rotation.T @ rotations_from(gaussians.quats)
+    axes = rotation.T @ quats_to_rotations(gaussians.quats)
     spread = axes * gaussians.scales[:, None, :]
     mixture = Mixture(
         (gaussians.means - camera.center) @ rotation,
@@ -161,15 +165,17 @@ def clustered(gaussians: Gaussians, camera: Camera, components: int, seed: int) 
         return mixture
     points = mixture.means.double().cpu().numpy()
     _, labels = kmeans2(points, components, iter=10, minit="points", seed=seed)
-    return reduced(mixture, torch.from_numpy(labels.astype(np.int64)).to(mixture.means.device))
+    return reduce_mixture(
+        mixture, torch.from_numpy(labels.astype(np.int64)).to(mixture.means.device)
+    )
 
 
-def scaled(mixture: Mixture, scale: Float[Tensor, ""]) -> Mixture:
+def scale_mixture(mixture: Mixture, scale: Float[Tensor, ""]) -> Mixture:
     """Scale a mixture."""
     return Mixture(scale * mixture.means, scale**2 * mixture.covariances, mixture.weights)
 
 
-def turned(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
+def rotate_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
     """Move a mixture in camera axes by the similarity of the scene."""
     c2w = camera.c2w[:3, :3]
     rotation = c2w.T @ fit.rotation @ c2w

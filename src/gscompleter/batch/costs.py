@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gscompleter.progress import stages_heard_by
+from gscompleter.progress import notify_of_stages
 
 COUNTERS = Path("/proc/self/io")
 """File in which Linux counts the bytes that this process reads and writes, cached or not."""
@@ -32,29 +32,29 @@ class Meter:
 
     stages: dict[str, Cost] = field(default_factory=dict)
     name: str = "open"
-    begun: Cost = field(default_factory=Cost)
+    start: Cost = field(default_factory=Cost)
     """Clock and counters at its start."""
 
     def begin(self, name: str) -> None:
         """End the current stage and start the stage `name`."""
-        now, cost = spent(), self.stages.setdefault(self.name, Cost())
-        cost.seconds += now.seconds - self.begun.seconds
-        cost.cpu_seconds += now.cpu_seconds - self.begun.cpu_seconds
-        cost.read_bytes += now.read_bytes - self.begun.read_bytes
-        cost.written_bytes += now.written_bytes - self.begun.written_bytes
-        self.name, self.begun = name, now
+        now, cost = read_counters(), self.stages.setdefault(self.name, Cost())
+        cost.seconds += now.seconds - self.start.seconds
+        cost.cpu_seconds += now.cpu_seconds - self.start.cpu_seconds
+        cost.read_bytes += now.read_bytes - self.start.read_bytes
+        cost.written_bytes += now.written_bytes - self.start.written_bytes
+        self.name, self.start = name, now
 
 
 @contextmanager
-def metered() -> Iterator[Meter]:
+def measure_costs() -> Iterator[Meter]:
     """Measure the body by stage."""
-    meter = Meter(begun=spent())
-    with stages_heard_by(meter.begin):
+    meter = Meter(start=read_counters())
+    with notify_of_stages(meter.begin):
         yield meter
     meter.begin("")
 
 
-def spent() -> Cost:
+def read_counters() -> Cost:
     """Read the clocks and the byte counters of this process; 0 if the system has no counters."""
     counters = COUNTERS.read_text() if COUNTERS.is_file() else ""
     found = dict(re.findall(r"^(\w+): ([0-9]+)$", counters, re.M))

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from gscompleter.batch.places import Place
-from gscompleter.errors import InputError, OutputError, quoted
+from gscompleter.errors import InputError, OutputError, quote_value
 
 BATCH = "batch.json"
 """Name of the file that marks the folder of a batch."""
@@ -69,23 +69,25 @@ class Attempts:
     reason: str | None = None
 
 
-def settle(job: Job, place: Place, work: Callable[[], Mapping[str, Any]], retries: int) -> Outcome:
+def run_claimed(
+    job: Job, place: Place, work: Callable[[], Mapping[str, Any]], retries: int
+) -> Outcome:
     """Claim a job, run it and write its row, unless it has a row or another process runs it.
 
     `work` returns further entries of the row. It is repeated after a killed process or any error
     other than InputError, at most `retries` times.
     """
-    with place.claimed(f"{CLAIMS}/{job.name}") as lost:
+    with place.hold_claim(f"{CLAIMS}/{job.name}") as lost:
         if lost is None:
             return Outcome(job, "elsewhere")
-        row = finished_row(place, job)
+        row = read_finished_row(place, job)
         if row is None:
-            row = row_of(job, attempts(work, lost, retries))
+            row = make_job_row(job, run_with_retries(work, lost, retries))
             write_row(place, job.name, row)
         return Outcome(job, row["state"], row["reason"])
 
 
-def attempts(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> Attempts:
+def run_with_retries(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> Attempts:
     """Run `work` with retries; `lost` attempts have already been killed."""
     reason = f"its process was killed {lost} times, perhaps because memory ran out"
     for number in range(lost + 1, retries + 2):
@@ -102,7 +104,7 @@ def attempts(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> 
     return Attempts(None, max(lost, retries + 1), reason)
 
 
-def row_of(job: Job, attempts: Attempts) -> dict[str, Any]:
+def make_job_row(job: Job, attempts: Attempts) -> dict[str, Any]:
     """Build the row of a job."""
     return {
         "version": VERSION,
@@ -115,19 +117,19 @@ def row_of(job: Job, attempts: Attempts) -> dict[str, Any]:
     }
 
 
-def row_path(name: str) -> str:
+def get_job_row_path(name: str) -> str:
     """Return the path of the row of a job."""
     return f"{ROWS}/{name}.json"
 
 
 def write_row(place: Place, name: str, row: Mapping[str, Any]) -> None:
     """Write the row of a job; raise OutputError if that fails."""
-    place.write(row_path(name), (json.dumps(row, indent=1) + "\n").encode())
+    place.write(get_job_row_path(name), (json.dumps(row, indent=1) + "\n").encode())
 
 
 def read_row(place: Place, name: str) -> dict[str, Any] | None:
     """Read the row of a job, or return None if there is no complete one."""
-    content = place.read(row_path(name))
+    content = place.read(get_job_row_path(name))
     try:
         row = None if content is None else json.loads(content)
     except ValueError:
@@ -135,7 +137,7 @@ def read_row(place: Place, name: str) -> dict[str, Any] | None:
     return row if isinstance(row, dict) and row.get("version") == VERSION else None
 
 
-def finished_row(place: Place, job: Job) -> dict[str, Any] | None:
+def read_finished_row(place: Place, job: Job) -> dict[str, Any] | None:
     """Read the row of a job that is done, or failed with the same options as now."""
     row = read_row(place, job.name)
     if row is None or (row["state"] == "failed" and row["options"] != dict(job.options)):
@@ -143,21 +145,22 @@ def finished_row(place: Place, job: Job) -> dict[str, Any] | None:
     return row
 
 
-def missing(jobs: Sequence[Job], place: Place, again: bool) -> list[Job]:
-    """Return jobs without a row or with a failed one to repeat (new options, or `again`).
+def find_missing_jobs(jobs: Sequence[Job], place: Place, rerun_failed: bool) -> list[Job]:
+    """Return jobs without a row or with a failed one to repeat (new options, or `rerun`).
 
     Raises:
         InputError: A job was done with other options.
     """
-    existing, left = place.names(ROWS), []
+    existing, left = place.list_names(ROWS), []
     for job in jobs:
         row = read_row(place, job.name) if f"{job.name}.json" in existing else None
-        if row is not None and row["state"] == "failed" and again:
-            place.remove(row_path(job.name))
+        if row is not None and row["state"] == "failed" and rerun_failed:
+            place.remove(get_job_row_path(job.name))
             row = None
         if row is not None and row["state"] == "done" and row["options"] != dict(job.options):
             raise InputError(
-                f"{quoted(place.name)} holds the job {quoted(job.name)} done with other options; "
+                f"{quote_value(place.name)} holds the job {quote_value(job.name)} done with other "
+                "options; "
                 "give the row another name, or name another folder."
             )
         if row is None or row["options"] != dict(job.options):
@@ -165,7 +168,7 @@ def missing(jobs: Sequence[Job], place: Place, again: bool) -> list[Job]:
     return left
 
 
-def slug(name: str) -> str:
+def make_job_name(name: str) -> str:
     """Turn a name into a valid file name."""
     return re.sub(r"[^\w.+-]+", "-", name).strip(".")[:LONGEST_NAME] or "job"
 
@@ -174,14 +177,16 @@ def claim_folder(place: Place) -> None:
     """Make `place` the folder of a batch, or raise InputError if it holds something else."""
     content = json.dumps({"version": VERSION, "kind": "batch"}).encode() + b"\n"
     # Order matters: every run writes this file before all others.
-    others = place.names("")
+    others = place.list_names("")
     if others and place.read(BATCH) is None:
-        raise InputError(f"{quoted(place.name)} holds something other than a batch; name another.")
+        raise InputError(
+            f"{quote_value(place.name)} holds something other than a batch; name another."
+        )
     if place.read(BATCH) is None:
         place.write(BATCH, content)
     if place.read(BATCH) != content:
         raise InputError(
-            f"{quoted(place.name)} holds a batch of another version; name another folder."
+            f"{quote_value(place.name)} holds a batch of another version; name another folder."
         )
 
 
@@ -193,6 +198,6 @@ def check_jobs(jobs: Sequence[Job]) -> None:
     for job in jobs:
         if job.name in seen:
             raise InputError(
-                f"Two jobs have the name {quoted(job.name)}; give each row a name of its own."
+                f"Two jobs have the name {quote_value(job.name)}; give each row a name of its own."
             )
         seen.add(job.name)

@@ -16,10 +16,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gscompleter.batch.jobs import Job, check_jobs, slug
-from gscompleter.batch.places import is_address, store_of
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.unfinished import MARK
+from gscompleter.batch.jobs import Job, check_jobs, make_job_name
+from gscompleter.batch.places import is_address, open_store
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.unfinished import UNFINISHED_PREFIX
 from gscompleter.reading import read_bytes
 
 FOLDER, NAME = "folder", "name"
@@ -37,17 +37,17 @@ def read_manifest(manifest: str, common: Mapping[str, Any]) -> list[Job]:
         InputError: The manifest cannot be read, names no job, or repeats a name.
     """
     base = os.path.dirname(os.path.abspath(manifest))
-    here = placed(common, os.getcwd())
+    here = resolve_paths(common, os.getcwd())
     rows = [
-        {**here, **(row if is_address(manifest) else placed(row, base))}
-        for row in rows_of(manifest)
+        {**here, **(row if is_address(manifest) else resolve_paths(row, base))}
+        for row in read_rows(manifest)
     ]
-    jobs = [Job(name, row) for name, row in zip(names_of(rows), map(plain, rows), strict=True)]
+    jobs = [Job(name, row) for name, row in zip(name_jobs(rows), map(drop_name, rows), strict=True)]
     check_jobs(jobs)
     return jobs
 
 
-def placed(row: Mapping[str, Any], base: str) -> dict[str, Any]:
+def resolve_paths(row: Mapping[str, Any], base: str) -> dict[str, Any]:
     """Make the paths of a row absolute; addresses and invalid values stay."""
 
     def joined(value: Any) -> Any:
@@ -63,45 +63,52 @@ def placed(row: Mapping[str, Any], base: str) -> dict[str, Any]:
     return result
 
 
-def rows_of(manifest: str) -> list[dict[str, Any]]:
+def read_rows(manifest: str) -> list[dict[str, Any]]:
     """Read the rows of a manifest as they are."""
     if not is_address(manifest) and os.path.isdir(manifest):
-        return [{FOLDER: os.path.abspath(folder)} for folder in scenes_in(Path(manifest))]
+        return [{FOLDER: os.path.abspath(folder)} for folder in list_scenes(Path(manifest))]
     if manifest.endswith(".csv"):
-        return list(csv_rows(text_of(manifest), manifest))
+        return list(parse_csv(read_manifest_text(manifest), manifest))
     if manifest.endswith((".jsonl", ".ndjson")):
-        return list(json_rows(text_of(manifest), manifest))
+        return list(parse_json_lines(read_manifest_text(manifest), manifest))
     if is_address(manifest):
-        store = store_of(manifest)
+        store = open_store(manifest)
         found = [e for e in store.ls(manifest, detail=True) if e["type"] == "directory"]
         return [{FOLDER: store.unstrip_protocol(e["name"])} for e in found]
     raise InputError(
-        f"The manifest {quoted(manifest)} is neither a .csv or .jsonl file nor a folder of scenes; "
+        f"The manifest {quote_value(manifest)} is neither a .csv or .jsonl file nor a folder of "
+        "scenes; "
         "correct the path."
     )
 
 
-def scenes_in(folder: Path) -> list[Path]:
+def list_scenes(folder: Path) -> list[Path]:
     """List the visible folders in a folder by name."""
-    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith((MARK, ".")))
+    return sorted(
+        p
+        for p in folder.iterdir()
+        if p.is_dir() and not p.name.startswith((UNFINISHED_PREFIX, "."))
+    )
 
 
-def text_of(manifest: str) -> str:
+def read_manifest_text(manifest: str) -> str:
     """Read the text of a manifest; raise InputError if that fails."""
     try:
         if is_address(manifest):
-            return bytes(store_of(manifest).cat_file(manifest)).decode("utf-8-sig")
+            return bytes(open_store(manifest).cat_file(manifest)).decode("utf-8-sig")
         return read_bytes(Path(manifest), LONGEST_FILE).decode("utf-8-sig")
     except OSError as error:
         reason = error.strerror or str(error)
-        raise InputError(f"The manifest {quoted(manifest)} cannot be read: {reason}.") from error
+        raise InputError(
+            f"The manifest {quote_value(manifest)} cannot be read: {reason}."
+        ) from error
     except UnicodeDecodeError as error:
         raise InputError(
-            f"The manifest {quoted(manifest)} is not text in UTF-8; save it as UTF-8."
+            f"The manifest {quote_value(manifest)} is not text in UTF-8; save it as UTF-8."
         ) from error
 
 
-def csv_rows(text: str, manifest: str) -> Iterator[dict[str, Any]]:
+def parse_csv(text: str, manifest: str) -> Iterator[dict[str, Any]]:
     """Parse the rows of a CSV file with a header."""
     try:
         for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
@@ -110,10 +117,12 @@ def csv_rows(text: str, manifest: str) -> Iterator[dict[str, Any]]:
                 given["too many cells"] = " ".join(row[None])
             yield given
     except csv.Error as error:
-        raise InputError(f"The manifest {quoted(manifest)} is not valid CSV: {error}.") from error
+        raise InputError(
+            f"The manifest {quote_value(manifest)} is not valid CSV: {error}."
+        ) from error
 
 
-def json_rows(text: str, manifest: str) -> Iterator[dict[str, Any]]:
+def parse_json_lines(text: str, manifest: str) -> Iterator[dict[str, Any]]:
     """Parse JSON lines."""
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip():
@@ -122,22 +131,23 @@ def json_rows(text: str, manifest: str) -> Iterator[dict[str, Any]]:
             row = json.loads(line)
         except (ValueError, RecursionError) as error:
             raise InputError(
-                f"Line {number} of the manifest {quoted(manifest)} is not JSON "
-                f"({quoted(str(error))}); correct it."
+                f"Line {number} of the manifest {quote_value(manifest)} is not JSON "
+                f"({quote_value(str(error))}); correct it."
             ) from error
         if not isinstance(row, dict):
             raise InputError(
-                f"Line {number} of the manifest {quoted(manifest)} is not a JSON object; write it "
+                f"Line {number} of the manifest {quote_value(manifest)} is not a JSON object; "
+                "write it "
                 'as {"folder": "scene", "target": [6]}.'
             )
         yield row
 
 
-def names_of(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+def name_jobs(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     """Name the jobs by their `name` or scene folder, numbered if several share a folder."""
     rows = list(rows)
-    given = [slug(str(row[NAME])) if NAME in row else None for row in rows]
-    scenes = [slug(os.path.basename(str(row.get(FOLDER, "")).rstrip("/"))) for row in rows]
+    given = [make_job_name(str(row[NAME])) if NAME in row else None for row in rows]
+    scenes = [make_job_name(os.path.basename(str(row.get(FOLDER, "")).rstrip("/"))) for row in rows]
     count, seen = (
         Counter(s for s, n in zip(scenes, given, strict=True) if n is None),
         Counter[str](),
@@ -149,6 +159,6 @@ def names_of(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     return names
 
 
-def plain(row: Mapping[str, Any]) -> dict[str, Any]:
+def drop_name(row: Mapping[str, Any]) -> dict[str, Any]:
     """Drop the name of a row."""
     return {key: value for key, value in row.items() if key != NAME}

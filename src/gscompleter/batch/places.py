@@ -20,9 +20,9 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any, Protocol, runtime_checkable
 
-from gscompleter.errors import InputError, OutputError, quoted
-from gscompleter.io.files import replacing
-from gscompleter.io.unfinished import MARK, locked
+from gscompleter.errors import InputError, OutputError, quote_value
+from gscompleter.io.files import replace_file
+from gscompleter.io.unfinished import UNFINISHED_PREFIX, acquire_lock
 
 LEASE_SECONDS = 90.0
 """Time without renewal after which a claim in a store expires; clocks must agree within it."""
@@ -51,15 +51,15 @@ class Place(Protocol):
         """Remove a file if it exists."""
         ...
 
-    def names(self, folder: str) -> set[str]:
+    def list_names(self, folder: str) -> set[str]:
         """List the names in a folder, without unfinished files; empty if it does not exist."""
         ...
 
-    def folder(self, path: str) -> AbstractContextManager[Path]:
+    def open_folder(self, path: str) -> AbstractContextManager[Path]:
         """Yield a local folder whose content is at `path` when the body ends."""
         ...
 
-    def claimed(self, path: str) -> AbstractContextManager[int | None]:
+    def hold_claim(self, path: str) -> AbstractContextManager[int | None]:
         """Hold a claim; yield the number of holders killed before, or None if it is held."""
         ...
 
@@ -68,9 +68,11 @@ class Place(Protocol):
         ...
 
 
-def place_of(out: str) -> Place:
+def open_place(out: str) -> Place:
     """Open a path or an address such as `s3://bucket/folder`."""
-    return StorePlace(out.rstrip("/"), store_of(out)) if is_address(out) else FolderPlace(Path(out))
+    return (
+        StorePlace(out.rstrip("/"), open_store(out)) if is_address(out) else FolderPlace(Path(out))
+    )
 
 
 def is_address(text: str) -> bool:
@@ -78,14 +80,16 @@ def is_address(text: str) -> bool:
     return "://" in text
 
 
-def store_of(address: str) -> Any:
+def open_store(address: str) -> Any:
     """Open the fsspec file system of an address; raise InputError if there is none."""
     import fsspec
 
     try:
         return fsspec.core.url_to_fs(address)[0]
     except (ImportError, ValueError) as error:
-        raise InputError(f"{quoted(address)} cannot be reached: {quoted(str(error))}.") from error
+        raise InputError(
+            f"{quote_value(address)} cannot be reached: {quote_value(str(error))}."
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -110,45 +114,47 @@ class FolderPlace:
         """Write a file atomically."""
         target = self.root / path
         make_folder(target.parent)
-        with replacing(target) as file:
+        with replace_file(target) as file:
             file.write(content)
 
     def remove(self, path: str) -> None:
         """Remove a file if it exists."""
         (self.root / path).unlink(missing_ok=True)
 
-    def names(self, folder: str) -> set[str]:
+    def list_names(self, folder: str) -> set[str]:
         """List the names in a folder, without unfinished files."""
         try:
-            return {n for n in os.listdir(self.root / folder) if not n.startswith(MARK)}
+            return {
+                n for n in os.listdir(self.root / folder) if not n.startswith(UNFINISHED_PREFIX)
+            }
         except FileNotFoundError:
             return set()
         except OSError as error:
             raise InputError(
-                f"{quoted(self.root / folder)} cannot be read: {error.strerror}; name another."
+                f"{quote_value(self.root / folder)} cannot be read: {error.strerror}; name another."
             ) from error
 
     @contextlib.contextmanager
-    def folder(self, path: str) -> Iterator[Path]:
+    def open_folder(self, path: str) -> Iterator[Path]:
         """Yield the folder itself; `complete` writes it atomically."""
         make_folder((self.root / path).parent)
         yield self.root / path
 
     @contextlib.contextmanager
-    def claimed(self, path: str) -> Iterator[int | None]:
+    def hold_claim(self, path: str) -> Iterator[int | None]:
         """Lock a file. Without locks in the file system every process gets the claim."""
         target = self.root / path
         make_folder(target.parent)
         try:
             descriptor = os.open(target, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
-            raise cannot_write(target, error) from error
+            raise make_write_error(target, error) from error
         try:
             # The last holder may have removed the file that has just been opened.
-            if locked(descriptor, wait=False) is False or not os.fstat(descriptor).st_nlink:
+            if acquire_lock(descriptor, wait=False) is False or not os.fstat(descriptor).st_nlink:
                 yield None
                 return
-            lost = counted(os.read(descriptor, 16))
+            lost = parse_count(os.read(descriptor, 16))
             write_count(target, descriptor, lost + 1)
             try:
                 yield lost
@@ -164,12 +170,12 @@ class FolderPlace:
         except FileNotFoundError:
             return False
         try:
-            return locked(descriptor, wait=False) is False
+            return acquire_lock(descriptor, wait=False) is False
         finally:
             os.close(descriptor)
 
 
-def counted(content: bytes) -> int:
+def parse_count(content: bytes) -> int:
     """Parse the number in a claim; 0 for a new one."""
     return int(content) if content.isdigit() else 0
 
@@ -181,7 +187,7 @@ def write_count(path: Path, descriptor: int, count: int) -> None:
     except OSError as error:
         if not os.fstat(descriptor).st_size:
             path.unlink(missing_ok=True)
-        raise cannot_write(path, error) from error
+        raise make_write_error(path, error) from error
 
 
 def make_folder(folder: Path) -> None:
@@ -189,15 +195,15 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise cannot_write(folder, error) from error
+        raise make_write_error(folder, error) from error
 
 
-def cannot_write(path: Path, error: OSError) -> OutputError:
+def make_write_error(path: Path, error: OSError) -> OutputError:
     """Return the OutputError for a write error."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     reason = "there is no space left" if full else error.strerror
     return OutputError(
-        f"Cannot write {quoted(path)}: {reason}; free some space or choose another place."
+        f"Cannot write {quote_value(path)}: {reason}; free some space or choose another place."
     )
 
 
@@ -212,49 +218,49 @@ class StorePlace:
     def read(self, path: str) -> bytes | None:
         """Read an object, or return None if it does not exist."""
         try:
-            return bytes(self.store.cat_file(self._at(path)))
+            return bytes(self.store.cat_file(self._resolve(path)))
         except FileNotFoundError:
             return None
 
     def write(self, path: str, content: bytes) -> None:
         """Write an object."""
-        with self._writing(path):
-            self.store.pipe_file(self._at(path), content)
+        with self._convert_errors(path):
+            self.store.pipe_file(self._resolve(path), content)
 
     def remove(self, path: str) -> None:
         """Remove an object if it exists."""
         with contextlib.suppress(FileNotFoundError):
-            self.store.rm_file(self._at(path))
+            self.store.rm_file(self._resolve(path))
 
-    def names(self, folder: str) -> set[str]:
+    def list_names(self, folder: str) -> set[str]:
         """List the names in a folder."""
         # Listings are cached, and other processes may have written since.
         self.store.invalidate_cache()
         try:
-            found = self.store.ls(self._at(folder), detail=False)
+            found = self.store.ls(self._resolve(folder), detail=False)
         except FileNotFoundError:
             return set()
         return {name.rstrip("/").rsplit("/", 1)[-1] for name in found}
 
     @contextlib.contextmanager
-    def folder(self, path: str) -> Iterator[Path]:
+    def open_folder(self, path: str) -> Iterator[Path]:
         """Yield a temporary folder, and upload its files when the body ends."""
         from tempfile import TemporaryDirectory
 
         with TemporaryDirectory(prefix="gscompleter-") as temporary:
             made = Path(temporary) / "result"
             yield made
-            with self._writing(path):
+            with self._convert_errors(path):
                 for file in sorted(p for p in made.rglob("*") if p.is_file()):
-                    target = self._at(f"{path}/{file.relative_to(made).as_posix()}")
+                    target = self._resolve(f"{path}/{file.relative_to(made).as_posix()}")
                     self.store.makedirs(target.rsplit("/", 1)[0], exist_ok=True)
                     self.store.put_file(str(file), target)
 
     @contextlib.contextmanager
-    def claimed(self, path: str) -> Iterator[int | None]:
+    def hold_claim(self, path: str) -> Iterator[int | None]:
         """Create an object exclusively; two processes may both take over an expired one."""
         holder = secrets.token_hex(8)
-        lost = self._taken(path, holder)
+        lost = self._take_claim(path, holder)
         if lost is None:
             yield None
             return
@@ -271,47 +277,49 @@ class StorePlace:
     def is_held(self, path: str) -> bool:
         """Return True if any process holds the claim."""
         claim = self.read(path)
-        return claim is not None and not expired(claim)
+        return claim is not None and not is_expired(claim)
 
-    def _taken(self, path: str, holder: str) -> int | None:
+    def _take_claim(self, path: str, holder: str) -> int | None:
         """Take a claim; return the number of holders killed before, or None if it is held."""
-        with self._writing(path):
+        with self._convert_errors(path):
             try:
-                self.store.pipe_file(self._at(path), lease(holder, 0), mode="create")
+                self.store.pipe_file(self._resolve(path), make_lease(holder, 0), mode="create")
                 return 0
             except FileExistsError:
                 pass
             claim = self.read(path)
-            if claim is None or not expired(claim):
+            if claim is None or not is_expired(claim):
                 return None
             lost = 1 + int(json.loads(claim)["lost"])
-            self.store.pipe_file(self._at(path), lease(holder, lost))
+            self.store.pipe_file(self._resolve(path), make_lease(holder, lost))
             taken = self.read(path)
             return lost if taken is not None and json.loads(taken)["holder"] == holder else None
 
     def _renew(self, path: str, holder: str, lost: int, over: Event) -> None:
         while not over.wait(RENEWAL_SECONDS):
             with contextlib.suppress(OSError):
-                self.store.pipe_file(self._at(path), lease(holder, lost))
+                self.store.pipe_file(self._resolve(path), make_lease(holder, lost))
 
     @contextlib.contextmanager
-    def _writing(self, path: str) -> Iterator[None]:
+    def _convert_errors(self, path: str) -> Iterator[None]:
         try:
-            self.store.makedirs(self._at(path).rsplit("/", 1)[0], exist_ok=True)
+            self.store.makedirs(self._resolve(path).rsplit("/", 1)[0], exist_ok=True)
             yield
         except OSError as error:
-            raise OutputError(f"Cannot write {quoted(self._at(path))}: {error}.") from error
+            raise OutputError(
+                f"Cannot write {quote_value(self._resolve(path))}: {error}."
+            ) from error
 
-    def _at(self, path: str) -> str:
+    def _resolve(self, path: str) -> str:
         return f"{self.name}/{path}".rstrip("/")
 
 
-def lease(holder: str, lost: int) -> bytes:
+def make_lease(holder: str, lost: int) -> bytes:
     """Return the content of a claim in a store, renewed now."""
     return json.dumps({"holder": holder, "lost": lost, "renewed": time.time()}).encode()
 
 
-def expired(claim: bytes) -> bool:
+def is_expired(claim: bytes) -> bool:
     """Return True if a claim in a store has expired."""
     try:
         return time.time() - float(json.loads(claim)["renewed"]) > LEASE_SECONDS

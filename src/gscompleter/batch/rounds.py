@@ -15,8 +15,8 @@ from gscompleter.batch.jobs import (
     Job,
     Outcome,
     Perform,
-    finished_row,
-    row_of,
+    make_job_row,
+    read_finished_row,
     write_row,
 )
 from gscompleter.batch.places import Place
@@ -29,7 +29,7 @@ POLL_SECONDS = 1.0
 class Rows(Protocol):
     """The rows of jobs, wherever they are stored."""
 
-    def ended(self, job: Job) -> Outcome | None:
+    def find_outcome(self, job: Job) -> Outcome | None:
         """Return the outcome of a job, or None if it has no row."""
         ...
 
@@ -44,18 +44,18 @@ class BatchRows:
 
     place: Place
 
-    def ended(self, job: Job) -> Outcome | None:
+    def find_outcome(self, job: Job) -> Outcome | None:
         """Return the outcome of a job, or None if it has no row."""
-        row = finished_row(self.place, job)
+        row = read_finished_row(self.place, job)
         return None if row is None else Outcome(job, row["state"], row["reason"])
 
     def give_up(self, job: Job, reason: str) -> Outcome:
         """Write a row for a job that cannot be completed."""
-        write_row(self.place, job.name, row_of(job, Attempts(None, 0, reason)))
+        write_row(self.place, job.name, make_job_row(job, Attempts(None, 0, reason)))
         return Outcome(job, "failed", reason)
 
 
-def in_this_process(perform: Perform, jobs: Iterable[Job]) -> Iterator[Outcome]:
+def run_in_this_process(perform: Perform, jobs: Iterable[Job]) -> Iterator[Outcome]:
     """Run jobs one after the other in this process: the simplest engine."""
     return map(perform, jobs)
 
@@ -73,22 +73,22 @@ class Rounds:
     elsewhere: list[Job] = field(default_factory=list)
     lost: Counter[str] = field(default_factory=Counter)
 
-    def outcomes(self, engine: Engine, perform: Perform) -> Iterator[Outcome]:
+    def run(self, engine: Engine, perform: Perform) -> Iterator[Outcome]:
         """Run all jobs and yield their outcomes in the order in which they end."""
         self.waiting.extend(self.jobs)
         while self.waiting or self.elsewhere:
-            for outcome in engine(perform, self.offered()):
-                yield from self.heard(outcome)
-            yield from self.done_by_others()
+            for outcome in engine(perform, self.take_waiting()):
+                yield from self.handle_outcome(outcome)
+            yield from self.collect_from_others()
             if self.elsewhere and not self.waiting:
                 time.sleep(POLL_SECONDS)
 
-    def offered(self) -> Iterator[Job]:
+    def take_waiting(self) -> Iterator[Job]:
         """Yield waiting jobs on demand, including those that are lost in the meantime."""
         while self.waiting:
             yield self.waiting.popleft()
 
-    def heard(self, outcome: Outcome) -> Iterator[Outcome]:
+    def handle_outcome(self, outcome: Outcome) -> Iterator[Outcome]:
         """Record an outcome, and yield it if it is final."""
         job = outcome.job
         if outcome.state == "elsewhere":
@@ -97,23 +97,23 @@ class Rounds:
             self.lost[job.name] += 1
             self.waiting.append(job)
         elif outcome.state == "lost":
-            yield self.given_up(job)
+            yield self.give_up_lost(job)
         else:
             yield outcome
 
-    def given_up(self, job: Job) -> Outcome:
+    def give_up_lost(self, job: Job) -> Outcome:
         """Return the outcome of a job that has been lost too often."""
-        ended = self.rows.ended(job)
+        ended = self.rows.find_outcome(job)
         lost = self.lost[job.name] + 1
         reason = f"its worker was lost {lost} times, perhaps because memory ran out"
         return self.rows.give_up(job, reason) if ended is None else ended
 
-    def done_by_others(self) -> Iterator[Outcome]:
+    def collect_from_others(self) -> Iterator[Outcome]:
         """Yield outcomes of other processes; jobs that they released wait again."""
         held = []
         for job in self.elsewhere:
             is_held = self.place.is_held(f"{CLAIMS}/{job.name}")
-            ended = self.rows.ended(job)
+            ended = self.rows.find_outcome(job)
             if ended is not None:
                 yield ended
             elif is_held:

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 from gscompleter.benchmark.manifest import BenchCase
 from gscompleter.benchmark.samples import Sample
-from gscompleter.benchmark.unfrozen import Unfrozen
+from gscompleter.benchmark.unfrozen import UnfrozenRenderer
 from gscompleter.benchmark.yardstick import Yardstick
 from gscompleter.data.formats import open_photographs
-from gscompleter.errors import InputError, quoted
-from gscompleter.runs.memory import peak_memory
+from gscompleter.errors import InputError, quote_value
+from gscompleter.runs.memory import measure_peak_memory
 from gscompleter.runs.methods import BASELINES, METHODS, Method, Models, Prediction
 from gscompleter.types import Camera, Completion
 
@@ -21,14 +21,16 @@ OWN = "own"
 """Name of the sum of their seconds."""
 
 
-def with_plain_autograd(state: Completion, target: Camera, models: Models) -> Prediction:
+def complete_with_autograd(state: Completion, target: Camera, models: Models) -> Prediction:
     """Complete as `full` does, with the same objectives and iterations but no frozen context."""
-    return METHODS["full"](state, target, replace(models, renderer=Unfrozen(models.renderer)))
+    return METHODS["full"](
+        state, target, replace(models, renderer=UnfrozenRenderer(models.renderer))
+    )
 
 
-COMPARED: dict[str, Method] = {
+BENCH_METHODS: dict[str, Method] = {
     "full": METHODS["full"],
-    "autograd": with_plain_autograd,
+    "autograd": complete_with_autograd,
     **BASELINES,
 }
 """Methods by name; the first one is ours, and times of others are multiples of its time."""
@@ -43,40 +45,40 @@ class Start:
     models: Models
 
 
-def check_compared(names: Sequence[str]) -> None:
+def check_bench_methods(names: Sequence[str]) -> None:
     """Raise InputError for an unknown method."""
     for name in names:
-        if name not in COMPARED:
+        if name not in BENCH_METHODS:
             raise InputError(
-                f"There is no method '{quoted(name)}' to compare; choose one of "
-                f"{', '.join(COMPARED)}.",
+                f"There is no method '{quote_value(name)}' to compare; choose one of "
+                f"{', '.join(BENCH_METHODS)}.",
                 "methods",
             )
 
 
-def start_of(case: BenchCase, models: Models, device: str) -> Start:
+def prepare_start(case: BenchCase, models: Models, device: str) -> Start:
     """Reconstruct the scene of a case once for all methods, with its first target."""
     photographs = open_photographs(case.scene, near=case.near, far=case.far)
     views = [view.to(device) for view in photographs.views(case.context, case.resolution)]
     target = photographs.camera(case.targets[0], case.resolution).to(device)
-    return Start(models.completer().begin(views), target, models)
+    return Start(models.make_completer().begin(views), target, models)
 
 
-def compared(name: str, start: Start, yardstick: Yardstick) -> Sample:
+def measure_method(name: str, start: Start, yardstick: Yardstick) -> Sample:
     """Measure one run of a method, next to the yardstick."""
 
     def measure() -> Prediction:
-        with peak_memory(start.state.views[0].image.device) as peak:
-            prediction = COMPARED[name](start.state, start.target, start.models)
+        with measure_peak_memory(start.state.views[0].image.device) as peak:
+            prediction = BENCH_METHODS[name](start.state, start.target, start.models)
         return replace(prediction, peak_bytes=peak.bytes)
 
-    found, unit = yardstick.beside(measure)
+    found, unit = yardstick.measure_beside(measure)
     added = len(found.scene) - len(start.state.scene)
     counts = {"context": len(start.state.scene), "added": added}
-    return Sample(with_own(found.seconds), unit, found.peak_bytes, counts)
+    return Sample(add_own_seconds(found.seconds), unit, found.peak_bytes, counts)
 
 
-def with_own(seconds: Mapping[str, float]) -> dict[str, float]:
+def add_own_seconds(seconds: Mapping[str, float]) -> dict[str, float]:
     """Add the sum of the stages in which methods differ."""
     own = sum(spent for stage, spent in seconds.items() if stage in OWN_STAGES)
     return {**seconds, OWN: own}

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gscompleter.benchmark.crowding import crowded
+from gscompleter.benchmark.crowding import multiply_gaussians
 from gscompleter.benchmark.manifest import BenchCase
-from gscompleter.benchmark.processes import run_alone
+from gscompleter.benchmark.processes import run_command
 from gscompleter.benchmark.samples import Sample
 from gscompleter.benchmark.yardstick import Yardstick
 from gscompleter.data.formats import open_photographs
-from gscompleter.io.files import SUMMARY
+from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.io.ply import save_ply
 from gscompleter.runs.methods import Models
 
@@ -21,16 +21,16 @@ PROCESS, REST = "process", "rest"
 """Seconds of the whole process, and those outside the stages: start, imports, files, scores."""
 
 
-def completed(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
+def measure_command(arguments: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
     """Measure one run of a command that writes to `out`, next to the yardstick."""
-    ended, unit = yardstick.beside(lambda: run_alone(words))
-    summary = json.loads((out / SUMMARY).read_text())
+    ended, unit = yardstick.measure_beside(lambda: run_command(arguments))
+    summary = json.loads((out / SUMMARY_FILE).read_text())
     stages = summary["seconds"]
     seconds = {**stages, REST: ended.seconds - stages["total"], PROCESS: ended.seconds}
     return Sample(seconds, unit, ended.peak_bytes, summary["gaussians"])
 
 
-def brought(case: BenchCase, folder: Path, models: Models, device: str) -> Path | None:
+def write_input_splat(case: BenchCase, folder: Path, models: Models, device: str) -> Path | None:
     """Write the input splat of a case to `folder` once; None if the context is reconstructed."""
     if case.gaussians is None:
         return None
@@ -39,6 +39,6 @@ def brought(case: BenchCase, folder: Path, models: Models, device: str) -> Path 
     if not path.exists():
         photographs = open_photographs(case.scene, near=case.near, far=case.far)
         views = [view.to(device) for view in photographs.views(case.context, case.resolution)]
-        context = models.completer().begin(views).context
-        save_ply(path, crowded(context, case.gaussians, models.seed))
+        context = models.make_completer().begin(views).context
+        save_ply(path, multiply_gaussians(context, case.gaussians, models.seed))
     return path

@@ -13,7 +13,7 @@ JITTER = 0.1
 """Offset of a copy, in standard deviations of its Gaussian."""
 
 
-def crowded(scene: Gaussians, count: int, seed: int = 0) -> Gaussians:
+def multiply_gaussians(scene: Gaussians, count: int, seed: int = 0) -> Gaussians:
     """Repeat Gaussians until there are `count`, with offsets and reduced opacities.
 
     All copies of a Gaussian together have its opacity. If `count` is smaller than the scene, a

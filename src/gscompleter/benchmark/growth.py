@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gscompleter.benchmark.samples import Measured
+from gscompleter.benchmark.samples import SampleSet
 
 
 @dataclass(frozen=True)
@@ -16,25 +16,28 @@ class Growth:
 
     axis: str
     sizes: tuple[int, ...]
-    points: tuple[Measured, ...]
+    points: tuple[SampleSet, ...]
     """One for each size."""
 
     @property
-    def slopes(self) -> dict[str, float | None]:
+    def exponents(self) -> dict[str, float | None]:
         """Exponent p of seconds ~ size^p by stage."""
-        return {stage: slope(self.sizes, self.medians(stage)) for stage in self.points[0].stages}
+        return {
+            stage: fit_exponent(self.sizes, self.get_medians(stage))
+            for stage in self.points[0].stages
+        }
 
     @property
-    def memory_slope(self) -> float | None:
+    def memory_exponent(self) -> float | None:
         """Exponent of the peak memory."""
-        return slope(self.sizes, [float(point.peak_bytes or 0) for point in self.points])
+        return fit_exponent(self.sizes, [float(point.peak_bytes or 0) for point in self.points])
 
-    def medians(self, stage: str) -> list[float]:
+    def get_medians(self, stage: str) -> list[float]:
         """Return the median seconds of a stage at each size."""
         return [point.seconds[stage].median for point in self.points]
 
 
-def slope(sizes: Sequence[int], values: Sequence[float]) -> float | None:
+def fit_exponent(sizes: Sequence[int], values: Sequence[float]) -> float | None:
     """Fit the exponent of a power law by least squares; None for fewer than two sizes."""
     known = [(size, value) for size, value in zip(sizes, values, strict=True) if value > 0]
     if len({size for size, _ in known}) < 2:

@@ -10,16 +10,16 @@ from pathlib import Path
 import torch
 
 from gscompleter import __version__
-from gscompleter.memory import memory_bytes
+from gscompleter.memory import read_memory_bytes
 
 
-def machine(device: str) -> dict[str, str | int]:
+def describe_machine(device: str) -> dict[str, str | int]:
     """Describe the versions and the hardware."""
-    memory = memory_bytes()
+    memory = read_memory_bytes()
     found: dict[str, str | int] = {
         "gscompleter": __version__,
-        "processor": processor(),
-        "cores": usable_cores(),
+        "processor": get_processor_name(),
+        "cores": count_usable_cores(),
         "memory_gb": 0 if memory is None else round(memory / 1e9),
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
@@ -29,14 +29,14 @@ def machine(device: str) -> dict[str, str | int]:
     return {**found, "gpu": torch.cuda.get_device_name()} if device == "cuda" else found
 
 
-def usable_cores() -> int:
+def count_usable_cores() -> int:
     """Count the cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def processor() -> str:
+def get_processor_name() -> str:
     """Return the model of the processor, or its architecture if Linux does not report it."""
     try:
         model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.M)

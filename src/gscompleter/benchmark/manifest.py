@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.data.formats import open_photographs
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
 
 
@@ -60,7 +60,7 @@ class Manifest:
     """Cases by axis, which differ only in its field."""
 
 
-def size_over(axis: str, case: BenchCase) -> int:
+def get_size(axis: str, case: BenchCase) -> int:
     """Return the size of a case along an axis."""
     if axis == "pixels":
         return case.pixels
@@ -68,45 +68,46 @@ def size_over(axis: str, case: BenchCase) -> int:
     return value if isinstance(value, int) else len(value)
 
 
-def grown_from(case: BenchCase) -> dict[str, tuple[BenchCase, ...]]:
+def make_series(case: BenchCase) -> dict[str, tuple[BenchCase, ...]]:
     """Make the default series of a case, with its first target, from doubled sizes."""
     height, width = case.resolution
     sides = [(round(s * height), round(s * width)) for s in SIDES]
     values: dict[str, Sequence[Any]] = {
         "gaussians": GAUSSIANS,
         "pixels": sides,
-        "views": prefixes(case.context, 2),
-        "targets": prefixes(case.targets, 1),
+        "views": make_prefixes(case.context, 2),
+        "targets": make_prefixes(case.targets, 1),
     }
     base = replace(case, targets=case.targets[:1])
-    return {axis: series(base, axis, found) for axis, found in values.items() if len(found) > 1}
+    return {axis: vary_case(base, axis, found) for axis, found in values.items() if len(found) > 1}
 
 
-def prefixes(frames: tuple[int, ...], fewest: int) -> list[tuple[int, ...]]:
+def make_prefixes(frames: tuple[int, ...], fewest: int) -> list[tuple[int, ...]]:
     """Return the first `fewest` frames, the first twice as many, and so on."""
     counts = [fewest * 2**n for n in range(len(frames).bit_length())]
     return [frames[:count] for count in counts if count <= len(frames)]
 
 
-def series(case: BenchCase, axis: str, values: Sequence[Any]) -> tuple[BenchCase, ...]:
+def vary_case(case: BenchCase, axis: str, values: Sequence[Any]) -> tuple[BenchCase, ...]:
     """Vary a case along an axis, and name the results by their sizes."""
     cases = [replace(case, **{AXES[axis]: value}) for value in values]
-    return tuple(replace(c, name=f"{case.name}, {size_over(axis, c):,} {axis}") for c in cases)
+    return tuple(replace(c, name=f"{case.name}, {get_size(axis, c):,} {axis}") for c in cases)
 
 
 def read_manifest(path: Path) -> Manifest:
     """Read a manifest from a JSON file; paths are relative to its folder."""
     content = read_json(path, "name a file of cases to measure")
     try:
-        cases = tuple(_case(row, path.parent) for row in content["cases"])
+        cases = tuple(_parse_case(row, path.parent) for row in content["cases"])
         by_name = {case.name: case for case in cases}
         if not cases or len(by_name) < len(cases):
             raise ValueError("there is no case, or two have the same name")
-        return Manifest(cases, _growth(content.get("growth"), by_name))
+        return Manifest(cases, _parse_growth(content.get("growth"), by_name))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(
-            f"{quoted(path)} names no cases to measure ({type(error).__name__}: "
-            f"{quoted(str(error))}); it needs cases, each with name, scene, context, targets and "
+            f"{quote_value(path)} names no cases to measure ({type(error).__name__}: "
+            f"{quote_value(str(error))}); it needs cases, each with name, scene, context, targets "
+            "and "
             "resolution.",
             "cases",
         ) from error
@@ -120,43 +121,48 @@ def check_frames(cases: Sequence[BenchCase]) -> None:
             photographs.camera(frame, case.resolution)
 
 
-def _growth(content: Any, cases: Mapping[str, BenchCase]) -> dict[str, tuple[BenchCase, ...]]:
+def _parse_growth(content: Any, cases: Mapping[str, BenchCase]) -> dict[str, tuple[BenchCase, ...]]:
     if content is None:
         return {}
     base = cases[content["case"]]
-    read = {"gaussians": _whole, "pixels": _size, "views": _frames, "targets": _frames}
+    read = {
+        "gaussians": _parse_int,
+        "pixels": _parse_size,
+        "views": _parse_frames,
+        "targets": _parse_frames,
+    }
     return {
-        axis: series(base, axis, [of(value) for value in content[axis]])
+        axis: vary_case(base, axis, [of(value) for value in content[axis]])
         for axis, of in read.items()
         if axis in content
     }
 
 
-def _case(row: Any, folder: Path) -> BenchCase:
+def _parse_case(row: Any, folder: Path) -> BenchCase:
     return BenchCase(
         str(row["name"]),
         folder / row["scene"],
-        _frames(row["context"]),
-        _frames(row["targets"]),
-        _size(row["resolution"]),
+        _parse_frames(row["context"]),
+        _parse_frames(row["targets"]),
+        _parse_size(row["resolution"]),
         None if row.get("near") is None else float(row["near"]),
         None if row.get("far") is None else float(row["far"]),
-        None if row.get("gaussians") is None else _whole(row["gaussians"]),
+        None if row.get("gaussians") is None else _parse_int(row["gaussians"]),
     )
 
 
-def _frames(value: Any) -> tuple[int, ...]:
+def _parse_frames(value: Any) -> tuple[int, ...]:
     if not value:
         raise ValueError("no frames")
-    return tuple(map(_whole, value))
+    return tuple(map(_parse_int, value))
 
 
-def _size(value: Any) -> tuple[int, int]:
-    height, width = map(_whole, value)
+def _parse_size(value: Any) -> tuple[int, int]:
+    height, width = map(_parse_int, value)
     return height, width
 
 
-def _whole(value: Any) -> int:
+def _parse_int(value: Any) -> int:
     if type(value) is not int or value < 0:
-        raise TypeError(f"{quoted(value)} is no whole number")
+        raise TypeError(f"{quote_value(value)} is no whole number")
     return value

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from gscompleter.benchmark.completions import PROCESS, REST
 from gscompleter.benchmark.growth import Growth
 from gscompleter.completer import STAGES
-from gscompleter.reports.plots import new_figure, style_of, write_figure
+from gscompleter.reports.plots import create_plot_figure, get_curve_style, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,24 +19,28 @@ CURVES = (*STAGES, REST, PROCESS)
 
 def plot_growth(path: Path, growth: Sequence[Growth]) -> Path:
     """Write a PNG with one panel per series; raise PlotsNotAvailable without matplotlib."""
-    figure = new_figure(3.2 * len(growth))
+    figure = create_plot_figure(3.2 * len(growth))
     panels = figure.subplots(len(growth), squeeze=False)[:, 0]
     for axes, series in zip(panels, growth, strict=True):
-        draw(axes, series)
+        plot_series(axes, series)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
     return write_figure(figure, path)
 
 
-def draw(axes: Axes, series: Growth) -> None:
+def plot_series(axes: Axes, series: Growth) -> None:
     """Plot the median seconds of each stage against size."""
     for number, stage in enumerate(CURVES):
         if stage in series.points[0].stages:
             axes.plot(
-                series.sizes, series.medians(stage), label=stage, linewidth=1, **style_of(number)
+                series.sizes,
+                series.get_medians(stage),
+                label=stage,
+                linewidth=1,
+                **get_curve_style(number),
             )
     axes.set_xscale("log")
     axes.set_yscale("log")
-    found = series.slopes[PROCESS]
+    found = series.exponents[PROCESS]
     axes.set_xlabel(series.axis if found is None else f"{series.axis} (process: {found:.2f})")
     axes.set_ylabel("seconds")
     axes.grid(alpha=0.3)

@@ -27,7 +27,7 @@ finally:
 
 
 @dataclass(frozen=True)
-class Ended:
+class ProcessResult:
     """Result of a process that succeeded."""
 
     seconds: float
@@ -36,13 +36,13 @@ class Ended:
     """Peak resident memory, or None if the system does not report it."""
 
 
-def run_alone(words: Sequence[str]) -> Ended:
+def run_command(arguments: Sequence[str]) -> ProcessResult:
     """Run `gscompleter` with these arguments; raise InputError if it rejects its input."""
     with TemporaryDirectory() as folder:
         peak = Path(folder) / "peak"
         start = time.perf_counter()
         done = subprocess.run(
-            [sys.executable, "-c", ENTRY, str(peak), *words],
+            [sys.executable, "-c", ENTRY, str(peak), *arguments],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
@@ -51,6 +51,6 @@ def run_alone(words: Sequence[str]) -> Ended:
         if done.returncode == 2:
             raise InputError(done.stderr.strip().removeprefix("gscompleter: "))
         if done.returncode != 0:
-            raise RuntimeError(f"gscompleter {' '.join(words)} failed:\n{done.stderr}")
+            raise RuntimeError(f"gscompleter {' '.join(arguments)} failed:\n{done.stderr}")
         peak_bytes = peak.read_text()
-    return Ended(seconds, int(peak_bytes) if peak_bytes else None)
+    return ProcessResult(seconds, int(peak_bytes) if peak_bytes else None)

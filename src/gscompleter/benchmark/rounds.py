@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from gscompleter.benchmark.samples import Measured, Sample
-from gscompleter.progress import shown_on, track
+from gscompleter.benchmark.samples import Sample, SampleSet
+from gscompleter.progress import show_progress, track
 
 
 @dataclass(frozen=True)
-class Task:
+class BenchTask:
     """A measurement that is repeated."""
 
     name: str
@@ -20,7 +20,9 @@ class Task:
     repeats: int
 
 
-def in_rounds(tasks: Sequence[Task], tell: Callable[[str], None]) -> dict[str, Measured]:
+def measure_in_rounds(
+    tasks: Sequence[BenchTask], report_line: Callable[[str], None]
+) -> dict[str, SampleSet]:
     """Run each task once per round until it has its repeats; `tell` receives progress lines."""
     samples: dict[str, list[Sample]] = {task.name: [] for task in tasks}
     turns = [
@@ -30,9 +32,9 @@ def in_rounds(tasks: Sequence[Task], tell: Callable[[str], None]) -> dict[str, M
         if number < task.repeats
     ]
     for number, task in enumerate(track(turns, "measuring"), start=1):
-        with shown_on(None):  # no progress lines inside a measurement
+        with show_progress(None):  # no progress lines inside a measurement
             sample = task.measure()
         samples[task.name].append(sample)
         seconds, ratio = sample.seconds[task.stage], sample.ratios[task.stage]
-        tell(f"{number}/{len(turns)} {task.name}: {seconds:.2f} s, {ratio:.1f} yardsticks")
-    return {name: Measured(name, tuple(found)) for name, found in samples.items() if found}
+        report_line(f"{number}/{len(turns)} {task.name}: {seconds:.2f} s, {ratio:.1f} yardsticks")
+    return {name: SampleSet(name, tuple(found)) for name, found in samples.items() if found}

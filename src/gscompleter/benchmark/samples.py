@@ -16,7 +16,7 @@ class Spread:
     high: float
 
     @staticmethod
-    def of(values: Sequence[float]) -> Spread:
+    def from_values(values: Sequence[float]) -> Spread:
         """Compute the statistics of values."""
         return Spread(statistics.median(values), min(values), max(values))
 
@@ -41,7 +41,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Measured:
+class SampleSet:
     """All samples of one case or method."""
 
     name: str
@@ -50,12 +50,12 @@ class Measured:
     @property
     def seconds(self) -> dict[str, Spread]:
         """Wall time by stage."""
-        return {s: Spread.of([x.seconds[s] for x in self.samples]) for s in self.stages}
+        return {s: Spread.from_values([x.seconds[s] for x in self.samples]) for s in self.stages}
 
     @property
     def ratios(self) -> dict[str, Spread]:
         """Wall time by stage, in yardsticks."""
-        return {s: Spread.of([x.ratios[s] for x in self.samples]) for s in self.stages}
+        return {s: Spread.from_values([x.ratios[s] for x in self.samples]) for s in self.stages}
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gscompleter.render import Renderer
-from gscompleter.render.reference import ReferenceView
+from gscompleter.render.reference import ReferenceFrozenScene
 from gscompleter.types import Camera, Gaussians, Render
 
 
 @dataclass(frozen=True)
-class Unfrozen:
+class UnfrozenRenderer:
     """A renderer that renders and differentiates the whole scene in every iteration."""
 
     renderer: Renderer
@@ -19,6 +19,6 @@ class Unfrozen:
         """Render as the wrapped renderer does."""
         return self.renderer.render(gaussians, camera)
 
-    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceView:
+    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceFrozenScene:
         """Return a scene that is rendered anew with every call."""
-        return ReferenceView(self.renderer, context, camera)
+        return ReferenceFrozenScene(self.renderer, context, camera)

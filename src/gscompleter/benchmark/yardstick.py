@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gscompleter.render import Renderer
-from gscompleter.types import Camera, Gaussians, merge, observed, sh_from_rgb
+from gscompleter.types import Camera, Gaussians, make_observed, merge, sh_from_rgb
 
 SIDE = 256
 """Side of the image in pixels."""
@@ -21,7 +21,7 @@ SHIFTS = (-0.2, 0.2, 0.4)
 RUNS = 5
 """Number of runs of which the median is taken."""
 
-VARIED = ("means", "quats", "scales", "opacities", "sh")
+GRADIENT_FIELDS = ("means", "quats", "scales", "opacities", "sh")
 """Fields that have gradients."""
 
 T = TypeVar("T")
@@ -36,32 +36,32 @@ class Yardstick:
     camera: Camera
 
     @staticmethod
-    def on(renderer: Renderer, device: str) -> Yardstick:
+    def create(renderer: Renderer, device: str) -> Yardstick:
         """Create the yardstick on a device, and run it once to compile everything."""
-        scene = merge([surface(camera_at(shift)) for shift in SHIFTS])
-        found = Yardstick(renderer, scene.to(device), camera_at(SHIFTS[-1]).to(device))
-        found.draw()
+        scene = merge([make_surface(make_yardstick_camera(shift)) for shift in SHIFTS])
+        found = Yardstick(renderer, scene.to(device), make_yardstick_camera(SHIFTS[-1]).to(device))
+        found.render()
         return found
 
-    def draw(self) -> tuple[Tensor, ...]:
+    def render(self) -> tuple[Tensor, ...]:
         """Render one image and compute the gradients of its sum."""
-        varied = {name: getattr(self.gaussians, name).clone() for name in VARIED}
+        varied = {name: getattr(self.gaussians, name).clone() for name in GRADIENT_FIELDS}
         variables = [tensor.requires_grad_() for tensor in varied.values()]
         image = self.renderer.render(replace(self.gaussians, **varied), self.camera).image
         return torch.autograd.grad(image.sum(), variables)
 
-    def seconds(self) -> float:
+    def measure_seconds(self) -> float:
         """Measure the median seconds of `RUNS` runs."""
-        return statistics.median(timed(self.draw) for _ in range(RUNS))
+        return statistics.median(measure_call(self.render) for _ in range(RUNS))
 
-    def beside(self, measure: Callable[[], T]) -> tuple[T, float]:
+    def measure_beside(self, measure: Callable[[], T]) -> tuple[T, float]:
         """Run `measure`, and return the mean yardstick of just before and just after."""
-        before = self.seconds()
+        before = self.measure_seconds()
         found = measure()
-        return found, (before + self.seconds()) / 2
+        return found, (before + self.measure_seconds()) / 2
 
 
-def timed(work: Callable[[], object]) -> float:
+def measure_call(work: Callable[[], object]) -> float:
     """Measure the seconds of a call, including its work on a GPU."""
     start = time.perf_counter()
     work()
@@ -70,7 +70,7 @@ def timed(work: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def camera_at(shift: float) -> Camera:
+def make_yardstick_camera(shift: float) -> Camera:
     """Make a camera along z, `shift` metres to the right."""
     K = torch.tensor([[1.2 * SIDE, 0, SIDE / 2], [0, 1.2 * SIDE, SIDE / 2], [0, 0, 1]])
     c2w = torch.eye(4)
@@ -78,13 +78,13 @@ def camera_at(shift: float) -> Camera:
     return Camera(c2w, K, SIDE, SIDE, near=1.0, far=8.0)
 
 
-def surface(camera: Camera) -> Gaussians:
+def make_surface(camera: Camera) -> Gaussians:
     """Make one Gaussian per pixel of a camera, on a wavy surface 3 m away."""
     x = torch.linspace(0, 12, SIDE)
     depth = 3 + 0.5 * torch.sin(x)[None] * torch.cos(x)[:, None]
     n = SIDE * SIDE
     colours = torch.rand(n, 3, generator=torch.Generator().manual_seed(0))
-    return observed(
+    return make_observed(
         (camera.center + depth[..., None] * camera.z_rays()).reshape(-1, 3),
         torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
         (0.5 * depth / camera.K[0, 0]).reshape(-1, 1).repeat(1, 3),

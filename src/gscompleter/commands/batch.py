@@ -56,7 +56,7 @@ class Counts:
     skipped_failed: int = 0
     """Skipped jobs whose row records a failure."""
 
-    def sentence(self) -> str:
+    def summarize(self) -> str:
         """Summarize the counts, and name the option that retries earlier failures."""
         before = f"done earlier {self.skipped}"
         if self.skipped_failed:
@@ -69,36 +69,36 @@ def run_batch(options: BatchOptions) -> None:
     # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
-    from gscompleter.batch.jobs import claim_folder, missing
+    from gscompleter.batch.jobs import claim_folder, find_missing_jobs
     from gscompleter.batch.manifest import read_manifest
-    from gscompleter.batch.places import place_of
+    from gscompleter.batch.places import open_place
     from gscompleter.batch.rounds import BatchRows, Rounds
     from gscompleter.batch.shards import parse_shard
-    from gscompleter.commands.engines import engine_for, pairs
-    from gscompleter.progress import preparing, shown_on
+    from gscompleter.commands.engines import make_engine, parse_pairs
+    from gscompleter.progress import show_preparation, show_progress
 
     number, count = parse_shard(options.shard, os.environ)
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
-    with shown_on(None if options.quiet else console):
-        with preparing("reading the manifest"):
-            jobs = read_manifest(options.manifest, pairs(options.each, "each"))
-            place = place_of(absolute(options.out))
-            engine = engine_for(options, place.name)
+    with show_progress(None if options.quiet else console):
+        with show_preparation("reading the manifest"):
+            jobs = read_manifest(options.manifest, parse_pairs(options.each, "each"))
+            place = open_place(make_absolute(options.out))
+            engine = make_engine(options, place.name)
             claim_folder(place)
             share = jobs[number::count]
-            left = missing(share, place, options.rerun == "failures")
+            left = find_missing_jobs(share, place, options.rerun == "failures")
             names = {job.name for job in left}
             failed_before = count_failed(place, [job for job in share if job.name not in names])
         rounds = Rounds(place, BatchRows(place), left, options.retries)
-        perform = CompletingJob(absolute(options.out), options.retries)
+        perform = JobCompleter(make_absolute(options.out), options.retries)
         failed = sum(
             outcome.state == "failed"
-            for outcome in followed(rounds.outcomes(engine, perform), len(left))
+            for outcome in show_outcomes(rounds.run(engine, perform), len(left))
         )
-        with preparing("table"):
-            show(place, jobs)
+        with show_preparation("table"):
+            write_batch_results(place, jobs)
     counts = Counts(len(left) - failed, failed, len(share) - len(left), failed_before)
-    sentence = f"{counts.sentence()} All results: {options.out}/index.html"
+    sentence = f"{counts.summarize()} All results: {options.out}/index.html"
     console.print(sentence, markup=False, soft_wrap=True)
 
 
@@ -110,79 +110,82 @@ def count_failed(place: Place, jobs: Iterable[Job]) -> int:
     return sum(row is not None and row["state"] == "failed" for row in rows)
 
 
-def absolute(out: str) -> str:
+def make_absolute(out: str) -> str:
     """Make a path absolute for workers elsewhere; addresses stay as they are."""
     return out if "://" in out else os.path.abspath(out)
 
 
-def followed(outcomes: Iterable[Outcome], total: int) -> Iterator[Outcome]:
+def show_outcomes(outcomes: Iterable[Outcome], total: int) -> Iterator[Outcome]:
     """Show the progress and the rate while iterating over outcomes."""
-    from gscompleter.progress import Activity, going_on
+    from gscompleter.progress import Activity, show_activity
 
     if not total:
         return
     activity = Activity("completing", total)
-    with going_on(activity):
+    with show_activity(activity):
         for outcome in outcomes:
             yield outcome
-            activity.stepped()
-            minutes = (activity.last - activity.begun) / 60
-            activity.name = f"completing ({activity.done / minutes:.1f} a minute)"
+            activity.count_step()
+            minutes = (activity.last_step_time - activity.start_time) / 60
+            activity.name = f"completing ({activity.num_done / minutes:.1f} a minute)"
 
 
-def show(place: Place, jobs: Sequence[Job]) -> None:
+def write_batch_results(place: Place, jobs: Sequence[Job]) -> None:
     """Write the table and the page, repeatedly while other shards add rows."""
     from gscompleter.batch.jobs import ROWS
     from gscompleter.reports.batch_page import write_overview
 
     seen = None
-    while seen != (there := place.names(ROWS)):
+    while seen != (there := place.list_names(ROWS)):
         seen = there
         write_overview(place, [job for job in jobs if f"{job.name}.json" in there])
 
 
 @dataclass(frozen=True)
-class CompletingJob:
+class JobCompleter:
     """A callable that completes the scene of a job, in any process."""
 
     out: str
     retries: int
 
     def __call__(self, job: Job) -> Outcome:
-        from gscompleter.batch.jobs import settle
-        from gscompleter.batch.places import place_of
+        from gscompleter.batch.jobs import run_claimed
+        from gscompleter.batch.places import open_place
 
-        place = place_of(self.out)
-        return settle(job, place, lambda: completed(job, place), self.retries)
+        place = open_place(self.out)
+        return run_claimed(job, place, lambda: complete_job(job, place), self.retries)
 
 
-def completed(job: Job, place: Place) -> dict[str, Any]:
+def complete_job(job: Job, place: Place) -> dict[str, Any]:
     """Complete the scene of a job and return its row."""
     import warnings
 
-    from gscompleter.batch.costs import metered
+    from gscompleter.batch.costs import measure_costs
     from gscompleter.batch.jobs import JOBS, THUMBNAILS
     from gscompleter.commands.complete import complete_folder
-    from gscompleter.commands.fetching import fetched
-    from gscompleter.commands.row_options import options_of
-    from gscompleter.reports.batch_page import scores_of, thumbnail_of
-    from gscompleter.runs.memory import peak_memory
+    from gscompleter.commands.fetching import download_inputs
+    from gscompleter.commands.row_options import parse_row
+    from gscompleter.reports.batch_page import average_scores, make_batch_thumbnail
+    from gscompleter.runs.memory import measure_peak_memory
 
     warnings.filterwarnings("ignore", module="PIL")  # as the command line has it
-    with peak_memory() as peak, metered() as meter:
-        with fetched(job.options) as given, place.folder(f"{JOBS}/{job.name}") as folder:
-            summary, _ = complete_folder(options_of(given, folder))
+    with measure_peak_memory() as peak, measure_costs() as meter:
+        with (
+            download_inputs(job.options) as given,
+            place.open_folder(f"{JOBS}/{job.name}") as folder,
+        ):
+            summary, _ = complete_folder(parse_row(given, folder))
             meter.begin("deliver")
-            thumbnail = thumbnail_of(folder)
+            thumbnail = make_batch_thumbnail(folder)
             size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
         if thumbnail is not None:
             place.write(f"{THUMBNAILS}/{job.name}.jpg", thumbnail)
-    return {**scores_of(summary), **cost_of(meter.stages), "result_bytes": size} | {
+    return {**average_scores(summary), **sum_costs(meter.stages), "result_bytes": size} | {
         "peak_bytes": peak.bytes
     }
 
 
-def cost_of(stages: Mapping[str, Any]) -> dict[str, Any]:
+def sum_costs(stages: Mapping[str, Any]) -> dict[str, Any]:
     """Sum the costs of a job over its stages."""
     from dataclasses import asdict
 

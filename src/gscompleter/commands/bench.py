@@ -10,35 +10,35 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from gscompleter.benchmark.comparison import OWN, check_compared, compared, start_of
-from gscompleter.benchmark.completions import PROCESS, brought, completed
+from gscompleter.benchmark.comparison import OWN, check_bench_methods, measure_method, prepare_start
+from gscompleter.benchmark.completions import PROCESS, measure_command, write_input_splat
 from gscompleter.benchmark.growth import Growth
-from gscompleter.benchmark.machine import machine
+from gscompleter.benchmark.machine import describe_machine
 from gscompleter.benchmark.manifest import (
     BenchCase,
     Manifest,
     check_frames,
-    grown_from,
+    get_size,
+    make_series,
     read_manifest,
-    size_over,
 )
 from gscompleter.benchmark.plots import plot_growth
-from gscompleter.benchmark.report import Report, content, report_markdown
-from gscompleter.benchmark.rounds import Task, in_rounds
-from gscompleter.benchmark.samples import Measured, Sample
+from gscompleter.benchmark.report import Report, build_content, format_report
+from gscompleter.benchmark.rounds import BenchTask, measure_in_rounds
+from gscompleter.benchmark.samples import Sample, SampleSet
 from gscompleter.benchmark.yardstick import Yardstick
 from gscompleter.commands.demo import (
     BASELINE_M,
-    motorcycle_cameras,
-    moved,
+    get_motorcycle_cameras,
+    move_right,
     write_motorcycle_scene,
 )
 from gscompleter.commands.options import BenchOptions
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 from gscompleter.generators import load_generator
-from gscompleter.io.files import check_output, output_folder
-from gscompleter.progress import preparing, shown_on, stage
+from gscompleter.io.files import check_output, open_output_folder
+from gscompleter.progress import show_preparation, show_progress, stage
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.reports.plots import PlotsNotAvailable
@@ -63,10 +63,10 @@ class Bench:
     def complete(self, case: BenchCase) -> Sample:
         """Complete a case in a process of its own."""
         out = self.folder / "completion"
-        scene = brought(case, self.folder, self.models, self.device)
-        return completed(self.words(case, scene, out), out, self.yardstick)
+        scene = write_input_splat(case, self.folder, self.models, self.device)
+        return measure_command(self.make_words(case, scene, out), out, self.yardstick)
 
-    def words(self, case: BenchCase, scene: Path | None, out: Path) -> list[str]:
+    def make_words(self, case: BenchCase, scene: Path | None, out: Path) -> list[str]:
         """Write the command line that completes a case."""
         planes = {"--near": case.near, "--far": case.far, "--scene": scene}
         given = [(flag, value) for flag, value in planes.items() if value is not None]
@@ -81,45 +81,45 @@ class Bench:
 
 def run_bench(options: BenchOptions) -> None:
     """Measure the cases and methods, and print or write the tables."""
-    check_asked(options)
+    check_bench_options(options)
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
-        manifest = chosen(manifest_of(options, Path(temporary)), options)
-        with shown_on(None if options.quiet else console):
-            with preparing("getting ready"):
-                bench = prepared(options, Path(temporary))
-            report = measured(bench, manifest, told_on(console))
+        manifest = select_cases(load_bench_manifest(options, Path(temporary)), options)
+        with show_progress(None if options.quiet else console):
+            with show_preparation("getting ready"):
+                bench = prepare_bench(options, Path(temporary))
+            report = run_measurements(bench, manifest, make_printer(console))
     if options.out is not None:
-        write(report, options.out, options.overwrite, console)
-    print(json.dumps(content(report), indent=1) if options.json else report_markdown(report))
+        write_bench(report, options.out, options.overwrite, console)
+    print(json.dumps(build_content(report), indent=1) if options.json else format_report(report))
 
 
-def check_asked(options: BenchOptions) -> None:
+def check_bench_options(options: BenchOptions) -> None:
     """Refuse impossible options."""
-    check_compared(options.methods)
+    check_bench_methods(options.methods)
     if options.folder is not None and options.cases is not None:
         raise InputError("A scene and a file of cases are both named; name one.", "cases")
     if options.out is not None:
         check_output(options.out, options.overwrite)
 
 
-def told_on(console: Console) -> Callable[[str], None]:
+def make_printer(console: Console) -> Callable[[str], None]:
     """Return a function that prints lines without markup."""
     return lambda line: console.print(line, markup=False, soft_wrap=True)
 
 
-def manifest_of(options: BenchOptions, folder: Path) -> Manifest:
+def load_bench_manifest(options: BenchOptions, folder: Path) -> Manifest:
     """Collect the cases of a file, a scene or the demo's pair."""
     if options.cases is not None:
         return read_manifest(options.cases)
     if options.folder is not None:
-        case = scene_case(options, options.folder)
-        return Manifest((case,), grown_from(case))
-    case = demo_case(options, folder / "motorcycle")
-    return Manifest((replace(case, targets=case.targets[:1]),), grown_from(case))
+        case = make_scene_case(options, options.folder)
+        return Manifest((case,), make_series(case))
+    case = write_demo_case(options, folder / "motorcycle")
+    return Manifest((replace(case, targets=case.targets[:1]),), make_series(case))
 
 
-def scene_case(options: BenchOptions, scene: Path) -> BenchCase:
+def make_scene_case(options: BenchOptions, scene: Path) -> BenchCase:
     """Create the case of a scene."""
     if not options.context or not options.target:
         raise InputError(
@@ -130,12 +130,12 @@ def scene_case(options: BenchOptions, scene: Path) -> BenchCase:
     return BenchCase(name, scene, options.context, options.target, options.resolution, *planes)
 
 
-def demo_case(options: BenchOptions, folder: Path) -> BenchCase:
+def write_demo_case(options: BenchOptions, folder: Path) -> BenchCase:
     """Write the demo's pair to `folder` with targets beyond its cameras."""
     write_motorcycle_scene(folder)
-    left, right = motorcycle_cameras(741, 500)
+    left, right = get_motorcycle_cameras(741, 500)
     beyond = [
-        moved(camera, side * step * BASELINE_M)
+        move_right(camera, side * step * BASELINE_M)
         for step in BEYOND
         for camera, side in ((left, -1), (right, 1))
     ]
@@ -146,14 +146,15 @@ def demo_case(options: BenchOptions, folder: Path) -> BenchCase:
     return BenchCase("motorcycle", folder, (0, 1), targets, options.resolution)
 
 
-def chosen(manifest: Manifest, options: BenchOptions) -> Manifest:
+def select_cases(manifest: Manifest, options: BenchOptions) -> Manifest:
     """Select the cases of the options, and check their frames."""
     cases = [case for case in manifest.cases if not options.only or case.name in options.only]
     unknown = set(options.only) - {case.name for case in cases}
     if unknown:
         known = ", ".join(case.name for case in manifest.cases)
         raise InputError(
-            f"There is no case '{quoted(min(unknown))}' to measure; choose one of {known}.", "only"
+            f"There is no case '{quote_value(min(unknown))}' to measure; choose one of {known}.",
+            "only",
         )
     axes: set[str] = set() if options.quick else {*options.growth}
     growth = {axis: found for axis, found in manifest.growth.items() if axis in axes}
@@ -163,7 +164,7 @@ def chosen(manifest: Manifest, options: BenchOptions) -> Manifest:
     return Manifest(tuple(cases), growth)
 
 
-def prepared(options: BenchOptions, folder: Path) -> Bench:
+def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
     """Load the models and the yardstick, compiled."""
     device = choose_device(options.device)
     renderer = load_renderer(device)
@@ -174,106 +175,108 @@ def prepared(options: BenchOptions, folder: Path) -> Bench:
         options.seed,
         QUICK_ITERATIONS if options.quick else None,
     )
-    return Bench(options, device, models, Yardstick.on(renderer, device), folder)
+    return Bench(options, device, models, Yardstick.create(renderer, device), folder)
 
 
-def measured(bench: Bench, manifest: Manifest, tell: Callable[[str], None]) -> Report:
+def run_measurements(bench: Bench, manifest: Manifest, tell: Callable[[str], None]) -> Report:
     """Run all measurements in rounds, after a first run that is not counted."""
     growing = [case for found in manifest.growth.values() for case in found]
-    names = names_of([*manifest.cases, *growing])
+    names = map_case_names([*manifest.cases, *growing])
     if not bench.options.quick:
         tell(f"{manifest.cases[0].name}: first run, not counted")
         with stage("warming up"):
             bench.complete(manifest.cases[0])
-    methods = method_tasks(bench, manifest.cases[0])
-    found = in_rounds([*case_tasks(bench, names), *methods], tell)
+    methods = make_method_tasks(bench, manifest.cases[0])
+    found = measure_in_rounds([*make_case_tasks(bench, names), *methods], tell)
     growth = [
         Growth(
             axis,
-            tuple(size_over(axis, case) for case in cases),
-            tuple(replace(found[names[nameless(case)]], name=case.name) for case in cases),
+            tuple(get_size(axis, case) for case in cases),
+            tuple(replace(found[names[remove_case_name(case)]], name=case.name) for case in cases),
         )
         for axis, cases in manifest.growth.items()
     ]
     return Report(
-        machine(bench.device),
-        settings_of(bench),
-        tuple(found[names[nameless(case)]] for case in manifest.cases),
-        tuple(method_named(found[task.name]) for task in methods),
+        describe_machine(bench.device),
+        describe_bench_settings(bench),
+        tuple(found[names[remove_case_name(case)]] for case in manifest.cases),
+        tuple(remove_method_prefix(found[task.name]) for task in methods),
         tuple(growth),
     )
 
 
-def names_of(cases: Sequence[BenchCase]) -> dict[BenchCase, str]:
+def map_case_names(cases: Sequence[BenchCase]) -> dict[BenchCase, str]:
     """Map each different case to the first of its names."""
     names: dict[BenchCase, str] = {}
     for case in cases:
-        names.setdefault(nameless(case), case.name)
+        names.setdefault(remove_case_name(case), case.name)
     return names
 
 
-def nameless(case: BenchCase) -> BenchCase:
+def remove_case_name(case: BenchCase) -> BenchCase:
     """Remove the name of a case."""
     return replace(case, name="")
 
 
-def case_tasks(bench: Bench, names: dict[BenchCase, str]) -> list[Task]:
+def make_case_tasks(bench: Bench, names: dict[BenchCase, str]) -> list[BenchTask]:
     """Create the tasks that complete cases through the command line."""
-    repeats = repeats_of(bench.options)
+    repeats = get_repeats(bench.options)
 
-    def task(case: BenchCase, name: str) -> Task:
-        return Task(name, lambda: bench.complete(case), PROCESS, repeats)
+    def task(case: BenchCase, name: str) -> BenchTask:
+        return BenchTask(name, lambda: bench.complete(case), PROCESS, repeats)
 
     return [task(case, name) for case, name in names.items()]
 
 
-METHOD = "method "
+METHOD_PREFIX = "method "
 
 
-def method_tasks(bench: Bench, case: BenchCase) -> list[Task]:
+def make_method_tasks(bench: Bench, case: BenchCase) -> list[BenchTask]:
     """Create the tasks that compare methods at the first target of `case`."""
     if not bench.options.methods:
         return []
-    start = start_of(case, bench.models, bench.device)
+    start = prepare_start(case, bench.models, bench.device)
     if not bench.options.quick:
-        with stage("warming up"), shown_on(None):
-            compared("full", start, bench.yardstick)
+        with stage("warming up"), show_progress(None):
+            measure_method("full", start, bench.yardstick)
 
-    def task(name: str) -> Task:
-        repeats = repeats_of(bench.options)
+    def task(name: str) -> BenchTask:
+        repeats = get_repeats(bench.options)
         if name not in ("full", "autograd"):
             repeats = min(repeats, bench.options.baseline_repeats)
-        return Task(METHOD + name, lambda: compared(name, start, bench.yardstick), OWN, repeats)
+        return BenchTask(
+            METHOD_PREFIX + name, lambda: measure_method(name, start, bench.yardstick), OWN, repeats
+        )
 
     return [task(name) for name in dict.fromkeys(bench.options.methods)]
 
 
-def method_named(found: Measured) -> Measured:
+def remove_method_prefix(found: SampleSet) -> SampleSet:
     """Remove the prefix from the name of a measurement."""
-    return replace(found, name=found.name.removeprefix(METHOD))
+    return replace(found, name=found.name.removeprefix(METHOD_PREFIX))
 
 
-def repeats_of(options: BenchOptions) -> int:
+def get_repeats(options: BenchOptions) -> int:
     """Return the number of repetitions."""
     return 1 if options.quick else options.repeats
 
 
-def settings_of(bench: Bench) -> dict[str, int | None]:
+def describe_bench_settings(bench: Bench) -> dict[str, int | None]:
     """Describe the settings that determine the numbers."""
     options = bench.options
     return {
         "seed": options.seed,
-        "repeats": repeats_of(options),
-        "baseline_repeats": min(repeats_of(options), options.baseline_repeats),
+        "repeats": get_repeats(options),
+        "baseline_repeats": min(get_repeats(options), options.baseline_repeats),
         "baseline_iterations": bench.models.baseline_iterations,
     }
 
 
-def write(report: Report, out: Path, overwrite: bool, console: Console) -> None:
+def write_bench(report: Report, out: Path, overwrite: bool, console: Console) -> None:
     """Write bench.json, tables.md and growth.png."""
-    with output_folder(out, overwrite) as folder:
-        (folder / "bench.json").write_text(json.dumps(content(report), indent=1) + "\n")
-        (folder / "tables.md").write_text(report_markdown(report))
+    with open_output_folder(out, overwrite) as folder:
+        (folder / "bench.json").write_text(json.dumps(build_content(report), indent=1) + "\n")
+        (folder / "tables.md").write_text(format_report(report))
         if report.growth:
             try:
                 plot_growth(folder / "growth.png", report.growth)

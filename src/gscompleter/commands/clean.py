@@ -15,82 +15,86 @@ from torch import Tensor
 from gscompleter import __version__
 from gscompleter.commands.opening import (
     Task,
+    apply_working_range,
     check_context,
-    in_frame_of_splat,
+    move_to_splat,
     open_scene,
+    print_lines,
     read_photographs,
-    say,
-    with_working_range,
 )
 from gscompleter.commands.options import CleanOptions
 from gscompleter.commands.output import (
-    opened_as,
-    replaceable,
-    saying_what_stays,
-    settings_of,
+    describe_opened,
+    describe_settings,
+    is_replaceable,
+    report_interrupts,
 )
-from gscompleter.commands.understood import found_out
+from gscompleter.commands.understood import describe_opening
 from gscompleter.compilation import compile_kernels
 from gscompleter.completer import Clock
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.files import SUMMARY, check_output, output_folder
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import SUMMARY_FILE, check_output, open_output_folder
 from gscompleter.metrics.image import psnr
-from gscompleter.progress import preparing, shown_on, stage, track
+from gscompleter.progress import show_preparation, show_progress, stage, track
 from gscompleter.render import Renderer, choose_device, load_renderer
-from gscompleter.reports.completion import save_brought
+from gscompleter.reports.completion import save_completed_splat
 from gscompleter.splats.formats import load_splat
-from gscompleter.stages.cleaning import superfluous
+from gscompleter.stages.cleaning import find_superfluous
 from gscompleter.types import Gaussians
 
 
 def run_clean(options: CleanOptions) -> None:
     """Clean the splat, and print a summary."""
-    with saying_what_stays(options.out):
+    with report_interrupts(options.out):
         summary = clean_splat(options)
         if not options.quiet:
-            tell(summary, options.out)
+            print_cleaning(summary, options.out)
 
 
 def clean_splat(options: CleanOptions) -> dict[str, Any]:
     """Clean the splat, write `options.out`, and return the summary."""
     console = Console(stderr=True, quiet=options.quiet)
-    check_output(options.out, replaceable(options))
+    check_output(options.out, is_replaceable(options))
     check_context(options)
     device = choose_device(options.device)
     renderer, clock = load_renderer(device), Clock(())
-    with shown_on(None if options.quiet else console):
+    with show_progress(None if options.quiet else console):
         opened = open_scene(options, console)
-        with preparing("reading photographs"):
+        with show_preparation("reading photographs"):
             task = read_photographs(options, opened, device)
-        with preparing("reading the scene"):
+        with show_preparation("reading the scene"):
             given = load_splat(options.scene, options.drop_nonfinite)
         compile_kernels([device])
-        with preparing("aligning the scene"):
-            task = in_frame_of_splat(task, given, options.scene, options, opened)
-        task = with_working_range(task, renderer)
+        with show_preparation("aligning the scene"):
+            task = move_to_splat(task, given, options.scene, options, opened)
+        task = apply_working_range(task, renderer)
         plan = f"compared with {len(task.views)} photographs on {device}"
-        plan += f", written to {quoted(options.out)}"
-        say(console, *found_out(options, opened, task), f"To do: {plan}.")
-        with output_folder(options.out, replaceable(options)) as folder:
+        plan += f", written to {quote_value(options.out)}"
+        print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
+        with open_output_folder(options.out, is_replaceable(options)) as folder:
             with clock("clean"):
-                removed = superfluous(splat_of(task), task.views, renderer, options.config)
-            settings = settings_of(options, options.config, targets={}, models={})
-            facts = {"settings": settings, "device": device, **opened_as(options, opened, task)}
-            summary = facts | scores(task, removed, renderer) | {"seconds": clock.seconds}
+                removed = find_superfluous(get_splat(task), task.views, renderer, options.config)
+            settings = describe_settings(options, options.config, targets={}, models={})
+            facts = {
+                "settings": settings,
+                "device": device,
+                **describe_opened(options, opened, task),
+            }
+            summary = facts | score_cleaning(task, removed, renderer) | {"seconds": clock.seconds}
             with stage("writing"):
-                write(folder, task, removed, {"version": __version__, **summary})
+                write_cleaned(folder, task, removed, {"version": __version__, **summary})
     return summary
 
 
-def splat_of(task: Task) -> Gaussians:
+def get_splat(task: Task) -> Gaussians:
     """Return the input splat."""
     assert task.scene is not None
     return task.scene
 
 
-def scores(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str, Any]:
+def score_cleaning(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str, Any]:
     """Count the removed Gaussians, and compute PSNR (dB) before and after."""
-    given = splat_of(task)
+    given = get_splat(task)
     rows = []
     for view in track(task.views, "scores"):
         before, after = (
@@ -103,20 +107,22 @@ def scores(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str
     return {"photographs": rows, "gaussians": counts}
 
 
-def write(folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[str, Any]) -> None:
+def write_cleaned(
+    folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[str, Any]
+) -> None:
     """Write the cleaned splat, the removed Gaussians and the summary."""
-    given = splat_of(task)
+    given = get_splat(task)
     if taken.all():
         raise InputError(
             "Every Gaussian of the splat makes the photographs worse; check that they show the "
             "same scene."
         )
-    assert task.brought is not None
-    save_brought(folder, given, taken, given[:0], task.brought)
-    (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n")
+    assert task.splat_file is not None
+    save_completed_splat(folder, given, taken, given[:0], task.splat_file)
+    (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
 
 
-def tell(summary: Mapping[str, Any], out: Path) -> None:
+def print_cleaning(summary: Mapping[str, Any], out: Path) -> None:
     """Print the numbers of Gaussians and the change of PSNR."""
     rows, counts = summary["photographs"], summary["gaussians"]
     before, after = (

@@ -11,94 +11,99 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.expected import expecting_completion
+from gscompleter.commands.expected import expect_completion
 from gscompleter.commands.exploring import (
-    cameras_of,
-    completed,
-    looks_around,
-    name_of,
-    planned,
-    tell_plan,
+    collect_cameras,
+    complete_targets,
+    name_target,
+    plan_completion,
+    print_plan,
+    render_looks_around,
     write_targets,
 )
 from gscompleter.commands.opening import (
     Opened,
     Task,
+    add_check_views,
+    apply_working_range,
     check_context,
     check_scene,
     check_targets,
-    in_frame_of_splat,
+    move_to_splat,
     open_scene,
+    print_lines,
     read_task,
-    say,
-    with_witnesses,
-    with_working_range,
 )
-from gscompleter.commands.options import CompleteOptions, most
+from gscompleter.commands.options import CompleteOptions, get_max_targets
 from gscompleter.commands.output import (
-    opened_as,
+    describe_opened,
+    describe_settings,
+    is_replaceable,
     read_held_out,
-    replaceable,
-    saying_what_stays,
-    settings_of,
+    report_interrupts,
 )
-from gscompleter.commands.understood import understood
-from gscompleter.compilation import BROUGHT, compile_kernels
-from gscompleter.completer import Clock, GSCompleter, total
+from gscompleter.commands.understood import describe_task
+from gscompleter.compilation import SPLAT_PART, compile_kernels
+from gscompleter.completer import Clock, GSCompleter, add_seconds
 from gscompleter.config import CompleterConfig
-from gscompleter.config.generators import settings_class
-from gscompleter.explorer import Explorer
+from gscompleter.config.generators import get_settings_class
+from gscompleter.explorer import ViewPlanner
 from gscompleter.generators import load_generator
-from gscompleter.io.files import check_output, output_folder
-from gscompleter.io.video import check_writer
-from gscompleter.kernels.sharing import meanwhile
-from gscompleter.progress import preparing, shown_on, stage
+from gscompleter.io.files import check_output, open_output_folder
+from gscompleter.io.video import check_video_writer
+from gscompleter.kernels.sharing import run_in_background
+from gscompleter.progress import show_preparation, show_progress, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
-from gscompleter.render.proxy import WORTH
-from gscompleter.reports.completion import Around, Target, write_report
-from gscompleter.reports.completion_page import completion_page
-from gscompleter.reports.film import NAME as FILM
-from gscompleter.reports.film import write_film
-from gscompleter.reports.page import NAME as PAGE
+from gscompleter.render.proxy import MIN_PROXY_GAUSSIANS
+from gscompleter.reports.completion import Surroundings, Target, write_report
+from gscompleter.reports.completion_page import render_completion_page
+from gscompleter.reports.film import VIDEO_FILE as FILM
+from gscompleter.reports.film import write_comparison_video
+from gscompleter.reports.page import REPORT_FILE as PAGE
 from gscompleter.reports.page import write_page
-from gscompleter.reports.plain_words import NO_TARGET, exposures, left_out, moved
+from gscompleter.reports.plain_words import (
+    NO_TARGET_NOTE,
+    describe_exposures,
+    describe_ignored,
+    describe_motion,
+)
 from gscompleter.splats.formats import load_splat
-from gscompleter.splats.order import order_nearby
+from gscompleter.splats.order import argsort_nearby
 from gscompleter.types import Camera, Completion, View
 
 
 def run_completion(options: CompleteOptions) -> None:
     """Complete the scene, and print a summary."""
-    with saying_what_stays(options.out):
+    with report_interrupts(options.out):
         if options.dry_run:
             plan_folder(options)
             return
         summary, completion = complete_folder(options)
         if not options.quiet:
-            tell(summary, completion, options)
+            print_completion(summary, completion, options)
 
 
 def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completion]:
     """Complete the scene, write `options.out`, and return the summary."""
     if options.video:
-        check_writer()
+        check_video_writer()
     console = Console(stderr=True, quiet=options.quiet)
-    with shown_on(None if options.quiet else console):
-        opened, task, explorer, before = prepared(options, console)
-        say(console, *understood(options, opened, task))
-        cameras = cameras_of(options, opened, task)
-        expectation = expecting_completion(options, task, task.views[0].image.device.type)
-        with output_folder(options.out, replaceable(options)) as folder, expectation:
-            completion, task = completed(options, task, cameras, explorer)
-            completion = replace(completion, seconds=total(completion.seconds, before))
+    with show_progress(None if options.quiet else console):
+        opened, task, explorer, before = prepare_completion(options, console)
+        print_lines(console, *describe_task(options, opened, task))
+        cameras = collect_cameras(options, opened, task)
+        expectation = expect_completion(options, task, task.views[0].image.device.type)
+        with open_output_folder(options.out, is_replaceable(options)) as folder, expectation:
+            completion, task = complete_targets(options, task, cameras, explorer)
+            completion = replace(completion, seconds=add_seconds(completion.seconds, before))
             with stage("report"):
                 done = Done(opened, task, cameras, completion)
                 summary = write_done(folder, options, done, explorer)
                 write_targets(folder, task)
             if options.video:
                 photographs = list(cameras.values())
-                write_film(folder, completion, photographs, explorer.completer.renderer)
+                write_comparison_video(folder, completion, photographs, explorer.completer.renderer)
     return summary, completion
 
 
@@ -114,99 +119,103 @@ class Done:
 
 
 def write_done(
-    folder: Path, options: CompleteOptions, done: Done, explorer: Explorer
+    folder: Path, options: CompleteOptions, done: Done, explorer: ViewPlanner
 ) -> dict[str, Any]:
     """Write all results but the targets and the video, and return the summary."""
     task, cameras = done.task, tuple(done.cameras.values())
-    facts = said_in_advance(options, done.opened, task, task.views[0].image.device.type)
-    with meanwhile(looks_around, options, done.completion, cameras, explorer) as looks:
+    facts = describe_run(options, done.opened, task, task.views[0].image.device.type)
+    with run_in_background(
+        render_looks_around, options, done.completion, cameras, explorer
+    ) as looks:
         summary = write_report(
             folder,
             done.completion,
             task.targets,
             explorer.completer,
             facts,
-            task.brought,
-            lambda: Around(tuple(looks()), cameras),
+            task.splat_file,
+            lambda: Surroundings(tuple(looks()), cameras),
             read_held_out(options, done.opened, task, done.cameras),
         )
-    write_page(folder, completion_page(folder))
+    write_page(folder, render_completion_page(folder))
     return summary
 
 
 def plan_folder(options: CompleteOptions) -> None:
     """Write the targets and print the plan, without completing the scene."""
     console = Console(stderr=True, quiet=options.quiet)
-    with shown_on(None if options.quiet else console):
-        opened, task, explorer, _ = prepared(options, console)
-        say(console, *understood(options, opened, task))
-        cameras = cameras_of(options, opened, task)
-        with output_folder(options.out, replaceable(options)) as folder:
-            plan = planned(options, task, cameras, explorer)
+    with show_progress(None if options.quiet else console):
+        opened, task, explorer, _ = prepare_completion(options, console)
+        print_lines(console, *describe_task(options, opened, task))
+        cameras = collect_cameras(options, opened, task)
+        with open_output_folder(options.out, is_replaceable(options)) as folder:
+            plan = plan_completion(options, task, cameras, explorer)
             write_targets(folder, plan.task)
     if not options.quiet:
-        tell_plan(options, plan)
+        print_plan(options, plan)
 
 
-def prepared(
+def prepare_completion(
     options: CompleteOptions, console: Console
-) -> tuple[Opened, Task, Explorer, Mapping[str, float]]:
+) -> tuple[Opened, Task, ViewPlanner, Mapping[str, float]]:
     """Open the scene and load the models; also returns the seconds that this took."""
-    check_output(options.out, replaceable(options))
+    check_output(options.out, is_replaceable(options))
     check_context(options)
     check_targets(options)
     check_reconstructor(options.reconstructor)
-    settings_class(options.synthesis.name)
+    get_settings_class(options.synthesis.name)
     device = choose_device(options.device)
     opened = open_scene(options, console)
     if not options.config.ego_mask:
-        opened = opened.with_ego_vehicle()
-    with preparing("reading photographs"):
+        opened = opened.keep_ego_vehicle()
+    with show_preparation("reading photographs"):
         task = read_task(options, opened, device)
     parts = device, options.reconstructor, options.synthesis.name
     if options.scene is None:
         compile_kernels(parts)
     else:
-        task = with_splat(task, options.scene, options, opened, parts)
-    with preparing("loading models"):
-        completer = completer_for(options, task.targets, device)
+        task = add_splat(task, options.scene, options, opened, parts)
+    with show_preparation("loading models"):
+        completer = load_completer(options, task.targets, device)
     clock = Clock()
-    with preparing("depth range"), clock("context"):
-        task = with_working_range(task, completer.renderer)
-    return opened, task, Explorer(completer), clock.seconds
+    with show_preparation("depth range"), clock("context"):
+        task = apply_working_range(task, completer.renderer)
+    return opened, task, ViewPlanner(completer), clock.seconds
 
 
-def with_splat(
+def add_splat(
     task: Task, path: Path, options: CompleteOptions, opened: Opened, parts: Sequence[str]
 ) -> Task:
     """Compile the kernels, and add the input splat to the task."""
-    with preparing("reading the scene"):
-        task = with_witnesses(task, opened.photographs)
+    with show_preparation("reading the scene"):
+        task = add_check_views(task, opened.photographs)
         given = load_splat(path, options.drop_nonfinite)
         if "cpu" in parts:
             check_scene(task, given)
-    compile_kernels([*parts, *([BROUGHT] if "cpu" in parts else [])])
-    with preparing("aligning the scene"):
-        order = order_nearby(given) if len(given) >= WORTH else None
+    compile_kernels([*parts, *([SPLAT_PART] if "cpu" in parts else [])])
+    with show_preparation("aligning the scene"):
+        order = argsort_nearby(given) if len(given) >= MIN_PROXY_GAUSSIANS else None
         given = given if order is None else given[order]
-        return in_frame_of_splat(task, given, path, options, opened, order)
+        return move_to_splat(task, given, path, options, opened, order)
 
 
-def said_in_advance(
+def describe_run(
     options: CompleteOptions, opened: Opened, task: Task, device: str
 ) -> dict[str, Any]:
     """Describe the input and the settings for `summary.json`."""
-    auto = None if options.target else most(options)
+    auto = None if options.target else get_max_targets(options)
     targets = {"target": list(options.target), "auto": auto}
     return {
-        "settings": settings_of(options, stages_of(options), targets, models_of(options)),
+        "settings": describe_settings(
+            options, get_stage_config(options), targets, describe_models(options)
+        ),
         "seed": options.seed,
         "device": device,
-        **opened_as(options, opened, task),
+        **describe_opened(options, opened, task),
     }
 
 
-def completer_for(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
+def load_completer(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
     """Load the models of the options."""
     photographs = [
         View(target.photograph, target.camera, target.frame)
@@ -216,14 +225,16 @@ def completer_for(options: CompleteOptions, targets: Sequence[Target], device: s
     generator = options.synthesis
     return GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
-        load_generator(generator.name, options.seed, photographs, device, generator.settings()),
+        load_generator(
+            generator.name, options.seed, photographs, device, generator.make_settings()
+        ),
         load_renderer(device),
-        stages_of(options),
+        get_stage_config(options),
         options.seed,
     )
 
 
-def stages_of(options: CompleteOptions) -> CompleterConfig:
+def get_stage_config(options: CompleteOptions) -> CompleterConfig:
     """Return the settings, changed by options that have a name of their own."""
     if not options.no_prune:
         return options.config
@@ -231,17 +242,19 @@ def stages_of(options: CompleteOptions) -> CompleterConfig:
     return replace(options.config, trust_settings=settings)
 
 
-def models_of(options: CompleteOptions) -> dict[str, Any]:
+def describe_models(options: CompleteOptions) -> dict[str, Any]:
     """Describe the models for `summary.json`."""
     return {
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
-        **options.synthesis.as_summary(),
+        **options.synthesis.describe(),
         "uses_target_photographs": options.synthesis.name == "oracle",
     }
 
 
-def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOptions) -> None:
+def print_completion(
+    summary: Mapping[str, Any], completion: Completion, options: CompleteOptions
+) -> None:
     """Print the scores per camera, the notes, and the location of the results."""
 
     def cell(value: float | None) -> str:
@@ -253,7 +266,7 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         table.add_row(name, "", cell(row["psnr_before"]), cell(row["psnr_after"]), "")
     notes = []
     for row, target in zip(summary["targets"], completion.targets, strict=True):
-        name = name_of(row["frame"], row["derived_from"])
+        name = name_target(row["frame"], row["derived_from"])
         notes += [f"{name}: {note}" for note in target.notes]
         hole = f"{100 * row['hole_fraction']:.1f} %"
         scores = cell(row["psnr_before"]), cell(row["psnr_after"])
@@ -264,8 +277,10 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
         console.print(note)
     gains = [row["exposure_gain"] for row in summary["context"]]
     contradicted = {row["frame"]: row["dynamic_fraction"] for row in summary["context"]}
-    carried = left_out(row["ignored"] for row in summary["context"])
-    for sentence in filter(None, (exposures(gains), moved(contradicted), carried)):
+    carried = describe_ignored(row["ignored"] for row in summary["context"])
+    for sentence in filter(
+        None, (describe_exposures(gains), describe_motion(contradicted), carried)
+    ):
         console.print(sentence, soft_wrap=True)
     origin = summary["frame"]["origin"]
     if any(origin):
@@ -275,7 +290,7 @@ def tell(summary: Mapping[str, Any], completion: Completion, options: CompleteOp
             soft_wrap=True,
         )
     if not summary["targets"]:
-        console.print(NO_TARGET)
+        console.print(NO_TARGET_NOTE)
     elif options.video:
         console.print(f"Video: {options.out / FILM}", soft_wrap=True)
     covered = summary["coverage"]

@@ -43,25 +43,30 @@ def run_convert(options: ConvertOptions) -> None:
     from rich.console import Console
 
     from gscompleter.io.ply import note_infinite_opacities
-    from gscompleter.progress import preparing, shown_on
-    from gscompleter.splats.formats import load_splat, loss_of_mode, save_splat, writable_format
+    from gscompleter.progress import show_preparation, show_progress
+    from gscompleter.splats.formats import (
+        describe_mode_loss,
+        get_writable_format,
+        load_splat,
+        save_splat,
+    )
 
-    writable_format(options.out)
+    get_writable_format(options.out)
     check_free(options.out, options.overwrite)
-    with shown_on(None if options.quiet else Console(stderr=True)):
-        with preparing("reading"):
+    with show_progress(None if options.quiet else Console(stderr=True)):
+        with show_preparation("reading"):
             gaussians = load_splat(options.source, options.drop_nonfinite)
-        with preparing("writing"):
-            save_splat(options.out, unlabelled(gaussians) if options.plain else gaussians)
+        with show_preparation("writing"):
+            save_splat(options.out, drop_labels(gaussians) if options.plain else gaussians)
     if not options.quiet:
         generated = int((gaussians.generated > 0).sum())
-        notes = note_infinite_opacities(gaussians), loss_of_mode(options.out, gaussians)
+        notes = note_infinite_opacities(gaussians), describe_mode_loss(options.out, gaussians)
         for note in filter(None, notes):
             print(note)
         print(f"{len(gaussians):,} Gaussians, {generated:,} of them generated: {options.out}")
 
 
-def unlabelled(gaussians: Gaussians) -> Gaussians:
+def drop_labels(gaussians: Gaussians) -> Gaussians:
     """Drop the labels of generated Gaussians; all Gaussians stay."""
     return replace(gaussians, generated=gaussians.generated.new_zeros(len(gaussians)))
 

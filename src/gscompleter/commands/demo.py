@@ -13,12 +13,12 @@ import torch
 from rich.console import Console
 from skimage.data import stereo_motorcycle
 
-from gscompleter.commands.complete import complete_folder, tell
+from gscompleter.commands.complete import complete_folder, print_completion
 from gscompleter.commands.options import CompleteOptions, DemoOptions
 from gscompleter.data.scene import write_cameras
-from gscompleter.io.files import output_folder
+from gscompleter.io.files import open_output_folder
 from gscompleter.io.image import read_image, write_image
-from gscompleter.reports.completion import strip
+from gscompleter.reports.completion import join_images
 from gscompleter.types import Camera
 
 FOCAL_PX = 994.978
@@ -30,17 +30,17 @@ BEYOND = 1.0
 RESOLUTION = (250, 370)
 
 
-def motorcycle_cameras(width: int, height: int) -> tuple[Camera, Camera]:
+def get_motorcycle_cameras(width: int, height: int) -> tuple[Camera, Camera]:
     """Return the left and right camera in metres; the left one is the world frame."""
     K = torch.diag(torch.tensor([FOCAL_PX, FOCAL_PX, 1.0]))
     K[:2, 2] = torch.tensor(PRINCIPAL_POINT_PX)
     left = Camera(torch.eye(4), K, width, height)
     K_right = K.clone()
     K_right[0, 2] += PRINCIPAL_POINT_DX_PX
-    return left, replace(moved(left, BASELINE_M), K=K_right)
+    return left, replace(move_right(left, BASELINE_M), K=K_right)
 
 
-def moved(camera: Camera, x: float) -> Camera:
+def move_right(camera: Camera, x: float) -> Camera:
     """Move a camera by `x` metres to the right."""
     c2w = camera.c2w.clone()
     c2w[0, 3] += x
@@ -51,20 +51,20 @@ def write_motorcycle_scene(folder: Path) -> None:
     """Write the pair as a scene folder with `targets.json`."""
     left_image, right_image, _ = stereo_motorcycle()
     height, width = left_image.shape[:2]
-    left, right = motorcycle_cameras(width, height)
+    left, right = get_motorcycle_cameras(width, height)
     (folder / "images").mkdir(parents=True)
     for name, image in (("left", left_image), ("right", right_image)):
         write_image(folder / "images" / f"{name}.png", torch.from_numpy(image / 255).float())
     write_cameras(
         folder / "transforms.json", [left, right], ["images/left.png", "images/right.png"]
     )
-    beyond = [moved(left, -BEYOND * BASELINE_M), moved(right, BEYOND * BASELINE_M)]
+    beyond = [move_right(left, -BEYOND * BASELINE_M), move_right(right, BEYOND * BASELINE_M)]
     write_cameras(folder / "targets.json", beyond)
 
 
 def run_demo(options: DemoOptions) -> None:
     """Write the scene, complete it for both targets, and join before and after."""
-    with output_folder(options.out, options.overwrite) as folder:
+    with open_output_folder(options.out, options.overwrite) as folder:
         scene = folder / "scene"
         write_motorcycle_scene(scene)
         complete_options = CompleteOptions(
@@ -80,10 +80,12 @@ def run_demo(options: DemoOptions) -> None:
         summary, completion = complete_folder(complete_options)
         images = folder / "completion" / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
-        shown = strip([read_image(images / f"{name}.png") for name in names])
+        shown = join_images([read_image(images / f"{name}.png") for name in names])
         write_image(folder / "before_after.png", shown)
     if not options.quiet:
-        tell(summary, completion, replace(complete_options, out=options.out / "completion"))
+        print_completion(
+            summary, completion, replace(complete_options, out=options.out / "completion")
+        )
         Console(highlight=False).print(
             f"Before and after, beyond the left and the right camera: "
             f"{options.out / 'before_after.png'}",

@@ -57,14 +57,14 @@ class Found:
 
 def run_doctor(options: DoctorOptions) -> None:
     """Inspect the installation and print the result."""
-    found = list(examined())
+    found = list(inspect_installation())
     if options.json:
         print(json.dumps([asdict(one) for one in found], indent=2))
     else:
-        tell(found)
+        print_findings(found)
 
 
-def tell(found: list[Found]) -> None:
+def print_findings(found: list[Found]) -> None:
     """Print the result, grouped by kind."""
     width = max(len(one.name) for one in found)
     kinds = dict.fromkeys(one.kind for one in found)
@@ -75,53 +75,56 @@ def tell(found: list[Found]) -> None:
                 print(f"  {one.name:{width}}  {'' if one.there else 'missing: '}{one.told}")
 
 
-def examined() -> Iterator[Found]:
+def inspect_installation() -> Iterator[Found]:
     """Inspect all parts, in the order of the result."""
-    yield from machine_facts()
-    yield from packages()
-    yield from extras()
-    yield from renderers()
-    yield from weights()
-    yield from viewer()
-    yield from caches()
+    yield from inspect_machine()
+    yield from inspect_packages()
+    yield from inspect_extras()
+    yield from inspect_renderers()
+    yield from inspect_weights()
+    yield from inspect_viewer()
+    yield from inspect_caches()
 
 
-def machine_facts() -> Iterator[Found]:
+def inspect_machine() -> Iterator[Found]:
     """Inspect versions, processor, memory and device."""
     # Imported here so that `--help` does not wait for torch.
-    from gscompleter.benchmark.machine import machine
+    from gscompleter.benchmark.machine import describe_machine
     from gscompleter.render import choose_device
 
-    facts = machine(choose_device())
+    facts = describe_machine(choose_device())
     unit = {"memory_gb": ("memory", " GB")}
     for name, value in facts.items():
         shown, suffix = unit.get(name, (name, ""))
         yield Found("machine", shown, True, f"{value}{suffix}")
 
 
-def packages() -> Iterator[Found]:
+def inspect_packages() -> Iterator[Found]:
     """Inspect the packages that everything needs."""
-    for requirement in required():
-        there = installed(requirement)
+    for requirement in list_requirements():
+        there = find_installed_version(requirement)
         details = there or f"{requirement}, which every command needs; pip install '{requirement}'"
         yield Found("packages", requirement.name, there is not None, details)
 
 
-def extras() -> Iterator[Found]:
+def inspect_extras() -> Iterator[Found]:
     """Inspect the extras."""
     for extra, purpose in PURPOSES.items():
-        if not required(extra):
+        if not list_requirements(extra):
             why = f"the installed version or this Python is older than this extra; for {purpose}"
             yield Found("extras", extra, False, why)
             continue
-        versions = {requirement.name: installed(requirement) for requirement in required(extra)}
+        versions = {
+            requirement.name: find_installed_version(requirement)
+            for requirement in list_requirements(extra)
+        }
         missing = [name for name, there in versions.items() if there is None]
         listed = ", ".join(missing or [f"{name} {there}" for name, there in versions.items()])
         remedy = f"; pip install '{DISTRIBUTION}[{extra}]'" if missing else ""
         yield Found("extras", extra, not missing, f"{listed}, for {purpose}{remedy}")
 
 
-def required(extra: str = "") -> list[Requirement]:
+def list_requirements(extra: str = "") -> list[Requirement]:
     """List the requirements of the package, or those that an extra adds."""
     from importlib.metadata import PackageNotFoundError, requires
 
@@ -134,17 +137,17 @@ def required(extra: str = "") -> list[Requirement]:
             f"{DISTRIBUTION} is not installed, so its requirements are unknown; run "
             "`pip install .` in its source folder."
         ) from None
-    return [r for r in all_of_them if is_for(extra, r)]
+    return [r for r in all_of_them if is_required_by(extra, r)]
 
 
-def is_for(extra: str, requirement: Requirement) -> bool:
+def is_required_by(extra: str, requirement: Requirement) -> bool:
     """Return True if an extra adds this requirement; without a name, if all need it."""
     if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
         return not extra
     return bool(extra) and requirement.marker.evaluate({"extra": extra})
 
 
-def installed(requirement: Requirement) -> str | None:
+def find_installed_version(requirement: Requirement) -> str | None:
     """Return the installed version if it satisfies the requirement."""
     from importlib.metadata import PackageNotFoundError, version
 
@@ -155,7 +158,7 @@ def installed(requirement: Requirement) -> str | None:
     return there if requirement.specifier.contains(there, prereleases=True) else None
 
 
-def renderers() -> Iterator[Found]:
+def inspect_renderers() -> Iterator[Found]:
     """Inspect the renderers and the compiled kernels."""
     from gscompleter.compilation import PARTS
     from gscompleter.kernels.compiled import is_compiled
@@ -173,14 +176,14 @@ def renderers() -> Iterator[Found]:
     yield Found("renderers", "kernels", not missing, lacking if missing else "compiled")
 
 
-def weights() -> Iterator[Found]:
+def inspect_weights() -> Iterator[Found]:
     """Inspect the published weights of reconstructors and LPIPS."""
     from gscompleter.metrics.lpips import NETWORKS
-    from gscompleter.metrics.lpips import place_of as place_of_lpips
-    from gscompleter.weights.fetching import cached
+    from gscompleter.metrics.lpips import get_weights_path as place_of_lpips
+    from gscompleter.weights.fetching import find_cached
     from gscompleter.weights.published import PUBLISHED
 
-    here = [name for name, published in PUBLISHED.items() if cached(published)]
+    here = [name for name, published in PUBLISHED.items() if find_cached(published)]
     listed = ", ".join(here) or f"all {len(PUBLISHED)} that `gscompleter models` lists"
     yield Found("weights", "reconstructors", bool(here), f"{listed}, for --reconstructor")
     for name, network in NETWORKS.items():
@@ -192,26 +195,26 @@ def weights() -> Iterator[Found]:
         yield Found("weights", f"lpips-{name}", there, details)
 
 
-def viewer() -> Iterator[Found]:
+def inspect_viewer() -> Iterator[Found]:
     """Inspect the JavaScript libraries of the pages."""
-    from gscompleter.viewer.packages import BUILT, LOCK, place_of, read_lock
+    from gscompleter.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
 
-    if BUILT.is_file():
-        yield Found("viewer", "libraries", True, f"with the package, {BUILT}")
+    if BUILT_LIBRARIES.is_file():
+        yield Found("viewer", "libraries", True, f"with the package, {BUILT_LIBRARIES}")
         return
-    missing = [p for p in read_lock(LOCK) if not place_of(p).is_file()]
+    missing = [p for p in read_lock(LOCK_FILE) if not get_archive_path(p).is_file()]
     names = ", ".join(package.name for package in missing)
     lacking = f"{names}, fetched with npm's registry when `gscompleter view` is first run"
     yield Found("viewer", "libraries", not missing, lacking if missing else "in the cache")
 
 
-def caches() -> Iterator[Found]:
+def inspect_caches() -> Iterator[Found]:
     """Inspect the cache folders."""
     import torch
 
-    from gscompleter.cache import cache_folder
-    from gscompleter.kernels.compiled import cache_folder as kernels_folder
+    from gscompleter.cache import get_download_folder
+    from gscompleter.kernels.compiled import get_cache_folder as kernels_folder
 
-    yield Found("caches", "downloads", True, f"{cache_folder()} (GSCOMPLETER_HOME)")
+    yield Found("caches", "downloads", True, f"{get_download_folder()} (GSCOMPLETER_HOME)")
     yield Found("caches", "kernels", True, f"{kernels_folder()} (NUMBA_CACHE_DIR)")
     yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")

@@ -6,35 +6,37 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gscompleter.batch.engines import Engine
-from gscompleter.batch.engines.local import LocalEngine, default_workers
+from gscompleter.batch.engines.local import LocalEngine, choose_num_workers
 from gscompleter.batch.engines.ray import RayEngine
 from gscompleter.batch.engines.submitit import SubmititEngine
 from gscompleter.batch.places import is_address
-from gscompleter.batch.rounds import in_this_process
+from gscompleter.batch.rounds import run_in_this_process
 from gscompleter.commands.options import EngineOptions
-from gscompleter.errors import InputError, quoted
-from gscompleter.threads import bound_threads, usable_cores
+from gscompleter.errors import InputError, quote_value
+from gscompleter.threads import count_available_cores, limit_threads
 
 
-def pairs(words: Sequence[str], option: str) -> dict[str, str]:
+def parse_pairs(words: Sequence[str], option: str) -> dict[str, str]:
     """Parse `NAME=VALUE` words."""
     for word in words:
         if not word.partition("=")[0] or "=" not in word:
-            raise InputError(f"'{quoted(word)}' is not NAME=VALUE, as in resolution=256.", option)
+            raise InputError(
+                f"'{quote_value(word)}' is not NAME=VALUE, as in resolution=256.", option
+            )
     return dict(tuple(word.split("=", 1)) for word in words)  # type: ignore[misc]
 
 
-def engine_for(options: EngineOptions, out: str) -> Engine:
+def make_engine(options: EngineOptions, out: str) -> Engine:
     """Create the engine. On this machine it also sets the threads, which workers inherit."""
     if options.engine is None:
-        return in_this_process
+        return run_in_this_process
     threads = options.threads or 1
     if options.engine == "ray":
         return RayEngine(options.workers, threads, options.gpus, options.address)
     if options.engine == "submitit":
         kept = "submitit" if is_address(out) else f"{out}/submitit"
-        slurm = pairs(options.slurm, "slurm")
+        slurm = parse_pairs(options.slurm, "slurm")
         return SubmititEngine(options.workers or 1, threads, options.gpus, Path(kept), slurm)
-    workers = options.workers or default_workers()
-    bound_threads(options.threads or max(1, usable_cores() // workers))
+    workers = options.workers or choose_num_workers()
+    limit_threads(options.threads or max(1, count_available_cores() // workers))
     return LocalEngine(workers)

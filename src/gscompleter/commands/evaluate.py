@@ -1,4 +1,4 @@
-"""The commands `evaluate`, `tables` and `index`."""
+"""The commands `evaluate`, `write_tables` and `index`."""
 
 from __future__ import annotations
 
@@ -13,33 +13,38 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.batch.shards import parse_shard
-from gscompleter.commands.engines import engine_for
+from gscompleter.commands.engines import make_engine
 from gscompleter.commands.options import (
     LONG_SIDE,
     EvaluateOptions,
     IndexOptions,
     Size,
     TablesOptions,
-    working_size,
+    parse_resolution,
 )
 from gscompleter.compilation import compile_kernels
 from gscompleter.data.cases import Case, read_cases
-from gscompleter.data.datasets import Skipped, open_clips, usable
+from gscompleter.data.datasets import SkippedScene, filter_usable, open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.framing import check_resolution
-from gscompleter.errors import InputError, quoted
-from gscompleter.progress import preparing, shown_on
+from gscompleter.errors import InputError, quote_value
+from gscompleter.progress import show_preparation, show_progress
 from gscompleter.render import choose_device
-from gscompleter.reports.evaluation_page import evaluation_page
+from gscompleter.reports.evaluation_page import render_evaluation_page
 from gscompleter.reports.page import write_page
-from gscompleter.reports.plots import PlotsNotAvailable, plots
-from gscompleter.reports.summary import Summary
-from gscompleter.reports.tables import score_cells, tables
-from gscompleter.runs.methods import methods_named
-from gscompleter.runs.protocols import ViewByView, index_of, parse_protocol, write_evaluation_index
+from gscompleter.reports.plots import PlotsNotAvailable, draw_plots
+from gscompleter.reports.summary import RunSummary
+from gscompleter.reports.tables import format_score_cells, write_tables
+from gscompleter.runs.methods import expand_methods
+from gscompleter.runs.protocols import (
+    ViewByView,
+    build_index,
+    parse_protocol,
+    write_evaluation_index,
+)
 from gscompleter.runs.runner import RunConfig, evaluate
-from gscompleter.runs.store import row_paths
-from gscompleter.runs.tasks import Task, task_of, tasks_of
+from gscompleter.runs.store import list_row_paths
+from gscompleter.runs.tasks import Task, make_case_task, make_tasks
 
 
 def run_evaluation(options: EvaluateOptions) -> None:
@@ -47,41 +52,41 @@ def run_evaluation(options: EvaluateOptions) -> None:
     if not options.paths:
         raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
-    methods = methods_named(options.methods)
+    methods = expand_methods(options.methods)
     shard = parse_shard(options.shard, os.environ)
     if options.resolution is not None:
-        check_resolution(working_size(options.resolution))
-    skipped: list[Skipped] = []
+        check_resolution(parse_resolution(options.resolution))
+    skipped: list[SkippedScene] = []
     notes: list[str] = []
     shown = None if options.quiet else console
-    with shown_on(shown), preparing("reading cases"):
-        tasks = chosen_tasks(options, skipped, notes)
+    with show_progress(shown), show_preparation("reading cases"):
+        tasks = collect_tasks(options, skipped, notes)
     for note in dict.fromkeys(notes):
         console.print(note, markup=False, soft_wrap=True)
-    tell_skipped(skipped, console)
+    print_skipped(skipped, console)
     config = RunConfig(
         reconstructor=options.reconstructor,
         weights=None if options.weights is None else str(options.weights),
         generator=options.synthesis.name,
-        generator_settings=options.synthesis.settings(),
+        generator_settings=options.synthesis.make_settings(),
         device=choose_device(options.device),
         seed=options.seed,
-        source=source_of(options),
+        source=describe_source(options),
     )
-    engine = engine_for(options, str(options.out.resolve()))
-    with shown_on(shown):
+    engine = make_engine(options, str(options.out.resolve()))
+    with show_progress(shown):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
         line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
         console.print(line)
         # A shard without cases has no tables.
         if counts.done + counts.failed + counts.skipped > 0:
-            show(options.out, options.quiet, num_rows=len(tasks) * len(methods))
+            write_and_print_tables(options.out, options.quiet, num_rows=len(tasks) * len(methods))
 
 
-def source_of(options: EvaluateOptions) -> dict[str, Any]:
+def describe_source(options: EvaluateOptions) -> dict[str, Any]:
     """Describe the cases, as an output folder records them."""
-    size = resolution_of(options) if options.protocol else options.resolution
+    size = get_resolution(options) if options.protocol else options.resolution
     return {
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
@@ -94,36 +99,38 @@ def source_of(options: EvaluateOptions) -> dict[str, Any]:
 
 def run_tables(options: TablesOptions) -> None:
     """Write the tables and plots of an evaluation, and print the tables."""
-    with shown_on(None if options.quiet else Console(stderr=True)):
-        show(options.out, options.quiet, options.fid)
+    with show_progress(None if options.quiet else Console(stderr=True)):
+        write_and_print_tables(options.out, options.quiet, options.fid)
 
 
-def show(out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0) -> None:
+def write_and_print_tables(
+    out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0
+) -> None:
     """Write the tables, plots and page of an evaluation, and print the tables unless `quiet`.
 
     It repeats this if other shards added rows meanwhile and all `num_rows` are there.
     """
-    seen, there = None, rows_there(out)
+    seen, there = None, list_row_times(out)
     while seen is None or (there != seen and len(there) >= num_rows):
         seen = there
-        with preparing("tables"):
-            summary = tables(out, with_fid)
-            draw(summary, out, quiet)
-            write_page(out, evaluation_page(out))
-        there = rows_there(out)
+        with show_preparation("tables"):
+            summary = write_tables(out, with_fid)
+            try_plots(summary, out, quiet)
+            write_page(out, render_evaluation_page(out))
+        there = list_row_times(out)
     if not quiet:
-        tell(summary, out)
+        print_tables(summary, out)
 
 
-def rows_there(out: Path) -> dict[Path, int]:
+def list_row_times(out: Path) -> dict[Path, int]:
     """Return the files of scores with their modification times."""
-    return {path: path.stat().st_mtime_ns for path in row_paths(out)}
+    return {path: path.stat().st_mtime_ns for path in list_row_paths(out)}
 
 
-def draw(summary: Summary, out: Path, quiet: bool) -> None:
+def try_plots(summary: RunSummary, out: Path, quiet: bool) -> None:
     """Draw the plots, or print the missing requirement."""
     try:
-        plots(summary, out)
+        draw_plots(summary, out)
     except PlotsNotAvailable as missing:
         if not quiet:
             Console(stderr=True).print(str(missing), highlight=False, markup=False)
@@ -133,14 +140,17 @@ def run_index(options: IndexOptions) -> None:
     """Write the evaluation index of a protocol for a data set."""
     if options.out.exists() and not options.overwrite:
         raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
-    skipped: list[Skipped] = []
+    skipped: list[SkippedScene] = []
     protocol = parse_protocol(options.protocol)
-    with shown_on(None if options.quiet else Console(stderr=True)), preparing("reading clips"):
-        index = index_of(protocol, usable(open_clips(options.path), skipped))
+    with (
+        show_progress(None if options.quiet else Console(stderr=True)),
+        show_preparation("reading clips"),
+    ):
+        index = build_index(protocol, filter_usable(open_clips(options.path), skipped))
     index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
     write_evaluation_index(options.out, index)
     console = Console(quiet=options.quiet, highlight=False)
-    tell_skipped(skipped, console)
+    print_skipped(skipped, console)
     targets = sum(len(split.targets) for splits in index.scenes.values() for split in splits)
     console.print(
         f"{targets} cases in {len(index.scenes)} scenes, {len(index.skipped)} scenes skipped: "
@@ -149,31 +159,33 @@ def run_index(options: IndexOptions) -> None:
     )
 
 
-def resolution_of(options: EvaluateOptions) -> Size:
+def get_resolution(options: EvaluateOptions) -> Size:
     """Return the working size of scenes."""
     return LONG_SIDE if options.resolution is None else options.resolution
 
 
-def chosen_tasks(options: EvaluateOptions, skipped: list[Skipped], notes: list[str]) -> list[Task]:
+def collect_tasks(
+    options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
+) -> list[Task]:
     """Collect the tasks of the options, and append to `skipped` and `notes`."""
     if not options.protocol:
-        files = [cases_file(path) for path in options.paths]
+        files = [find_cases_file(path) for path in options.paths]
         cases = [case for file in files for case in read_cases(file)]
         if options.one_per_scene:
-            cases = first_of_each_scene(cases)
+            cases = select_first_cases(cases)
         cases = cases[: options.limit]
-        notes += notes_of(cases)
+        notes += collect_scene_notes(cases)
         if options.resolution is not None:
-            size = working_size(options.resolution)
+            size = parse_resolution(options.resolution)
             cases = [replace(case, resolution=size) for case in cases]
         if options.use_masks:
             cases = [replace(case, ignore_masked=True) for case in cases]
         cases = [replace(case, ego_mask=options.ego_mask) for case in cases]
-        return [task_of(case) for case in cases]
-    return list(islice(tasks_in_clips(options, skipped, notes), options.limit))
+        return [make_case_task(case) for case in cases]
+    return list(islice(iterate_tasks(options, skipped, notes), options.limit))
 
 
-def first_of_each_scene(cases: Sequence[Case]) -> list[Case]:
+def select_first_cases(cases: Sequence[Case]) -> list[Case]:
     """Select the first case of each scene."""
     first: dict[Path, Case] = {}
     for case in cases:
@@ -181,7 +193,7 @@ def first_of_each_scene(cases: Sequence[Case]) -> list[Case]:
     return list(first.values())
 
 
-def notes_of(cases: Sequence[Case]) -> Iterator[str]:
+def collect_scene_notes(cases: Sequence[Case]) -> Iterator[str]:
     """Collect the notes on the scenes of cases. Scenes that cannot be opened have none."""
     for scene in dict.fromkeys(case.scene for case in cases):
         try:
@@ -190,33 +202,33 @@ def notes_of(cases: Sequence[Case]) -> Iterator[str]:
             continue
 
 
-def tasks_in_clips(
-    options: EvaluateOptions, skipped: list[Skipped], notes: list[str]
+def iterate_tasks(
+    options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
 ) -> Iterator[Task]:
     """Iterate over the tasks of the protocols, clip by clip."""
     protocols = [parse_protocol(text) for text in options.protocol]
     for path in options.paths:
-        for clip in usable(open_clips(path), skipped):
+        for clip in filter_usable(open_clips(path), skipped):
             notes += clip.notes
             if options.use_masks and not clip.has_masks:
                 raise InputError(
                     f"{clip.name} has neither masks nor boxes of moving objects; leave --use-masks "
                     "out."
                 )
-            clip = clip if options.ego_mask else clip.with_ego_vehicle()
+            clip = clip if options.ego_mask else clip.keep_ego_vehicle()
             for protocol in protocols:
-                if isinstance(protocol, ViewByView) and (reason := protocol.reason_to_skip(clip)):
-                    skipped.append(Skipped(clip.name, reason))
-                size = working_size(resolution_of(options))
-                tasks = tasks_of(protocol, clip, size, options.use_masks)
+                if isinstance(protocol, ViewByView) and (reason := protocol.explain_skip(clip)):
+                    skipped.append(SkippedScene(clip.name, reason))
+                size = parse_resolution(get_resolution(options))
+                tasks = make_tasks(protocol, clip, size, options.use_masks)
                 yield from tasks[:1] if options.one_per_scene else tasks
 
 
-def cases_file(path: Path) -> Path:
+def find_cases_file(path: Path) -> Path:
     """Find the cases.json that `path` is or contains."""
     if not os.path.exists(path):
         raise InputError(
-            f"There is no '{quoted(path)}'; name a cases.json, or scenes with --protocol."
+            f"There is no '{quote_value(path)}'; name a cases.json, or scenes with --protocol."
         )
     file = path / "cases.json" if os.path.isdir(path) else path
     if file.suffix != ".json" or not os.path.isfile(file) or file.name == "transforms.json":
@@ -226,24 +238,26 @@ def cases_file(path: Path) -> Path:
     return file
 
 
-def tell_skipped(skipped: Sequence[Skipped], console: Console) -> None:
+def print_skipped(skipped: Sequence[SkippedScene], console: Console) -> None:
     """Print the skipped clips with the reasons."""
     for clip in skipped:
         console.print(f"Skipped {clip.name}: {clip.reason}.")
 
 
-def tell(summary: Summary, out: Path) -> None:
+def print_tables(summary: RunSummary, out: Path) -> None:
     """Print the tables, transposed: one column per method."""
     table = Table("", *summary.methods, box=None)
-    columns = summary.present(summary.columns)
-    cells = score_cells(summary, columns)
+    columns = summary.find_present_columns(summary.columns)
+    cells = format_score_cells(summary, columns)
     for number, column in enumerate(columns, start=1):
         table.add_row(column.title, *(row[number] for row in cells))
-    if summary.common:
-        table.add_row("seconds", *(f"{summary.seconds(m)['total']:.1f}" for m in summary.methods))
+    if summary.common_tasks:
+        table.add_row(
+            "seconds", *(f"{summary.compute_seconds(m)['total']:.1f}" for m in summary.methods)
+        )
     console = Console(highlight=False)
     console.print(table)
     for case, method, reason in summary.failures:
         console.print(f"Failed: {case}, {method}: {reason}", markup=False)
-    over = f"Over {len(summary.common)} of {len(summary.tasks)} cases"
+    over = f"Over {len(summary.common_tasks)} of {len(summary.tasks)} cases"
     console.print(f"{over}: {out / 'tables.md'}", soft_wrap=True)

@@ -10,16 +10,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.commands.opening import Opened, Task, usable_cameras
-from gscompleter.commands.options import CompleteOptions, most, working_size
-from gscompleter.completer import check_numbers
-from gscompleter.data.origin import frame_from_photographs
+from gscompleter.commands.opening import Opened, Task, collect_usable_cameras
+from gscompleter.commands.options import CompleteOptions, get_max_targets, parse_resolution
+from gscompleter.completer import check_target_ids
+from gscompleter.data.origin import compute_frame_from_photographs
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import quoted
-from gscompleter.explorer import Explorer
-from gscompleter.frames.similarity import moved_camera, moved_exactly
-from gscompleter.io.files import TARGETS
-from gscompleter.metrics.coverage import Look, held_out_cameras, looks_of
+from gscompleter.errors import quote_value
+from gscompleter.explorer import ViewPlanner
+from gscompleter.frames.similarity import transform_camera, transform_camera_exactly
+from gscompleter.io.files import TARGETS_FILE
+from gscompleter.metrics.coverage import RenderPair, render_pairs, sample_held_out_cameras
 from gscompleter.reports.completion import Target
 from gscompleter.stages.exploration import Choice
 from gscompleter.types import Camera, Completion
@@ -41,63 +41,67 @@ class Plan:
     context_seconds: float
 
 
-def cameras_of(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:
+def collect_cameras(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:
     """Return the cameras of all usable photographs by frame, in the frame of the result."""
     given = opened.photographs
-    transform = task.frame @ frame_from_photographs(-given.origin)
+    transform = task.frame @ compute_frame_from_photographs(-given.origin)
     known, device = task.views[0].camera, task.views[0].image.device
-    cameras = usable_cameras(given, range(len(given)), working_size(options.resolution))
-    moved = {f: moved_camera(camera, transform).to(device) for f, camera in cameras.items()}
+    cameras = collect_usable_cameras(given, range(len(given)), parse_resolution(options.resolution))
+    moved = {f: transform_camera(camera, transform).to(device) for f, camera in cameras.items()}
     return {f: replace(c, near=known.near, far=known.far) for f, c in moved.items()}
 
 
-def completed(
-    options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: Explorer
+def complete_targets(
+    options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: ViewPlanner
 ) -> tuple[Completion, Task]:
     """Complete the scene for the targets of `task`, or for targets that it finds."""
     completer = explorer.completer
     if task.targets:
         targets = [target.camera.to(task.views[0].image.device) for target in task.targets]
-        return completer(task.views, targets, task.scene, task.witnesses), task
-    check_numbers(task.scene, most(options))
-    begun = completer.begin(task.views, task.scene, task.witnesses)
-    completion, choices = explorer.explore(begun, list(cameras.values()), most(options))
-    return completion, replace(task, targets=targets_of(choices, list(cameras)))
+        return completer(task.views, targets, task.scene, task.check_views), task
+    check_target_ids(task.scene, get_max_targets(options))
+    begun = completer.begin(task.views, task.scene, task.check_views)
+    completion, choices = explorer.explore(begun, list(cameras.values()), get_max_targets(options))
+    return completion, replace(task, targets=make_targets(choices, list(cameras)))
 
 
-def planned(
-    options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: Explorer
+def plan_completion(
+    options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: ViewPlanner
 ) -> Plan:
     """Plan the completion without running it."""
-    begun = explorer.completer.begin(task.views, task.scene, task.witnesses)
+    begun = explorer.completer.begin(task.views, task.scene, task.check_views)
     if task.targets:
         targets = [target.camera.to(task.views[0].image.device) for target in task.targets]
-        holes = explorer.holes(begun, targets)
+        holes = explorer.compute_hole_fractions(begun, targets)
     else:
-        choices = explorer.plan(begun, list(cameras.values()), most(options))
-        task = replace(task, targets=targets_of(choices, list(cameras)))
-        holes = [choice.hole for choice in choices]
-    return Plan(task, tuple(holes), seconds_of(options, begun), begun.seconds["context"])
+        choices = explorer.plan(begun, list(cameras.values()), get_max_targets(options))
+        task = replace(task, targets=make_targets(choices, list(cameras)))
+        holes = [choice.hole_fraction for choice in choices]
+    return Plan(
+        task, tuple(holes), estimate_target_seconds(options, begun), begun.seconds["context"]
+    )
 
 
-def seconds_of(options: CompleteOptions, begun: Completion) -> float | None:
+def estimate_target_seconds(options: CompleteOptions, begun: Completion) -> float | None:
     """Estimate the seconds per target from the context's, or return None if unknown."""
     if options.scene is not None or options.synthesis.name != "warp-inpaint":
         return None
     return LIFTED_VIEWS * begun.seconds["context"] / len(begun.views)
 
 
-def tell_plan(options: CompleteOptions, plan: Plan) -> None:
+def print_plan(options: CompleteOptions, plan: Plan) -> None:
     """Print the targets, their holes and the estimated time."""
     table = Table("camera", "hole", box=None)
     for number, (target, hole) in enumerate(zip(plan.task.targets, plan.holes, strict=True)):
-        table.add_row(f"{number + 1}: {name_of(target.frame, target.near)}", f"{100 * hole:.1f} %")
+        table.add_row(
+            f"{number + 1}: {name_target(target.frame, target.derived_from)}", f"{100 * hole:.1f} %"
+        )
     console = Console(highlight=False)
     console.print(table)
-    console.print(sentence_of(plan, options.out), soft_wrap=True)
+    console.print(describe_plan(plan, options.out), soft_wrap=True)
 
 
-def sentence_of(plan: Plan, out: Path) -> str:
+def describe_plan(plan: Plan, out: Path) -> str:
     """Write the sentence on the number of targets and the estimated time."""
     number = len(plan.holes)
     if number == 0:
@@ -109,19 +113,19 @@ def sentence_of(plan: Plan, out: Path) -> str:
             f"({plan.context_seconds:.0f} s)"
         )
     counted = "1 camera" if number == 1 else f"{number} cameras"
-    return f"To complete: {counted}, {duration}. Edit the cameras in {quoted(out / TARGETS)}."
+    return f"To complete: {counted}, {duration}. Edit the cameras in {quote_value(out / TARGETS_FILE)}."
 
 
-def name_of(frame: int | None, near: int | None) -> str:
+def name_target(frame: int | None, near: int | None) -> str:
     """Name a target for tables."""
     if near is not None:
         return f"target near {near}"
     return "target" if frame is None else f"target {frame}"
 
 
-def targets_of(choices: Iterable[Choice], frames: Sequence[int]) -> list[Target]:
+def make_targets(choices: Iterable[Choice], frames: Sequence[int]) -> list[Target]:
     """Turn chosen candidates into targets."""
-    return [Target(c.camera, near=frames[c.candidate.base]) for c in choices]
+    return [Target(c.camera, derived_from=frames[c.candidate.base]) for c in choices]
 
 
 def write_targets(folder: Path, task: Task) -> None:
@@ -129,12 +133,17 @@ def write_targets(folder: Path, task: Task) -> None:
     if not task.targets:
         return
     back = np.linalg.inv(task.frame)
-    write_cameras(folder / TARGETS, [moved_exactly(t.camera, back) for t in task.targets])
+    write_cameras(
+        folder / TARGETS_FILE, [transform_camera_exactly(t.camera, back) for t in task.targets]
+    )
 
 
-def looks_around(
-    options: CompleteOptions, completion: Completion, cameras: Iterable[Camera], explorer: Explorer
-) -> list[Look]:
+def render_looks_around(
+    options: CompleteOptions,
+    completion: Completion,
+    cameras: Iterable[Camera],
+    explorer: ViewPlanner,
+) -> list[RenderPair]:
     """Render the scene before and after at cameras around the photographs."""
-    aside = held_out_cameras(list(cameras), options.seed)
-    return looks_of(completion, aside, explorer.completer.renderer)
+    aside = sample_held_out_cameras(list(cameras), options.seed)
+    return render_pairs(completion, aside, explorer.completer.renderer)

@@ -8,28 +8,28 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from gscompleter.batch.places import is_address, store_of
-from gscompleter.errors import InputError, quoted
+from gscompleter.batch.places import is_address, open_store
+from gscompleter.errors import InputError, quote_value
 
 
 @contextmanager
-def fetched(options: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def download_inputs(options: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Replace addresses in the options of a row by downloaded files, inside the block."""
     with TemporaryDirectory(prefix="gscompleter-") as folder:
-        yield {key: local(value, Path(folder) / key) for key, value in options.items()}
+        yield {key: download_value(value, Path(folder) / key) for key, value in options.items()}
 
 
-def local(value: Any, folder: Path) -> Any:
+def download_value(value: Any, folder: Path) -> Any:
     """Download a value if it is an address."""
     if isinstance(value, list):
-        return [local(item, folder / str(number)) for number, item in enumerate(value)]
+        return [download_value(item, folder / str(number)) for number, item in enumerate(value)]
     if not isinstance(value, str) or not is_address(value):
         return value
-    store, path = store_of(value), folder / value.rstrip("/").rsplit("/", 1)[-1]
+    store, path = open_store(value), folder / value.rstrip("/").rsplit("/", 1)[-1]
     try:
         found = store.isdir(value), store.isfile(value)
         if not any(found):
-            raise InputError(f"There is nothing at {quoted(value)}; correct the address.")
+            raise InputError(f"There is nothing at {quote_value(value)}; correct the address.")
         path.parent.mkdir(parents=True, exist_ok=True)
         store.get(value.rstrip("/") + ("/" if found[0] else ""), str(path), recursive=found[0])
     except OSError as error:

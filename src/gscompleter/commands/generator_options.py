@@ -13,8 +13,8 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from gscompleter.config.generators import GENERATORS, GeneratorSettings, settings_class
-from gscompleter.errors import InputError, quoted
+from gscompleter.config.generators import GENERATORS, GeneratorSettings, get_settings_class
+from gscompleter.errors import InputError, quote_value
 
 PREFIX = "generator_"
 DEFAULT = "warp-inpaint"
@@ -27,37 +27,39 @@ class GeneratorOptions:
     name: str = DEFAULT
     given: Mapping[str, Any] = field(default_factory=dict)
 
-    def settings(self) -> GeneratorSettings:
+    def make_settings(self) -> GeneratorSettings:
         """Return the settings, or raise InputError if one is unknown to the generator."""
-        kind = settings_class(self.name)
+        kind = get_settings_class(self.name)
         for setting, value in self.given.items():
             knowing = [name for name, kind in GENERATORS.items() if hasattr(kind, setting)]
             if self.name not in knowing:
                 raise InputError(
-                    f"The generator {self.name!r} has no setting {setting} ({quoted(value)}); "
+                    f"The generator {self.name!r} has no setting {setting} ({quote_value(value)}); "
                     f"leave it out, or choose {' or '.join(knowing)}.",
                     PREFIX + setting,
                 )
         return kind(**self.given)
 
-    def as_summary(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Describe the generator for `summary.json`."""
-        settings = asdict(self.settings())
+        settings = asdict(self.make_settings())
         return {"generator": self.name, **{PREFIX + name: settings[name] for name in settings}}
 
 
-def generator_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
+def make_generator_spec(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Tell tyro to read GeneratorOptions as the union of all generators' settings."""
     if info.type is not GeneratorOptions:
         return None
     known: dict[str, list[tuple[str, StructFieldSpec]]] = {}
     for name, kind in GENERATORS.items():
-        for spec in specs_of(kind):
+        for spec in get_fields(kind):
             known.setdefault(spec.name, []).append((name, spec))
-    return StructConstructorSpec(options_from, (generator_field(), *map(flag, known.values())))
+    return StructConstructorSpec(
+        make_generator_options, (make_generator_field(), *map(merge_fields, known.values()))
+    )
 
 
-def generator_field() -> StructFieldSpec:
+def make_generator_field() -> StructFieldSpec:
     """Return the option `--generator`."""
     kinds = "; ".join(
         f"{name}: {(kind.__doc__ or '').rstrip('.')}" for name, kind in GENERATORS.items()
@@ -66,14 +68,14 @@ def generator_field() -> StructFieldSpec:
     return StructFieldSpec("generator", str, DEFAULT, sentence)
 
 
-def specs_of(kind: type[GeneratorSettings]) -> tuple[StructFieldSpec, ...]:
+def get_fields(kind: type[GeneratorSettings]) -> tuple[StructFieldSpec, ...]:
     """Return the fields of a class of settings."""
     spec = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(kind, kind(), False))
     assert isinstance(spec, StructConstructorSpec)
     return spec.fields
 
 
-def flag(known: Sequence[tuple[str, StructFieldSpec]]) -> StructFieldSpec:
+def merge_fields(known: Sequence[tuple[str, StructFieldSpec]]) -> StructFieldSpec:
     """Merge the fields of several generators with one name into one optional option."""
     first = known[0][1]
     sentences: dict[str, list[str]] = {}
@@ -90,7 +92,7 @@ def flag(known: Sequence[tuple[str, StructFieldSpec]]) -> StructFieldSpec:
     )
 
 
-def options_from(generator: str, **values: Any) -> GeneratorOptions:
+def make_generator_options(generator: str, **values: Any) -> GeneratorOptions:
     """Create the options from those values that were given."""
     given = {
         name.removeprefix(PREFIX): value

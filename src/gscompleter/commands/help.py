@@ -17,7 +17,7 @@ from tyro.constructors import (
 )
 
 from gscompleter.commands.batch import BatchOptions
-from gscompleter.commands.generator_options import GeneratorOptions, generator_field
+from gscompleter.commands.generator_options import GeneratorOptions, make_generator_field
 from gscompleter.commands.options import (
     BenchOptions,
     CleanOptions,
@@ -71,7 +71,7 @@ def asks_for_help(words: Sequence[str]) -> bool:
     return any(word in (*HELP, HELP_ALL) for word in words)
 
 
-def rule_for_help(show_all: bool) -> Rule:
+def make_help_rule(show_all: bool) -> Rule:
     """Return a rule by which tyro writes help pages. No option can be parsed with it."""
     entered: list[type] = []
 
@@ -84,8 +84,12 @@ def rule_for_help(show_all: bool) -> Rule:
         entered.remove(kind)
         if not isinstance(spec, StructConstructorSpec):
             return None
-        fields = spec.fields if show_all or kind not in COMMON else common_fields(kind, spec.fields)
-        return replace(spec, fields=tuple(map(tidy, fields)))
+        fields = (
+            spec.fields
+            if show_all or kind not in COMMON
+            else select_common_fields(kind, spec.fields)
+        )
+        return replace(spec, fields=tuple(map(tidy_field, fields)))
 
     return rule
 
@@ -97,21 +101,21 @@ def is_shown(kind: Any) -> bool:
     return issubclass(kind, (Settings, GeneratorOptions))
 
 
-def common_fields(kind: type, fields: Sequence[StructFieldSpec]) -> list[StructFieldSpec]:
+def select_common_fields(kind: type, fields: Sequence[StructFieldSpec]) -> list[StructFieldSpec]:
     """Select the common fields of a command; groups of settings become one option."""
     by_name = {field.name: field for field in fields}
     chosen = [by_name[name] for name in COMMON[kind]]
-    return [*map(in_one_option, chosen), ALL]
+    return [*map(collapse_group, chosen), ALL]
 
 
-def in_one_option(field: StructFieldSpec) -> StructFieldSpec:
+def collapse_group(field: StructFieldSpec) -> StructFieldSpec:
     """Replace a group of settings by the option that selects all of them."""
     if isinstance(field.default, CompleterConfig):
         return CONFIG
-    return generator_field() if isinstance(field.default, GeneratorOptions) else field
+    return make_generator_field() if isinstance(field.default, GeneratorOptions) else field
 
 
-def metavar_of(kind: Any) -> str:
+def format_metavar(kind: Any) -> str:
     """Return the placeholder for the value of an option that may be left out."""
     kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     parts = [part for part in get_args(kind) if part is not NoneType]
@@ -119,12 +123,12 @@ def metavar_of(kind: Any) -> str:
         return "|".join(map(str, parts))
     if get_origin(kind) is tuple:
         several = parts[-1] is Ellipsis
-        one = metavar_of(parts[0])
-        return f"{one} [{one} ...]" if several else " ".join(map(metavar_of, parts))
-    return "|".join(map(metavar_of, parts)) if parts else METAVARS[kind]
+        one = format_metavar(parts[0])
+        return f"{one} [{one} ...]" if several else " ".join(map(format_metavar, parts))
+    return "|".join(map(format_metavar, parts)) if parts else METAVARS[kind]
 
 
-def tidy(field: StructFieldSpec) -> StructFieldSpec:
+def tidy_field(field: StructFieldSpec) -> StructFieldSpec:
     """Join the lines of a help text, and hide a default that says nothing."""
     given = field.helptext
 
@@ -134,7 +138,7 @@ def tidy(field: StructFieldSpec) -> StructFieldSpec:
 
     kind: Any = field.type
     if field.default is None:
-        kind = Annotated[kind, tyro.conf.arg(metavar=metavar_of(kind))]
+        kind = Annotated[kind, tyro.conf.arg(metavar=format_metavar(kind))]
     if field.default is None or field.default is False or field.default == ():
         kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
     return replace(field, helptext=text, type=kind)

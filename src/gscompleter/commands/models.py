@@ -11,44 +11,48 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.commands.options import ModelsOptions
-from gscompleter.weights.fetching import INSTALL, cached, hub_is_installed, place_of
+from gscompleter.weights.fetching import INSTALL, find_cached, get_cache_path, is_hub_installed
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
-WIDEST = 1000
+MAX_LINE_WIDTH = 1000
 
 
 def run_models(options: ModelsOptions) -> None:
     """Print the published weights and their location on this machine."""
-    found = {name: cached(weights) for name, weights in PUBLISHED.items()}
+    found = {name: find_cached(weights) for name, weights in PUBLISHED.items()}
     if options.json:
         print(
-            json.dumps([as_json(PUBLISHED[name], path) for name, path in found.items()], indent=2)
+            json.dumps(
+                [describe_weights(PUBLISHED[name], path) for name, path in found.items()], indent=2
+            )
         )
     else:
-        tell(found)
+        print_models(found)
 
 
-def as_json(weights: PublishedWeights, path: Path | None) -> dict[str, object]:
+def describe_weights(weights: PublishedWeights, path: Path | None) -> dict[str, object]:
     """Describe weights and their location."""
     return {
         **asdict(weights),
         "url": weights.url,
-        "pinned_by": weights.pinned_by,
+        "pinned_by": weights.integrity_check,
         "cached": None if path is None else str(path),
-        "place": str(place_of(weights)),
+        "place": str(get_cache_path(weights)),
     }
 
 
-def tell(found: dict[str, Path | None]) -> None:
+def print_models(found: dict[str, Path | None]) -> None:
     """Print the table and its footnotes."""
     table = Table(box=None)
     for title in ("name", "model", "parameters", "views", "size", "code / weights", "cached"):
         table.add_column(title, no_wrap=title == "name")
     table.add_column("source", overflow="fold")
     for name, path in found.items():
-        table.add_row(*cells(PUBLISHED[name], path))
+        table.add_row(*format_cells(PUBLISHED[name], path))
     # Rows are not wrapped in a file or a pipe.
-    console = Console(width=None if sys.stdout.isatty() else WIDEST, markup=False, highlight=False)
+    console = Console(
+        width=None if sys.stdout.isatty() else MAX_LINE_WIDTH, markup=False, highlight=False
+    )
     console.print(table)
     cautions: dict[str, list[str]] = {}
     for weights in PUBLISHED.values():
@@ -57,11 +61,11 @@ def tell(found: dict[str, Path | None]) -> None:
     print("\n(!) Whether commercial use is allowed is unclear:")
     for caution, names in cautions.items():
         print(f"    {', '.join(names)}: {caution}.")
-    if not hub_is_installed():
+    if not is_hub_installed():
         print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")
 
 
-def cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:
+def format_cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:
     """Format a row of the table."""
     fewest, most = weights.views
     count = weights.parameters

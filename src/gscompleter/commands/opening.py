@@ -15,51 +15,60 @@ from jaxtyping import Bool, Float, Int64
 from rich.console import Console
 from torch import Tensor
 
-from gscompleter.commands.options import CompleteOptions, SceneOptions, most, working_size
-from gscompleter.completer import ranged
-from gscompleter.data.formats import open_photographs, recognised, refuse_scenes_below
+from gscompleter.commands.options import (
+    CompleteOptions,
+    SceneOptions,
+    get_max_targets,
+    parse_resolution,
+)
+from gscompleter.completer import set_depth_range
+from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.framing import Resolution
-from gscompleter.data.origin import frame_from_photographs, origin_of, told_from
+from gscompleter.data.origin import (
+    choose_scene_origin,
+    compute_frame_from_photographs,
+    shift_to_origin,
+)
 from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import load_cameras
-from gscompleter.data.sparse_points import with_depth_range
-from gscompleter.data.structure_from_motion import POSES, find_poses, holds_photographs
-from gscompleter.errors import InputError, numbers_listed, quoted
-from gscompleter.frames.beside import GivenSplat
-from gscompleter.frames.placing import frame_of_splat
-from gscompleter.frames.similarity import moved_camera, moved_view
-from gscompleter.io.files import SUMMARY
-from gscompleter.io.ply import drawable_rows
+from gscompleter.data.sparse_points import add_depth_range
+from gscompleter.data.structure_from_motion import POSES, find_poses, has_photographs
+from gscompleter.errors import InputError, join_numbers, quote_value
+from gscompleter.frames.beside import InputSplat
+from gscompleter.frames.placing import align_splat
+from gscompleter.frames.similarity import transform_camera, transform_view
+from gscompleter.io.files import SUMMARY_FILE
+from gscompleter.io.ply import find_finite_rows
 from gscompleter.matching.depth_range import estimate_depth_range
 from gscompleter.memory import (
     check_memory,
     check_scene_memory,
-    images_that_fit,
-    needed_bytes,
-    scene_bytes,
+    count_fitting_images,
+    estimate_bytes,
+    estimate_scene_bytes,
 )
 from gscompleter.render import Renderer, load_renderer
-from gscompleter.reports.completion import Brought, Target
+from gscompleter.reports.completion import InputSplatFile, Target
 from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
-from gscompleter.splats.formats import format_of
-from gscompleter.stages.candidates import spread_cameras
-from gscompleter.stages.context import working_range
-from gscompleter.stages.overview import overview, select_overview
-from gscompleter.stages.selection import points_before, select_context
+from gscompleter.splats.formats import detect_splat_format
+from gscompleter.stages.candidates import select_spread_cameras
+from gscompleter.stages.context import find_depth_range
+from gscompleter.stages.overview import select_overview, summarize_cameras
+from gscompleter.stages.selection import make_points_in_front, select_context
 from gscompleter.types import Camera, Gaussians, View
 
-MIN_SIZE = 16
+MIN_IMAGE_SIZE = 16
 """Smallest side of an image, in pixels."""
-SPLATS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
+SPLAT_EXTENSIONS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
 MAX_DIGITS = 9
-CHOSEN, CHOSEN_WITH_SCENE = 3, 8
+NUM_CONTEXT, NUM_CONTEXT_WITH_SPLAT = 3, 8
 """Number of context photographs if none are named, without and with an input splat."""
-CHOSEN_FOR_ALL = 8
+NUM_CONTEXT_FOR_ALL = 8
 """Number of context photographs if no target is named either."""
-WITNESSES, WITNESS_SIDE = 6, 320
+NUM_DEPTH_VIEWS, CHECK_VIEW_SIZE = 6, 320
 """Photographs for depth range estimation, and the longer side of these and of check views."""
-MAX_WITNESSES = 40
+MAX_CHECK_VIEWS = 40
 """Most check views of an input splat, in addition to the context."""
 
 
@@ -69,12 +78,12 @@ class Opened:
 
     photographs: Photographs
     format: str
-    number: int
+    num_photographs: int
     """Number of photographs, with those whose camera was not found."""
 
-    def with_ego_vehicle(self) -> Opened:
+    def keep_ego_vehicle(self) -> Opened:
         """Return a copy that does not mask the vehicle that carries the camera."""
-        return replace(self, photographs=self.photographs.with_ego_vehicle())
+        return replace(self, photographs=self.photographs.keep_ego_vehicle())
 
 
 @dataclass(frozen=True)
@@ -83,7 +92,7 @@ class ContextBudget:
 
     usable: int
     wanted: int
-    allowed: int
+    limit: int
     """The default number, limited by memory but never below the minimum."""
 
 
@@ -108,11 +117,11 @@ class Task:
     depths: DepthSource
     scene: Gaussians | None = None
     """Input splat, or None to reconstruct the context."""
-    brought: Brought | None = None
+    splat_file: InputSplatFile | None = None
     method: str = "given"
-    said: str = "the frame of the photographs"
+    frame_description: str = "the frame of the photographs"
     """Description of `method` for the user."""
-    witnesses: Sequence[View] | None = None
+    check_views: Sequence[View] | None = None
     """Check views of the input splat, at low resolution."""
     budget: ContextBudget | None = None
     """Number of context photographs, or None if they are named."""
@@ -122,15 +131,15 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     """Open the photographs. If they have no cameras, find them and keep them in OUT."""
     folder, poses, number = options.folder, options.out / POSES, None
     refuse_splat(folder)
-    if options.format is None and holds_photographs(folder) and recognised(folder) is None:
+    if options.format is None and has_photographs(folder) and find_format(folder) is None:
         refuse_other_exports(folder)
         refuse_scenes_below(folder)
-        ours = options.overwrite or os.path.isfile(poses / SUMMARY)
+        ours = options.overwrite or os.path.isfile(poses / SUMMARY_FILE)
         found = find_poses(folder, poses, overwrite=ours)
-        say(console, *found.notes)
+        print_lines(console, *found.notes)
         folder, number = poses, found.photographs
     given = open_photographs(folder, options.format, options.near, options.far)
-    say(console, *given.notes)
+    print_lines(console, *given.notes)
     assert given.format is not None
     if number is None:
         return Opened(given, given.format, len(given))
@@ -139,9 +148,9 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
 
 def refuse_splat(path: Path) -> None:
     """Refuse a file of Gaussians given as the folder of photographs."""
-    if not os.path.isdir(path) and path.name.lower().endswith(SPLATS):
+    if not os.path.isdir(path) and path.name.lower().endswith(SPLAT_EXTENSIONS):
         raise InputError(
-            f"{quoted(path, 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
+            f"{quote_value(path, 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
             "be the folder of its photographs, with or without cameras."
         )
 
@@ -151,25 +160,25 @@ def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
     given = opened.photographs
     targets = read_targets(given, options)
     if options.context:
-        return task_of(options, given, options.context, targets, device, check_sizes)
-    frames, budget = chosen_context(options, given, targets)
-    task = task_of(options, given, frames, targets, device, check_sizes)
+        return make_opened_task(options, given, options.context, targets, device, check_sizes)
+    frames, budget = choose_context(options, given, targets)
+    task = make_opened_task(options, given, frames, targets, device, check_sizes)
     return replace(task, budget=budget)
 
 
 def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task:
     """Read the named photographs, or all."""
-    given, resolution = opened.photographs, working_size(options.resolution)
-    frames = options.context or tuple(usable_cameras(given, range(len(given)), resolution))
+    given, resolution = opened.photographs, parse_resolution(options.resolution)
+    frames = options.context or tuple(collect_usable_cameras(given, range(len(given)), resolution))
     if not frames:
         raise InputError(
-            f"No photograph of {quoted(options.folder)} can be used; name the folder that the "
+            f"No photograph of {quote_value(options.folder)} can be used; name the folder that the "
             "splat was trained on."
         )
-    return task_of(options, given, frames, (), device, check_sides)
+    return make_opened_task(options, given, frames, (), device, check_sides)
 
 
-def task_of(
+def make_opened_task(
     options: SceneOptions,
     given: Photographs,
     frames: Sequence[int],
@@ -178,18 +187,18 @@ def task_of(
     check: Callable[[Sequence[Camera]], None],
 ) -> Task:
     """Read the photographs of `frames`, in ascending order, once the cameras pass `check`."""
-    frames, resolution = sorted(frames), working_size(options.resolution)
-    bounded = with_depth_range(given, frames, resolution)
-    targets = [replace(t, camera=with_planes(t.camera, bounded)) for t in targets]
+    frames, resolution = sorted(frames), parse_resolution(options.resolution)
+    bounded = add_depth_range(given, frames, resolution)
+    targets = [replace(t, camera=copy_depth_range(t.camera, bounded)) for t in targets]
     cameras = [bounded.camera(frame, resolution) for frame in frames]
     check([*cameras, *(target.camera for target in targets)])
     views = [view.to(device) for view in bounded.views(frames, resolution)]
-    targets = [with_photograph(target, bounded, resolution) for target in targets]
-    depths = depth_source(options, given, bounded)
-    return Task(views, targets, frame_from_photographs(given.origin), given.origin, depths)
+    targets = [add_photograph(target, bounded, resolution) for target in targets]
+    depths = find_depth_source(options, given, bounded)
+    return Task(views, targets, compute_frame_from_photographs(given.origin), given.origin, depths)
 
 
-def in_frame_of_splat(
+def move_to_splat(
     task: Task,
     scene: Gaussians,
     path: Path,
@@ -203,62 +212,68 @@ def in_frame_of_splat(
     """
     given, device = opened.photographs, task.views[0].image.device
     cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
-    origin = origin_of(scene, given.origin)
-    scene = told_from(origin, scene, cameras).to(device)
-    splat = GivenSplat(path, scene, origin, options.folder)
+    origin = choose_scene_origin(scene, given.origin)
+    scene = shift_to_origin(origin, scene, cameras).to(device)
+    splat = InputSplat(path, scene, origin, options.folder)
     frames = [view.frame for view in task.views if view.frame is not None]
-    found = frame_of_splat(splat, given, frames, load_renderer(device.type))
+    found = align_splat(splat, given, frames, load_renderer(device.type))
     return replace(
         task,
-        views=[moved_view(view, found.transform) for view in task.views],
-        targets=[replace(t, camera=moved_camera(t.camera, found.transform)) for t in task.targets],
+        views=[transform_view(view, found.transform) for view in task.views],
+        targets=[
+            replace(t, camera=transform_camera(t.camera, found.transform)) for t in task.targets
+        ],
         frame=found.transform @ task.frame,
         origin=given.origin if found.method == "given" else origin,
         scene=scene,
-        brought=Brought(path, rows_kept(path) if options.drop_nonfinite else None, order),
+        splat_file=InputSplatFile(
+            path, mask_drawable_rows(path) if options.drop_nonfinite else None, order
+        ),
         method=found.method,
-        said=found.sentence(),
-        witnesses=[moved_view(view, found.transform) for view in task.witnesses or ()],
+        frame_description=found.describe(),
+        check_views=[transform_view(view, found.transform) for view in task.check_views or ()],
     )
 
 
-def with_witnesses(task: Task, given: Photographs) -> Task:
+def add_check_views(task: Task, given: Photographs) -> Task:
     """Add check views: unused photographs near the targets and all around."""
     used = {view.frame for view in task.views} | {target.frame for target in task.targets}
     others = [frame for frame in range(len(given)) if frame not in used]
-    cameras = usable_cameras(given, others, WITNESS_SIDE)
+    cameras = collect_usable_cameras(given, others, CHECK_VIEW_SIZE)
     wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
     views = []
-    for frame in near_and_far(wanted, cameras, MAX_WITNESSES):
+    for frame in select_near_and_far(wanted, cameras, MAX_CHECK_VIEWS):
         with suppress(InputError):
-            views += given.views([frame], WITNESS_SIDE)
-    return replace(task, witnesses=[view.to(task.views[0].image.device) for view in views])
+            views += given.views([frame], CHECK_VIEW_SIZE)
+    return replace(task, check_views=[view.to(task.views[0].image.device) for view in views])
 
 
-def near_and_far(wanted: Sequence[Camera], cameras: Mapping[int, Camera], count: int) -> list[int]:
+def select_near_and_far(
+    wanted: Sequence[Camera], cameras: Mapping[int, Camera], count: int
+) -> list[int]:
     """Select up to `count` frames: half nearest to `wanted`, the others spread over the rest."""
-    near = closest(wanted, cameras, count if len(cameras) <= count else count // 2)
+    near = select_closest(wanted, cameras, count if len(cameras) <= count else count // 2)
     rest = [frame for frame in cameras if frame not in near]
     if not rest:
         return near
-    far = spread_cameras([cameras[frame] for frame in rest], count - len(near))
+    far = select_spread_cameras([cameras[frame] for frame in rest], count - len(near))
     return sorted([*near, *(rest[i] for i in far)])
 
 
-def with_working_range(task: Task, renderer: Renderer) -> Task:
+def apply_working_range(task: Task, renderer: Renderer) -> Task:
     """Set the depth range of the photographs."""
-    near, far = working_range(task.views, task.scene, renderer)
-    return replace(task, views=[ranged(view, near, far) for view in task.views])
+    near, far = find_depth_range(task.views, task.scene, renderer)
+    return replace(task, views=[set_depth_range(view, near, far) for view in task.views])
 
 
-def rows_kept(path: Path) -> Bool[Tensor, "n"] | None:
+def mask_drawable_rows(path: Path) -> Bool[Tensor, "n"] | None:
     """Return the mask of finite Gaussians in a .ply, or None for other formats."""
-    return drawable_rows(path) if format_of(path) == "ply" else None
+    return find_finite_rows(path) if detect_splat_format(path) == "ply" else None
 
 
 def check_context(options: SceneOptions) -> None:
     """Refuse too few or repeated context frames."""
-    context, needed = options.context, needed_views(options)
+    context, needed = options.context, get_min_views(options)
     if context is not None and len(context) < needed:
         raise InputError(
             f"--context names {len(context)} frame(s), and stereo needs at least {needed}; "
@@ -267,7 +282,7 @@ def check_context(options: SceneOptions) -> None:
     if context is not None and len(set(context)) < len(context):
         twice = [frame for frame in context if context.count(frame) > 1]
         raise InputError(
-            f"--context names {numbers_listed(twice)} twice, which gives "
+            f"--context names {join_numbers(twice)} twice, which gives "
             "identical cameras and no baseline; name different frames."
         )
 
@@ -282,12 +297,12 @@ def check_targets(options: CompleteOptions) -> None:
         )
 
 
-def needed_views(options: SceneOptions) -> int:
+def get_min_views(options: SceneOptions) -> int:
     """Return the minimum number of photographs."""
     return 2 if options.scene is None else 1
 
 
-def chosen_context(
+def choose_context(
     options: CompleteOptions, given: Photographs, targets: Sequence[Target]
 ) -> tuple[tuple[int, ...], ContextBudget]:
     """Choose context frames for the targets, or for the whole scene without any.
@@ -295,44 +310,44 @@ def chosen_context(
     Targets are never chosen, because their photographs score the result.
     """
     target_frames = {target.frame for target in targets}
-    resolution = working_size(options.resolution)
-    cameras = usable_cameras(
+    resolution = parse_resolution(options.resolution)
+    cameras = collect_usable_cameras(
         given, [f for f in range(len(given)) if f not in target_frames], resolution
     )
-    if len(cameras) < needed_views(options):
+    if len(cameras) < get_min_views(options):
         left = "photograph is" if len(cameras) == 1 else "photographs are"
         raise InputError(
             f"{len(cameras)} usable {left} left without the targets, and the context needs at "
-            f"least {needed_views(options)}; name fewer targets, or add photographs."
+            f"least {get_min_views(options)}; name fewer targets, or add photographs."
         )
     frames, candidates = list(cameras), list(cameras.values())
-    wanted = [target.camera for target in targets] or overview(candidates)
+    wanted = [target.camera for target in targets] or summarize_cameras(candidates)
     points = given.points()
     if points is None or len(points) == 0:
-        points = points_told(given, wanted, cameras)
-    budget = context_budget(options, candidates, targets)
+        points = sample_scene_points(given, wanted, cameras)
+    budget = compute_context_budget(options, candidates, targets)
     if not targets:
-        chosen = select_overview(candidates, points, budget.allowed)
+        chosen = select_overview(candidates, points, budget.limit)
     else:
-        chosen = select_context(wanted, candidates, points, budget.allowed)
+        chosen = select_context(wanted, candidates, points, budget.limit)
     return tuple(frames[index] for index in chosen), budget
 
 
-def context_budget(
+def compute_context_budget(
     options: CompleteOptions, candidates: Sequence[Camera], targets: Sequence[Target]
 ) -> ContextBudget:
     """Compute the number of context photographs from the defaults and the memory."""
-    wanted = CHOSEN if options.scene is None else CHOSEN_WITH_SCENE
+    wanted = NUM_CONTEXT if options.scene is None else NUM_CONTEXT_WITH_SPLAT
     if not targets:
-        wanted = CHOSEN_FOR_ALL
+        wanted = NUM_CONTEXT_FOR_ALL
     cameras = [*candidates, *(target.camera for target in targets)]
-    fit = images_that_fit(max(camera.width * camera.height for camera in cameras))
-    left = wanted if fit is None else fit - (len(targets) or most(options))
-    allowed = max(needed_views(options), min(wanted, left))
+    fit = count_fitting_images(max(camera.width * camera.height for camera in cameras))
+    left = wanted if fit is None else fit - (len(targets) or get_max_targets(options))
+    allowed = max(get_min_views(options), min(wanted, left))
     return ContextBudget(len(candidates), wanted, allowed)
 
 
-def usable_cameras(
+def collect_usable_cameras(
     given: Photographs, frames: Sequence[int], resolution: Resolution
 ) -> dict[int, Camera]:
     """Return the valid cameras of frames that have a photograph."""
@@ -346,26 +361,30 @@ def usable_cameras(
     return cameras
 
 
-def closest(targets: Sequence[Camera], cameras: Mapping[int, Camera], count: int) -> list[int]:
+def select_closest(
+    targets: Sequence[Camera], cameras: Mapping[int, Camera], count: int
+) -> list[int]:
     """Select the frames whose cameras are nearest to a target, in ascending order."""
     centers = torch.stack([target.center for target in targets])
     distance = {f: (centers - c.center).norm(dim=-1).min().item() for f, c in cameras.items()}
     return sorted(sorted(cameras, key=distance.__getitem__)[:count])
 
 
-def points_told(
+def sample_scene_points(
     given: Photographs, targets: Sequence[Camera], cameras: dict[int, Camera]
 ) -> Float[Tensor, "n 3"]:
     """Sample points in front of the targets within the known or estimated depth range."""
     near, far = given.near, given.far
     if near is None or far is None:
-        frames = closest(targets, cameras, WITNESSES)
-        low, high = estimate_depth_range(given.views(frames, WITNESS_SIDE))
+        frames = select_closest(targets, cameras, NUM_DEPTH_VIEWS)
+        low, high = estimate_depth_range(given.views(frames, CHECK_VIEW_SIZE))
         near, far = low if near is None else near, high if far is None else far
-    return torch.cat([points_before(target, near, far) for target in targets])
+    return torch.cat([make_points_in_front(target, near, far) for target in targets])
 
 
-def depth_source(options: SceneOptions, given: Photographs, bounded: Photographs) -> DepthSource:
+def find_depth_source(
+    options: SceneOptions, given: Photographs, bounded: Photographs
+) -> DepthSource:
     """Find the source of each end of the depth range."""
 
     def teller(name: str) -> str:
@@ -382,10 +401,10 @@ def depth_source(options: SceneOptions, given: Photographs, bounded: Photographs
 
 def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
     """Read the target cameras in the order of the command line."""
-    resolution = working_size(options.resolution)
+    resolution = parse_resolution(options.resolution)
     targets = []
     for word in options.target:
-        frame = frame_number(word)
+        frame = parse_frame_number(word)
         if frame is None:
             check_target_file(word, given)
             cameras = load_cameras(word, resolution, origin=given.origin.tolist())
@@ -399,24 +418,24 @@ def check_target_file(word: str, given: Photographs) -> None:
     """Refuse a target that is neither a frame number nor a file."""
     if not os.path.exists(word):
         raise InputError(
-            f"'{quoted(word, 60)}' is no target: a target is the number of a frame, from 0 to "
+            f"'{quote_value(word, 60)}' is no target: a target is the number of a frame, from 0 to "
             f"{len(given) - 1}, or a file of cameras (transforms.json, cameras.json, COLMAP's "
             "images.txt, SuperSplat's poses), and there is no such file.",
             "target",
         )
 
 
-def with_planes(camera: Camera, photographs: Photographs) -> Camera:
+def copy_depth_range(camera: Camera, photographs: Photographs) -> Camera:
     """Set the depth range of a camera."""
     return replace(camera, near=photographs.near, far=photographs.far)
 
 
-def with_photograph(target: Target, given: Photographs, resolution: Resolution) -> Target:
+def add_photograph(target: Target, given: Photographs, resolution: Resolution) -> Target:
     """Add its photograph to a target, if there is one."""
     if target.frame is None or not given.has_photograph(target.frame):
         return target
     (view,) = given.views([target.frame], resolution)
-    return replace(target, photograph=view.image, ignored=view.ignored)
+    return replace(target, photograph=view.image, ignore_mask=view.ignore_mask)
 
 
 def check_sizes(cameras: Sequence[Camera]) -> None:
@@ -429,39 +448,41 @@ def check_scene(task: Task, scene: Gaussians) -> None:
     """Refuse a splat that does not fit into memory together with its photographs."""
     cameras = [v.camera for v in task.views] + [target.camera for target in task.targets]
     pixels = max(camera.width * camera.height for camera in cameras)
-    needed = needed_bytes(pixels, len(cameras)) + scene_needs(task, scene)
-    check_scene_memory(len(scene), len(task.views) + len(task.witnesses or ()), needed)
+    needed = estimate_bytes(pixels, len(cameras)) + estimate_splat_bytes(task, scene)
+    check_scene_memory(len(scene), len(task.views) + len(task.check_views or ()), needed)
 
 
-def scene_needs(task: Task, scene: Gaussians) -> int:
+def estimate_splat_bytes(task: Task, scene: Gaussians) -> int:
     """Estimate the additional memory of an input splat, in bytes."""
-    cameras = [view.camera for view in (*task.views, *(task.witnesses or ()))]
+    cameras = [view.camera for view in (*task.views, *(task.check_views or ()))]
     parts = [part for part in vars(scene).values() if isinstance(part, Tensor)]
     numbers = sum(part[0].numel() for part in parts)
     sizes = [camera.width * camera.height for camera in cameras]
-    return scene_bytes(len(scene), numbers, sizes)
+    return estimate_scene_bytes(len(scene), numbers, sizes)
 
 
 def check_sides(cameras: Sequence[Camera]) -> None:
     """Refuse images that are too small."""
     for camera in cameras:
-        if min(camera.width, camera.height) < MIN_SIZE:
+        if min(camera.width, camera.height) < MIN_IMAGE_SIZE:
             raise InputError(
                 f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
-                f"least {MIN_SIZE}; choose a larger --resolution, or another camera."
+                f"least {MIN_IMAGE_SIZE}; choose a larger --resolution, or another camera."
             )
 
 
-def frame_number(word: str) -> int | None:
+def parse_frame_number(word: str) -> int | None:
     """Parse a frame number; None if the word is a file name."""
     if re.fullmatch("-?[0-9]+", word) is None:
         return None
     if len(word) > MAX_DIGITS:
-        raise InputError(f"There is no frame {quoted(word)}; name one by its number.", "target")
+        raise InputError(
+            f"There is no frame {quote_value(word)}; name one by its number.", "target"
+        )
     return int(word)
 
 
-def say(console: Console, *lines: str) -> None:
+def print_lines(console: Console, *lines: str) -> None:
     """Print lines without markup."""
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

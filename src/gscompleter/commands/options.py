@@ -23,7 +23,7 @@ Size = tuple[int, int] | int | Literal["full"]
 LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
 
-FOUND = 4
+DEFAULT_NUM_TARGETS = 4
 """Default number of target cameras that are searched for."""
 
 
@@ -349,11 +349,11 @@ class ModelsOptions(Settings):
     """Print all details as JSON."""
 
 
-def most(options: CompleteOptions) -> int:
+def get_max_targets(options: CompleteOptions) -> int:
     """Return the number of targets to search for."""
-    return FOUND if options.auto is None else options.auto
+    return DEFAULT_NUM_TARGETS if options.auto is None else options.auto
 
 
-def working_size(given: Size) -> tuple[int, int] | int | None:
+def parse_resolution(given: Size) -> tuple[int, int] | int | None:
     """Return `--resolution` as the readers of photographs take it."""
     return None if given == "full" else given

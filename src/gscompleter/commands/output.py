@@ -9,13 +9,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gscompleter.commands.opening import Opened, Task, closest
-from gscompleter.commands.options import SceneOptions, working_size
+from gscompleter.commands.opening import Opened, Task, select_closest
+from gscompleter.commands.options import SceneOptions, parse_resolution
 from gscompleter.config import CompleterConfig
 from gscompleter.config.cleaning import CleaningConfig
 from gscompleter.data.structure_from_motion import POSES
 from gscompleter.errors import InputError
-from gscompleter.io.files import SUMMARY
+from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.reports.completion import HeldOut
 from gscompleter.types import Camera, View
 
@@ -23,13 +23,13 @@ MAX_HELD_OUT = 8
 """Most unused photographs to score."""
 
 
-def opened_as(options: SceneOptions, opened: Opened, task: Task) -> dict[str, Any]:
+def describe_opened(options: SceneOptions, opened: Opened, task: Task) -> dict[str, Any]:
     """Describe the opened scene, its frame and its depth range."""
     camera = task.views[0].camera
     return {
         "scene": {
             "format": opened.format,
-            "photographs": opened.number,
+            "photographs": opened.num_photographs,
             "used": len(task.views),
             "splat": None if options.scene is None else str(options.scene),
         },
@@ -42,7 +42,7 @@ def opened_as(options: SceneOptions, opened: Opened, task: Task) -> dict[str, An
     }
 
 
-def settings_of(
+def describe_settings(
     options: SceneOptions,
     config: CompleterConfig | CleaningConfig,
     targets: Mapping[str, Any],
@@ -73,34 +73,34 @@ def read_held_out(
     used = {view.frame for view in task.views} | {target.frame for target in task.targets}
     others = {frame: camera for frame, camera in cameras.items() if frame not in used}
     wanted = [target.camera for target in task.targets] or [view.camera for view in task.views]
-    checks = {view.frame for view in task.witnesses or ()}
+    checks = {view.frame for view in task.check_views or ()}
     held_out, device = list[HeldOut](), task.views[0].image.device
-    for frame in closest([camera.to(device) for camera in wanted], others, MAX_HELD_OUT):
+    for frame in select_closest([camera.to(device) for camera in wanted], others, MAX_HELD_OUT):
         with suppress(InputError):
-            (view,) = opened.photographs.views([frame], working_size(options.resolution))
-            view = View(view.image, others[frame], frame, ignored=view.ignored).to(device)
+            (view,) = opened.photographs.views([frame], parse_resolution(options.resolution))
+            view = View(view.image, others[frame], frame, ignore_mask=view.ignore_mask).to(device)
             held_out.append(HeldOut(view, frame in checks))
     return held_out
 
 
-def replaceable(options: SceneOptions) -> bool:
+def is_replaceable(options: SceneOptions) -> bool:
     """Return True if the content of the output folder may be replaced."""
-    return options.overwrite or holds_poses_only(options.out)
+    return options.overwrite or has_poses_only(options.out)
 
 
-def holds_poses_only(out: Path) -> bool:
+def has_poses_only(out: Path) -> bool:
     """Return True if a folder contains only the cameras of an earlier run."""
     return os.path.isdir(out) and os.listdir(out) == [POSES]
 
 
 @contextmanager
-def saying_what_stays(out: Path) -> Iterator[None]:
+def report_interrupts(out: Path) -> Iterator[None]:
     """Let an interrupt name the results that were written."""
-    before = written(out)
+    before = get_result_times(out)
     try:
         yield
     except KeyboardInterrupt as stop:
-        there = written(out)
+        there = get_result_times(out)
         if there[0] != before[0]:
             raise KeyboardInterrupt(f"the result is written: {out}") from stop
         if there[1] != before[1]:
@@ -110,7 +110,7 @@ def saying_what_stays(out: Path) -> Iterator[None]:
         raise
 
 
-def written(out: Path) -> list[int | None]:
+def get_result_times(out: Path) -> list[int | None]:
     """Return the modification times of the result and of found cameras, or None without."""
-    summaries = [out / SUMMARY, out / POSES / SUMMARY]
+    summaries = [out / SUMMARY_FILE, out / POSES / SUMMARY_FILE]
     return [s.stat().st_mtime_ns if s.is_file() else None for s in summaries]

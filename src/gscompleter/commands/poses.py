@@ -32,16 +32,16 @@ def run_poses(options: PosesOptions) -> None:
     from rich.console import Console
 
     from gscompleter.data.structure_from_motion import find_poses
-    from gscompleter.progress import shown_on
+    from gscompleter.progress import show_progress
 
-    with shown_on(None if options.quiet else Console(stderr=True)):
+    with show_progress(None if options.quiet else Console(stderr=True)):
         found = find_poses(options.photographs, options.out, options.overwrite)
     if options.quiet:
         return
     for note in found.notes:
         print(note)
     print(
-        f"{found.registered} of {found.photographs} cameras and {found.points:,} points, "
+        f"{found.num_registered} of {found.photographs} cameras and {found.points:,} points, "
         f"mean error {found.error:.2f} px"
         f"{', found by an earlier run' if found.reused else ''}: {options.out}"
     )

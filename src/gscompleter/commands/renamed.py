@@ -25,22 +25,22 @@ def use_new_names(words: Sequence[str]) -> list[str]:
 
 
 def use_new_name(word: str) -> str:
-    """Replace an old option name such as `--film` or `--again=failures`, and warn of it."""
+    """Replace an old option name such as `--film` or `--rerun=failures`, and warn of it."""
     old, equals, value = word.partition("=")
-    return f"--{new_name(old[2:])}{equals}{value}"
+    return f"--{translate_name(old[2:])}{equals}{value}"
 
 
-def new_name(name: str) -> str:
+def translate_name(name: str) -> str:
     """Return today's name of an option without dashes, and warn of an old one."""
     new = RENAMED.get(name.replace("_", "-"))
     if new is None:
         return name
-    warn_of(name.replace("_", "-"), new)
+    warn_renamed(name.replace("_", "-"), new)
     return new
 
 
 @cache
-def warn_of(old: str, new: str) -> None:
+def warn_renamed(old: str, new: str) -> None:
     """Print once per process that an option has a new name."""
     print(
         f"{PROGRAM}--{old} is now called --{new}; the old name stops working in the next release.",

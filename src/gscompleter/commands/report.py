@@ -25,12 +25,12 @@ class ReportOptions(Settings):
 def run_report(options: ReportOptions) -> None:
     """Write `report.html` and print its path."""
     # Imported here so that `--help` does not wait for torch.
-    from gscompleter.reports.completion_page import completion_page
-    from gscompleter.reports.evaluation_page import TABLES, evaluation_page
-    from gscompleter.reports.page import NAME, write_page
+    from gscompleter.reports.completion_page import render_completion_page
+    from gscompleter.reports.evaluation_page import TABLES_FILE, render_evaluation_page
+    from gscompleter.reports.page import REPORT_FILE, write_page
 
-    evaluated = os.path.isfile(options.out / TABLES)
-    page = evaluation_page(options.out) if evaluated else completion_page(options.out)
+    evaluated = os.path.isfile(options.out / TABLES_FILE)
+    page = render_evaluation_page(options.out) if evaluated else render_completion_page(options.out)
     write_page(options.out, page)
     if not options.quiet:
-        print(options.out / NAME)
+        print(options.out / REPORT_FILE)

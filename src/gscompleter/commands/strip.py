@@ -31,13 +31,16 @@ def run_strip(options: StripOptions) -> None:
     # Imported here so that `--help` does not wait for torch.
     from rich.console import Console
 
-    from gscompleter.progress import preparing, shown_on
-    from gscompleter.splats.formats import writable_format
+    from gscompleter.progress import show_preparation, show_progress
+    from gscompleter.splats.formats import get_writable_format
     from gscompleter.splats.stripping import strip
 
-    writable_format(options.out)
+    get_writable_format(options.out)
     check_free(options.out, options.overwrite)
-    with shown_on(None if options.quiet else Console(stderr=True)), preparing("stripping"):
+    with (
+        show_progress(None if options.quiet else Console(stderr=True)),
+        show_preparation("stripping"),
+    ):
         given, generated = strip(options.completed, options.out)
     if not options.quiet:
         print(f"{given:,} Gaussians, {generated:,} generated ones removed: {options.out}")

@@ -11,10 +11,10 @@ import tyro
 from gscompleter.commands.convert import check_free
 from gscompleter.commands.options import Port
 from gscompleter.config.settings import Settings
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 
 if TYPE_CHECKING:
-    from gscompleter.viewer.exhibit import Exhibit
+    from gscompleter.viewer.exhibit import ViewerContent
     from gscompleter.viewer.page import Page
 
 
@@ -60,52 +60,52 @@ def run_view(options: ViewOptions) -> None:
         check_page(options.save, options.overwrite)
     libraries = load_libraries()
     name = "page" if options.save is None else options.save.stem
-    exhibit = exhibit_of(options)
+    exhibit = load_exhibit(options)
     page = make_page(exhibit, libraries, name)
     if not options.quiet:
-        tell(exhibit, page)
+        print_remarks(exhibit, page)
     if options.save is None:
-        serve(options, page)
+        serve_page(options, page)
     else:
-        write(page, options.save)
+        write_parts(page, options.save)
 
 
 def check_page(path: Path, overwrite: bool) -> None:
     """Refuse a file name without .html, and an existing file unless `overwrite` is set."""
     if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{quoted(path)} is no .html file; name it *.html.", "save")
+        raise InputError(f"{quote_value(path)} is no .html file; name it *.html.", "save")
     check_free(path, overwrite)
 
 
-def exhibit_of(options: ViewOptions) -> Exhibit:
+def load_exhibit(options: ViewOptions) -> ViewerContent:
     """Read the scenes and cameras of the options."""
     from dataclasses import replace
 
     from gscompleter.viewer.exhibit import (
-        camera_shots,
-        exhibit_of_completion,
-        exhibit_of_files,
         is_completion,
+        load_file_cameras,
+        load_viewer_completion,
+        load_viewer_files,
     )
 
     if options.other is None and is_completion(options.scene):
-        exhibit = exhibit_of_completion(options.scene, options.drop_nonfinite)
+        exhibit = load_viewer_completion(options.scene, options.drop_nonfinite)
     elif options.other is None:
-        exhibit = exhibit_of_files(options.scene, None, options.drop_nonfinite)
+        exhibit = load_viewer_files(options.scene, None, options.drop_nonfinite)
     else:
-        exhibit = exhibit_of_files(options.other, options.scene, options.drop_nonfinite)
+        exhibit = load_viewer_files(options.other, options.scene, options.drop_nonfinite)
     if options.cameras is None:
         return exhibit
-    shots = camera_shots(options.cameras, options.resolution, exhibit.place)
-    return replace(exhibit, shots=(*exhibit.shots, *shots))
+    shots = load_file_cameras(options.cameras, options.resolution, exhibit.scene_transform)
+    return replace(exhibit, cameras=(*exhibit.cameras, *shots))
 
 
-def tell(exhibit: Exhibit, page: Page) -> None:
+def print_remarks(exhibit: ViewerContent, page: Page) -> None:
     """Print remarks on the page."""
-    for remark in exhibit.remarks:
+    for remark in exhibit.notes:
         print(remark)
-    if page.left_out:
-        print(f"{page.left_out:,} Gaussians are too far away to be shown.")
+    if page.num_omitted:
+        print(f"{page.num_omitted:,} Gaussians are too far away to be shown.")
     if page.parts:
         print(
             f"The Gaussians do not fit into one page; keep these {len(page.parts)} files beside "
@@ -113,25 +113,25 @@ def tell(exhibit: Exhibit, page: Page) -> None:
         )
 
 
-def write(page: Page, path: Path) -> None:
+def write_parts(page: Page, path: Path) -> None:
     """Write the parts of the page, then the page."""
-    from gscompleter.io.files import replacing
+    from gscompleter.io.files import replace_file
 
     for name, part in page.parts.items():
-        with replacing(path.with_name(name)) as file:
+        with replace_file(path.with_name(name)) as file:
             file.write(part)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(page.html)
 
 
-def serve(options: ViewOptions, page: Page) -> None:
+def serve_page(options: ViewOptions, page: Page) -> None:
     """Serve the page to this machine until Ctrl-C."""
     import webbrowser
     from contextlib import suppress
 
-    from gscompleter.viewer.server import ADDRESS, serving
+    from gscompleter.viewer.server import ADDRESS, make_page_server
 
-    with serving(page, options.port) as server, suppress(KeyboardInterrupt):
+    with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
         address = f"http://{ADDRESS}:{server.server_address[1]}/"
         # Printed once the server listens.
         print(f"{address} (Ctrl-C ends it)", flush=True)

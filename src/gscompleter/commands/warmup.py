@@ -22,14 +22,14 @@ def run_warmup(options: WarmupOptions) -> None:
     from rich.console import Console
 
     from gscompleter.compilation import PARTS, compile_kernels
-    from gscompleter.kernels.compiled import cache_folder
-    from gscompleter.progress import shown_on
+    from gscompleter.kernels.compiled import get_cache_folder
+    from gscompleter.progress import show_progress
 
-    with shown_on(None if options.quiet else Console(stderr=True)):
+    with show_progress(None if options.quiet else Console(stderr=True)):
         seconds = compile_kernels(list(PARTS))
     if options.quiet:
         return
     if seconds is None:
-        print(f"All kernels are compiled already: {cache_folder()}")
+        print(f"All kernels are compiled already: {get_cache_folder()}")
     else:
-        print(f"All kernels are compiled, in {seconds:.1f} s: {cache_folder()}")
+        print(f"All kernels are compiled, in {seconds:.1f} s: {get_cache_folder()}")

@@ -16,8 +16,8 @@ from typing import Any
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.framing import Resolution
-from gscompleter.data.photographs import Photographs, without_masked
-from gscompleter.errors import InputError, quoted
+from gscompleter.data.photographs import Photographs, apply_masks
+from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
 from gscompleter.types import View
 
@@ -50,12 +50,12 @@ class Case:
     def load(self, frames: tuple[int, ...]) -> list[View]:
         """Load the photographs of `frames`."""
         scene = open_photographs(self.scene, near=self.near, far=self.far)
-        scene = scene if self.ego_mask else scene.with_ego_vehicle()
+        scene = scene if self.ego_mask else scene.keep_ego_vehicle()
         views = scene.views(frames, self.resolution)
-        return without_masked(views, scene, self.resolution) if self.ignore_masked else views
+        return apply_masks(views, scene, self.resolution) if self.ignore_masked else views
 
 
-def holds_cases(path: Path) -> bool:
+def has_cases(path: Path) -> bool:
     """Check whether `path` is a folder with a `cases.json`, or a JSON file with cases."""
     if os.path.isdir(path):
         return os.path.isfile(path / NAME)
@@ -87,27 +87,31 @@ def read_cases(path: Path) -> list[Case]:
     content = read_json(path, "name a file of cases")
     try:
         height, width = content["resolution"]
-        return [_case(row, (_whole(height), _whole(width)), path) for row in content["cases"]]
+        return [
+            _parse_case(row, (_check_whole(height), _check_whole(width)), path)
+            for row in content["cases"]
+        ]
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
-            f"{path} is no file of cases ({type(error).__name__}: {quoted(str(error))}); it needs "
+            f"{path} is no file of cases ({type(error).__name__}: {quote_value(str(error))}); it "
+            "needs "
             "resolution and cases, each with scene, context and target."
         ) from error
 
 
-def _case(row: Any, resolution: tuple[int, int], path: Path) -> Case:
+def _parse_case(row: Any, resolution: tuple[int, int], path: Path) -> Case:
     return Case(
         path.parent / row["scene"],
-        tuple(map(_whole, row["context"])),
-        _whole(row["target"]),
-        tuple(map(_whole, row.get("neighbours", ()))),
+        tuple(map(_check_whole, row["context"])),
+        _check_whole(row["target"]),
+        tuple(map(_check_whole, row.get("neighbours", ()))),
         resolution,
         None if row.get("near") is None else float(row["near"]),
         None if row.get("far") is None else float(row["far"]),
     )
 
 
-def _whole(value: Any) -> int:
+def _check_whole(value: Any) -> int:
     if type(value) is not int:
-        raise TypeError(f"{quoted(value)} is no whole number")
+        raise TypeError(f"{quote_value(value)} is no whole number")
     return value

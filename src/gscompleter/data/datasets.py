@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from gscompleter.data.cases import holds_cases, open_cases
-from gscompleter.data.ego_vehicle import looking_for_vehicle
-from gscompleter.data.formats import FORMATS, format_of, recognised
+from gscompleter.data.cases import has_cases, open_cases
+from gscompleter.data.ego_vehicle import attach_vehicle_detector
+from gscompleter.data.formats import FORMATS, detect_format, find_format
 from gscompleter.data.photographs import Photographs, PosedPhotographs
 
 P = TypeVar("P", bound=PosedPhotographs)
 
 
 @dataclass(frozen=True)
-class Skipped:
+class SkippedScene:
     """A scene that was left out, and why."""
 
     name: str
@@ -31,16 +31,16 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
     so damage raises an InputError while iterating.
     """
     path = Path(path)
-    if holds_cases(path):
+    if has_cases(path):
         return open_cases(path)
-    inside = [] if recognised(path) or not os.path.isdir(path) else sorted(path.iterdir())
-    folders = [child for child in inside if child.is_dir() and recognised(child)]
-    scenes = [(FORMATS[format_of(place)], place) for place in folders or [path]]
-    clips = (looking_ahead(clip) for format, place in scenes for clip in format.open(place))
-    return (replace(clip, frames=looking_for_vehicle(clip.frames)) for clip in clips)
+    inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
+    folders = [child for child in inside if child.is_dir() and find_format(child)]
+    scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]
+    clips = (select_front_camera(clip) for format, place in scenes for clip in format.open(place))
+    return (replace(clip, frames=attach_vehicle_detector(clip.frames)) for clip in clips)
 
 
-def looking_ahead(clip: Photographs) -> Photographs:
+def select_front_camera(clip: Photographs) -> Photographs:
     """Keep the frames of the front camera if a vehicle has several cameras."""
     if clip.front is None:
         return clip
@@ -48,11 +48,11 @@ def looking_ahead(clip: Photographs) -> Photographs:
     return replace(clip, frames=ahead)
 
 
-def usable(clips: Iterable[P], skipped: list[Skipped]) -> Iterator[P]:
+def filter_usable(clips: Iterable[P], skipped: list[SkippedScene]) -> Iterator[P]:
     """Yield the scenes that benchmarks keep, and append the others to `skipped`."""
     for clip in clips:
-        reason = clip.reason_to_skip()
+        reason = clip.find_skip_reason()
         if reason is None:
             yield clip
         else:
-            skipped.append(Skipped(clip.name, reason))
+            skipped.append(SkippedScene(clip.name, reason))

@@ -19,11 +19,11 @@ from jaxtyping import Float
 
 from gscompleter.data.frame import Frame
 from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.json_numbers import number_of, size_of, text_of
+from gscompleter.data.json_numbers import get_number, get_size, get_text
 from gscompleter.data.limits import MAX_COORDINATE, MAX_IN_PIXELS
-from gscompleter.data.photographs import Photographs, photographs_of
-from gscompleter.data.poses import rotation_of
-from gscompleter.errors import InputError, quoted
+from gscompleter.data.photographs import Photographs, build_photographs
+from gscompleter.data.poses import compute_rotation
+from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
 from gscompleter.reading import open_file, read_head
 
@@ -35,9 +35,9 @@ MAX_SWEEP = 1 << 28
 """Largest points of a lidar sweep, in bytes."""
 
 
-def holds_dgp(path: Path) -> bool:
+def has_dgp(path: Path) -> bool:
     """Check whether `path` is a DGP scene file, or a folder with one."""
-    return _scene_file(path) is not None
+    return _find_scene_file(path) is not None
 
 
 def open_dgp(path: Path) -> Iterator[Photographs]:
@@ -46,73 +46,77 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     Frames of all cameras are numbered by their sorted names, which are paths below the folder. The
     first camera by name, in DDAD CAMERA_01, is the front camera.
     """
-    file = _scene_file(path)
+    file = _find_scene_file(path)
     if file is None:
-        raise InputError(f"There is no scene of DGP in {quoted(path)}; name its scene.json.")
+        raise InputError(f"There is no scene of DGP in {quote_value(path)}; name its scene.json.")
     content = read_json(file, ADVICE)
-    cameras = _calibrations(file, content)
-    images = [datum for datum in _list(content, "data") if "image" in _object(datum, "datum")]
-    sweeps = _sweeps(content)
-    frames = sorted((_frame(d, cameras, sweeps, file) for d in images), key=lambda f: f.name)
+    cameras = _read_calibrations(file, content)
+    images = [
+        datum for datum in _get_list(content, "data") if "image" in _get_object(datum, "datum")
+    ]
+    sweeps = _map_sweeps(content)
+    frames = sorted((_parse_frame(d, cameras, sweeps, file) for d in images), key=lambda f: f.name)
     if not frames:
-        raise InputError(f"{quoted(file)} lists no images; name a scene with cameras.")
+        raise InputError(f"{quote_value(file)} lists no images; name a scene with cameras.")
     front = min(frame.sensor or "" for frame in frames)
-    yield photographs_of(file.resolve().parent.name, str(file), frames, front=front)
+    yield build_photographs(file.resolve().parent.name, str(file), frames, front=front)
 
 
-def _frame(
+def _parse_frame(
     datum: Any, cameras: Mapping[str, Intrinsics], sweeps: Mapping[str, Any], file: Path
 ) -> Frame:
-    image, camera = _object(datum["datum"], "image"), _object(datum, "id").get("name")
-    name = text_of(image, "filename", str(file))
-    title = f"image {quoted(name)} of {quoted(file)}"
+    image, camera = _get_object(datum["datum"], "image"), _get_object(datum, "id").get("name")
+    name = get_text(image, "filename", str(file))
+    title = f"image {quote_value(name)} of {quote_value(file)}"
     if name is None or not isinstance(camera, str) or camera not in cameras:
         raise InputError(
-            f"The {title} has no file name, or its camera {quoted(camera)} is not in the "
+            f"The {title} has no file name, or its camera {quote_value(camera)} is not in the "
             f"calibration; {ADVICE}."
         )
     given = cameras[camera]
-    intrinsics = Intrinsics(size_of(image, title), given.focal, given.center)
-    sweep = _object(_object(sweeps.get(str(datum.get("key"))), "datum"), "point_cloud")
-    points = text_of(sweep, "filename", str(file))
-    pose = _pose(_object(sweep, "pose"), str(file)) if points is not None else np.eye(4)
+    intrinsics = Intrinsics(get_size(image, title), given.focal, given.center)
+    sweep = _get_object(_get_object(sweeps.get(str(datum.get("key"))), "datum"), "point_cloud")
+    points = get_text(sweep, "filename", str(file))
+    pose = _parse_pose(_get_object(sweep, "pose"), str(file)) if points is not None else np.eye(4)
     there = points is not None and os.path.isfile(file.parent / points)
     return Frame(
         name,
         title,
-        _pose(_object(image, "pose"), title),
+        _parse_pose(_get_object(image, "pose"), title),
         intrinsics,
         file.parent / name,
         sensor=camera,
-        measured=partial(_points, file.parent / str(points), pose) if there else None,
+        laser_points=partial(_read_points, file.parent / str(points), pose) if there else None,
     )
 
 
-def _sweeps(content: Any) -> dict[str, Any]:
+def _map_sweeps(content: Any) -> dict[str, Any]:
     """Map the key of each datum to the point cloud of its sample."""
-    data = {str(d.get("key")): d for d in _list(content, "data") if isinstance(d, dict)}
+    data = {str(d.get("key")): d for d in _get_list(content, "data") if isinstance(d, dict)}
     found: dict[str, Any] = {}
-    for sample in _list(content, "samples"):
-        keys = [str(key) for key in _list(sample, "datum_keys")]
-        clouds = [k for k in keys if "point_cloud" in _object(data.get(k), "datum")]
+    for sample in _get_list(content, "samples"):
+        keys = [str(key) for key in _get_list(sample, "datum_keys")]
+        clouds = [k for k in keys if "point_cloud" in _get_object(data.get(k), "datum")]
         found |= {key: data[clouds[0]] for key in keys if clouds}
     return found
 
 
-def _points(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
+def _read_points(
+    path: Path, world_from_laser: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "n 3"]:
     """Read the finite points of a sweep in the world frame."""
     try:
         with open_file(path) as file, zipfile.ZipFile(file) as archive:
-            points = _array(archive)
+            points = _read_array(archive)
         finite = points[np.isfinite(points).all(axis=1)]
     except InputError:
         raise
     except Exception as error:  # damaged archives and arrays raise anything
-        raise InputError(f"{quoted(path)} is no point cloud of DGP; {ADVICE}.") from error
+        raise InputError(f"{quote_value(path)} is no point cloud of DGP; {ADVICE}.") from error
     return finite @ world_from_laser[:3, :3].T + world_from_laser[:3, 3]
 
 
-def _array(archive: zipfile.ZipFile) -> Float[np.ndarray, "n 3"]:
+def _read_array(archive: zipfile.ZipFile) -> Float[np.ndarray, "n 3"]:
     """Read the first three columns of `data`; raises a ValueError if unsuitable or too large."""
     if archive.getinfo("data.npy").file_size > MAX_SWEEP:
         raise ValueError
@@ -123,26 +127,26 @@ def _array(archive: zipfile.ZipFile) -> Float[np.ndarray, "n 3"]:
     return table[:, :3].astype(np.float64)
 
 
-def _pose(pose: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
+def _parse_pose(pose: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
     def read_numbers(part: str, *keys: str) -> list[float]:
-        entry = _object(pose, part)
-        return [number_of(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
+        entry = _get_object(pose, part)
+        return [get_number(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
 
     c2w = np.eye(4)
-    c2w[:3, :3] = rotation_of(read_numbers("rotation", "qw", "qx", "qy", "qz"))
+    c2w[:3, :3] = compute_rotation(read_numbers("rotation", "qw", "qx", "qy", "qz"))
     c2w[:3, 3] = read_numbers("translation", "x", "y", "z")
     return c2w
 
 
-def _calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
+def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     """Read the intrinsics by camera name, without image sizes."""
-    file = _calibration_file(scene, content)
+    file = _find_calibration_file(scene, content)
     calibration = read_json(file, ADVICE)
-    names, entries = _list(calibration, "names"), _list(calibration, "intrinsics")
+    names, entries = _get_list(calibration, "names"), _get_list(calibration, "intrinsics")
     # Entries of other sensors are zeros.
     pairs = [(n, e) for n, e in zip(names, entries, strict=False) if _is_camera(n, e)]
     return {
-        name: _intrinsics(entry, f"camera {quoted(name)} of {quoted(file)}")
+        name: _parse_intrinsics(entry, f"camera {quote_value(name)} of {quote_value(file)}")
         for name, entry in pairs
     }
 
@@ -151,29 +155,30 @@ def _is_camera(name: Any, entry: Any) -> bool:
     return isinstance(name, str) and isinstance(entry, dict) and entry.get("fx") not in (None, 0)
 
 
-def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
+def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
     fx, fy = (
-        number_of(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
+        get_number(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
     )
-    cx, cy = (number_of(entry, key, title, -MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("cx", "cy"))
+    cx, cy = (get_number(entry, key, title, -MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("cx", "cy"))
     return Intrinsics(None, (fx, fy), (cx, cy))
 
 
-def _calibration_file(scene: Path, content: Any) -> Path:
+def _find_calibration_file(scene: Path, content: Any) -> Path:
     """Find the calibration of the first sample: `calibration/KEY.json` or calibration.json."""
-    samples = _list(content, "samples")
+    samples = _get_list(content, "samples")
     key = samples[0].get("calibration_key") if samples and isinstance(samples[0], dict) else None
     folder = scene.parent / CALIBRATIONS
     candidates = [folder / f"{key}.json", scene.with_name(f"{CALIBRATIONS}.json")]
     found = next((path for path in candidates if os.path.isfile(path)), None)
     if found is None:
         raise InputError(
-            f"The calibration of {quoted(scene)} is missing; put it at {quoted(candidates[0])}."
+            f"The calibration of {quote_value(scene)} is missing; put it at "
+            f"{quote_value(candidates[0])}."
         )
     return found
 
 
-def _scene_file(path: Path) -> Path | None:
+def _find_scene_file(path: Path) -> Path | None:
     files = sorted(path.glob("scene*.json")) if os.path.isdir(path) else [path]
     return next((file for file in files if _is_scene(file)), None)
 
@@ -184,11 +189,11 @@ def _is_scene(path: Path) -> bool:
     return b'"datum"' in read_head(path, MAX_SNIFFED)
 
 
-def _list(content: Any, key: str) -> list[Any]:
+def _get_list(content: Any, key: str) -> list[Any]:
     value = content.get(key) if isinstance(content, dict) else None
     return value if isinstance(value, list) else []
 
 
-def _object(content: Any, key: str) -> dict[str, Any]:
+def _get_object(content: Any, key: str) -> dict[str, Any]:
     value = content.get(key) if isinstance(content, dict) else None
     return value if isinstance(value, dict) else {}

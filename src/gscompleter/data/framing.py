@@ -10,7 +10,7 @@ from PIL import Image
 
 from gscompleter.data.lens import Pinhole
 from gscompleter.data.limits import MAX_SIDE
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 
 Resolution = tuple[int, int] | int | None
 """Target size of images.
@@ -24,35 +24,35 @@ this longer side. None: keep the size.
 class Framing:
     """Resize to `scaled_size`, then crop `size` at `corner` (all x, y)."""
 
-    resized: tuple[int, int]
+    scaled_size: tuple[int, int]
     corner: tuple[int, int]
     size: tuple[int, int]
 
-    def camera(self, pinhole: Pinhole) -> Pinhole:
+    def apply_to_camera(self, pinhole: Pinhole) -> Pinhole:
         """Return the camera of the framed image."""
-        return pinhole.resized(*self.resized).cropped(*self.corner, *self.size)
+        return pinhole.resize(*self.scaled_size).crop(*self.corner, *self.size)
 
-    def image(
+    def apply_to_image(
         self, image: Shaped[np.ndarray, "h w *c"], filtering: Image.Resampling
     ) -> Shaped[np.ndarray, "h2 w2 *c"]:
         """Resize and crop an image."""
         left, top = self.corner
         width, height = self.size
-        resized = resize(image, self.resized, filtering)
+        resized = resize(image, self.scaled_size, filtering)
         return np.ascontiguousarray(resized[top : top + height, left : left + width])
 
 
-def framing(width: int, height: int, resolution: Resolution) -> Framing:
+def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
     """Compute the framing of a width × height image for a resolution."""
     check_resolution(resolution)
     if resolution is not None and not isinstance(resolution, int):
-        return covering(width, height, resolution)
+        return compute_cover_framing(width, height, resolution)
     scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
     size = max(round(width * scale), 1), max(round(height * scale), 1)
     return Framing(size, (0, 0), size)
 
 
-def covering(width: int, height: int, resolution: tuple[int, int]) -> Framing:
+def compute_cover_framing(width: int, height: int, resolution: tuple[int, int]) -> Framing:
     """Compute the framing that covers `resolution` (height, width) and crops the centre."""
     scale = max(resolution[0] / height, resolution[1] / width)
     new_width = max(round(width * scale), resolution[1])
@@ -82,6 +82,6 @@ def check_resolution(resolution: Resolution) -> None:
     sides = (resolution,) if isinstance(resolution, int) else resolution
     if not all(1 <= side <= MAX_SIDE for side in sides):
         raise InputError(
-            f"The resolution {' × '.join(map(quoted, sides))} is impossible; height and "
+            f"The resolution {' × '.join(map(quote_value, sides))} is impossible; height and "
             f"width have to be positive, and at most {MAX_SIDE}."
         )

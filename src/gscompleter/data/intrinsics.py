@@ -28,27 +28,27 @@ class Intrinsics:
     """Full fields of view in radians, for files without focal lengths."""
     distortion: Distortion = Distortion()
 
-    def at(self, width: int, height: int) -> Pinhole:
+    def compute_pinhole(self, width: int, height: int) -> Pinhole:
         """Compute the intrinsics of an image of this size, before undistortion."""
         w, h = self.size or (width, height)
-        fl_x = _focal(self.focal[0], self.angle[0], w)
-        fl_y = _focal(self.focal[1], self.angle[1], h)
+        fl_x = _compute_focal(self.focal[0], self.angle[0], w)
+        fl_y = _compute_focal(self.focal[1], self.angle[1], h)
         cx = w / 2 if self.center[0] is None else self.center[0]
         cy = h / 2 if self.center[1] is None else self.center[1]
         # With only one focal length, pixels are square.
         known = fl_y if fl_x is None else fl_x
         assert known is not None
         fl_x, fl_y = known if fl_x is None else fl_x, known if fl_y is None else fl_y
-        return Pinhole(fl_x, fl_y, cx, cy, w, h).resized(width, height)
+        return Pinhole(fl_x, fl_y, cx, cy, w, h).resize(width, height)
 
-    def transposed(self, width: int, height: int) -> bool:
+    def is_transposed(self, width: int, height: int) -> bool:
         """Check whether a photograph of this size is rotated by 90° relative to `size`."""
         w, h = self.size or (width, height)
         same = math.isclose(width * h, height * w, rel_tol=SAME_ASPECT)
         return not same and math.isclose(width * w, height * h, rel_tol=SAME_ASPECT)
 
 
-def pinhole_defect(pinhole: Pinhole) -> str | None:
+def find_pinhole_defect(pinhole: Pinhole) -> str | None:
     """Describe why intrinsics are impossible; None if they are valid."""
     low, high = FOCAL_RANGE
     for focal, side in ((pinhole.fl_x, pinhole.width), (pinhole.fl_y, pinhole.height)):
@@ -62,7 +62,7 @@ def pinhole_defect(pinhole: Pinhole) -> str | None:
     return None
 
 
-def opening_angle(pinhole: Pinhole) -> float:
+def compute_fov(pinhole: Pinhole) -> float:
     """Compute the larger field of view of a camera, in degrees."""
     sides = ((pinhole.fl_x, pinhole.cx, pinhole.width), (pinhole.fl_y, pinhole.cy, pinhole.height))
     return math.degrees(
@@ -70,7 +70,7 @@ def opening_angle(pinhole: Pinhole) -> float:
     )
 
 
-def _focal(focal: float | None, angle: float | None, length: int) -> float | None:
+def _compute_focal(focal: float | None, angle: float | None, length: int) -> float | None:
     if focal is not None or angle is None:
         return focal
     return length / 2 / math.tan(angle / 2)

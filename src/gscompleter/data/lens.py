@@ -39,16 +39,16 @@ class Pinhole:
             [[self.fl_x, 0, self.cx], [0, self.fl_y, self.cy], [0, 0, 1]], dtype=torch.float64
         ).float()
 
-    def resized(self, width: int, height: int) -> Pinhole:
+    def resize(self, width: int, height: int) -> Pinhole:
         """Return the camera of the image resized to width × height."""
         x, y = width / self.width, height / self.height
         return Pinhole(self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y, width, height)
 
-    def cropped(self, left: int, top: int, width: int, height: int) -> Pinhole:
+    def crop(self, left: int, top: int, width: int, height: int) -> Pinhole:
         """Return the camera of the crop that begins at pixel (left, top)."""
         return Pinhole(self.fl_x, self.fl_y, self.cx - left, self.cy - top, width, height)
 
-    def zoomed(self, zoom: float) -> Pinhole:
+    def magnify(self, zoom: float) -> Pinhole:
         """Magnify the image by `zoom` about the principal point, at the same size."""
         return Pinhole(
             self.fl_x * zoom, self.fl_y * zoom, self.cx, self.cy, self.width, self.height
@@ -95,21 +95,21 @@ def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[
     """Distort points of the image plane at z = 1; NaN outside the field of the lens."""
     # Far outside the photograph, polynomials overflow and the division has no solution.
     with np.errstate(all="ignore"):
-        return _bent(_projected(points, distortion), distortion)
+        return _apply_polynomials(_project(points, distortion), distortion)
 
 
-def _projected(
+def _project(
     points: Float[np.ndarray, "*n 2"], distortion: Distortion
 ) -> Float[np.ndarray, "*n 2"]:
     if distortion.projection == "perspective":
         return points
     r = np.linalg.norm(points, axis=-1)
     small = r < 1e-6
-    scale = _radius(np.where(small, 1e-6, r), distortion) / np.where(small, 1e-6, r)
+    scale = _compute_radius(np.where(small, 1e-6, r), distortion) / np.where(small, 1e-6, r)
     return points * scale[..., None]
 
 
-def _radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndarray, "*n"]:
+def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndarray, "*n"]:
     if distortion.projection == "equidistant":
         return np.arctan(r)
     if distortion.projection == "field-of-view":
@@ -122,10 +122,14 @@ def _radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndar
     return r / (alpha * np.sqrt(beta * r * r + 1) + 1 - alpha)
 
 
-def _bent(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np.ndarray, "*n 2"]:
+def _apply_polynomials(
+    points: Float[np.ndarray, "*n 2"], distortion: Distortion
+) -> Float[np.ndarray, "*n 2"]:
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
-    radial = _polynomial(r2, distortion.radial) / _polynomial(r2, distortion.denominator)
+    radial = _evaluate_polynomial(r2, distortion.radial) / _evaluate_polynomial(
+        r2, distortion.denominator
+    )
     (p1, p2), (s1, s3) = distortion.tangential, distortion.prism
     return np.stack(
         [
@@ -136,7 +140,7 @@ def _bent(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np
     )
 
 
-def _polynomial(
+def _evaluate_polynomial(
     r2: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
 ) -> Float[np.ndarray, "*n"]:
     """Evaluate 1 + k1 r² + k2 r⁴ + … at r²."""
@@ -147,7 +151,7 @@ def _polynomial(
 
 
 @lru_cache(maxsize=16)
-def undistorted(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
+def undistort_pinhole(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
     """Compute the pinhole camera of the undistorted photograph, of the same size.
 
     It keeps the principal point and zooms until every pixel lies in the photograph and the borders
@@ -158,22 +162,22 @@ def undistorted(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
         return pinhole
     zoom, radius = None, np.zeros(())
     for candidate in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400):
-        bent = distort(_border(pinhole.zoomed(float(candidate))), distortion)
+        bent = distort(_compute_border(pinhole.magnify(float(candidate))), distortion)
         # Zooming out must move every border point outwards: beyond the fold of a polynomial,
         # points return into the photograph and show something else.
-        if not _within(pinhole, bent) or (np.linalg.norm(bent, axis=-1) < radius).any():
+        if not _is_within(pinhole, bent) or (np.linalg.norm(bent, axis=-1) < radius).any():
             break
         zoom, radius = float(candidate), np.linalg.norm(bent, axis=-1)
-    return None if zoom is None else pinhole.zoomed(zoom)
+    return None if zoom is None else pinhole.magnify(zoom)
 
 
 @lru_cache(maxsize=1)
-def undistortion_map(
+def compute_undistortion_map(
     pinhole: Pinhole, distortion: Distortion, new: Pinhole
 ) -> Float[np.ndarray, "h w 2"]:
     """Compute the photograph position of each undistorted pixel, for `remap`."""
     x, y = np.meshgrid(np.arange(new.width) + 0.5, np.arange(new.height) + 0.5)
-    pixels = _pixels(pinhole, distort(_plane_points(new, x, y), distortion))
+    pixels = _to_pixels(pinhole, distort(_to_plane(new, x, y), distortion))
     # The nearest border fills pixels outside the field of the lens.
     finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
     with np.errstate(over="ignore"):
@@ -188,27 +192,27 @@ def remap(
     return np.asarray(cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _border(pinhole: Pinhole) -> Float[np.ndarray, "n 2"]:
+def _compute_border(pinhole: Pinhole) -> Float[np.ndarray, "n 2"]:
     """Compute the outermost pixel centres on the image plane at z = 1."""
     x, y = np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5
-    rows = [_plane_points(pinhole, x, np.full_like(x, edge)) for edge in (y[0], y[-1])]
-    columns = [_plane_points(pinhole, np.full_like(y, edge), y) for edge in (x[0], x[-1])]
+    rows = [_to_plane(pinhole, x, np.full_like(x, edge)) for edge in (y[0], y[-1])]
+    columns = [_to_plane(pinhole, np.full_like(y, edge), y) for edge in (x[0], x[-1])]
     return np.concatenate(rows + columns)
 
 
-def _plane_points(
+def _to_plane(
     pinhole: Pinhole, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]
 ) -> Float[np.ndarray, "*n 2"]:
     return np.stack([(x - pinhole.cx) / pinhole.fl_x, (y - pinhole.cy) / pinhole.fl_y], axis=-1)
 
 
-def _pixels(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+def _to_pixels(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
     return points * [pinhole.fl_x, pinhole.fl_y] + [pinhole.cx, pinhole.cy]
 
 
-def _within(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> bool:
+def _is_within(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> bool:
     """Check whether all points fall on pixels of the photograph, within 0.001 pixels."""
-    x, y = np.moveaxis(_pixels(pinhole, points), -1, 0)
+    x, y = np.moveaxis(_to_pixels(pinhole, points), -1, 0)
     return bool(
         (x.min() >= 0.499)
         and (x.max() <= pinhole.width - 0.499)

@@ -22,7 +22,7 @@ MAX_STEP = 1e-3
 """Coarsest float32 step of coordinates, relative to the camera spread."""
 
 
-def local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "3"]:
+def choose_local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "3"]:
     """Choose the coordinate origin: zero, or the first camera centre for remote cameras."""
     if not poses:
         return np.zeros(3)
@@ -32,14 +32,14 @@ def local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray,
     return centers[0] if remote else np.zeros(3)
 
 
-def frame_from_photographs(origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+def compute_frame_from_photographs(origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """Build the transform from the photographs' frame to the frame with zero at `origin`."""
     transform = np.eye(4)
     transform[:3, 3] -= origin
     return transform
 
 
-def origin_of(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def choose_scene_origin(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """Choose a scene's origin: `origin` if the scene lies near it, else zero."""
     if len(scene) == 0 or not origin.any():
         return origin
@@ -48,7 +48,7 @@ def origin_of(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Float[np.ndar
     return origin if there else np.zeros(3)
 
 
-def told_from(
+def shift_to_origin(
     origin: Float[np.ndarray, "3"], scene: Gaussians, cameras: Sequence[Camera]
 ) -> Gaussians:
     """Express a scene relative to `origin` (scene units); refuses too coarse float32 steps."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 from gscompleter.reading import check_file
 
 ADVICE = "download it again"
@@ -24,7 +24,7 @@ def read_columns(
         from pyarrow import dataset
     except ImportError as error:
         raise InputError(
-            f"{quoted(path)} is a parquet file, and pyarrow is not installed; run "
+            f"{quote_value(path)} is a parquet file, and pyarrow is not installed; run "
             "`pip install 'gscompleter[waymo]'`."
         ) from error
     check_file(path)
@@ -39,18 +39,18 @@ def read_columns(
     except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(
-            f"{quoted(path)} cannot be read ({quoted(lines[0])}); {ADVICE}."
+            f"{quote_value(path)} cannot be read ({quote_value(lines[0])}); {ADVICE}."
         ) from error
-    return {column: [_plain(value) for value in found.column(column)] for column in columns}
+    return {column: [_to_plain(value) for value in found.column(column)] for column in columns}
 
 
 def _check_columns(path: Path, needed: Sequence[str], there: Sequence[str]) -> None:
     for column in needed:
         if column not in there:
-            raise InputError(f"{quoted(path)} has no column {quoted(column)}; {ADVICE}.")
+            raise InputError(f"{quote_value(path)} has no column {quote_value(column)}; {ADVICE}.")
 
 
-def _plain(scalar: Any) -> Any:
+def _to_plain(scalar: Any) -> Any:
     """Convert to a Python value, and a list of numbers to an array."""
     if not scalar.is_valid:
         return None

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 from gscompleter.io.ply import Element, read_header, read_vertices
 from gscompleter.reading import open_file
 
@@ -22,13 +22,13 @@ def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:
             vertex = next((e for e in elements if e.name == "vertex"), None)
             if vertex is None or not _is_table(vertex):
                 raise InputError(
-                    f"{quoted(path)} holds no points with x, y and z; export them again."
+                    f"{quote_value(path)} holds no points with x, y and z; export them again."
                 )
             ahead = elements[: elements.index(vertex)]
             vertices = read_vertices(file, file_format, ahead, vertex, path)
     except OSError as error:
         raise InputError(
-            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+            f"{quote_value(path)} cannot be read: {error.strerror}; correct the path."
         ) from error
     return np.stack([vertices[axis].astype(np.float64) for axis in AXES], axis=-1)
 

@@ -14,7 +14,7 @@ FLOAT_NOISE = 1e-6
 """Largest deviation from a rotation that is kept as it is."""
 
 
-def pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
+def find_pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
     """Describe why a pose is invalid; None for a rigid transform within the limits."""
     if not np.isfinite(pose).all():
         return "its pose holds NaN or infinity"
@@ -29,7 +29,7 @@ def pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
     return None
 
 
-def made_rigid(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def make_rigid(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Replace the rotation by the nearest exact one, unless it is within `FLOAT_NOISE`."""
     rotation = pose[:3, :3]
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > FLOAT_NOISE:
@@ -40,12 +40,12 @@ def made_rigid(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     return rigid
 
 
-def c2w_of(viewmat: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def invert_viewmat(viewmat: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Invert a world-to-camera transform; an invalid one stays, so its defect is found later."""
-    return viewmat if pose_defect(viewmat) is not None else np.linalg.inv(viewmat)
+    return viewmat if find_pose_defect(viewmat) is not None else np.linalg.inv(viewmat)
 
 
-def rotation_of(quaternion: Sequence[float]) -> Float[np.ndarray, "3 3"]:
+def compute_rotation(quaternion: Sequence[float]) -> Float[np.ndarray, "3 3"]:
     """Compute the rotation of a quaternion (real part first, any length); NaN if it is zero."""
     q = np.array(quaternion, dtype=np.float64)
     with np.errstate(all="ignore"):

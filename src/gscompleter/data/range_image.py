@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 
-def inclinations_of(
+def compute_inclinations(
     values: Float[np.ndarray, "h"] | None, low: float, high: float, height: int
 ) -> Float[np.ndarray, "h"]:
     """Compute the elevation of each row in radians, highest first.
@@ -21,34 +21,34 @@ def inclinations_of(
     return (even if values is None else values)[::-1]
 
 
-def azimuths_of(width: int, extrinsic: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "w"]:
+def compute_azimuths(width: int, extrinsic: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "w"]:
     """Compute the direction of each column in radians, in laser axes; the middle points ahead."""
     yaw = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
     return np.pi * (1 - 2 * (np.arange(width) + 0.5) / width) - yaw
 
 
-def points_of(
+def compute_points(
     ranges: Float[np.ndarray, "h w"],
     inclinations: Float[np.ndarray, "h"],
     extrinsic: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "h w 3"]:
     """Compute the measured points (metres) in the vehicle frame; `extrinsic` is the laser pose."""
     elevation = inclinations[:, None]
-    azimuth = azimuths_of(ranges.shape[1], extrinsic)[None]
+    azimuth = compute_azimuths(ranges.shape[1], extrinsic)[None]
     level = np.cos(elevation)
     up = np.broadcast_to(np.sin(elevation), ranges.shape)
     rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up], axis=-1)
-    return moved(ranges[..., None] * rays, extrinsic)
+    return transform_points(ranges[..., None] * rays, extrinsic)
 
 
-def moved(
+def transform_points(
     points: Float[np.ndarray, "*n 3"], pose: Float[np.ndarray, "*n 4 4"] | Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "*n 3"]:
     """Transform points from the local frame of `pose`, one for all or one per point."""
     return (pose[..., :3, :3] @ points[..., None])[..., 0] + pose[..., :3, 3]
 
 
-def poses_of(angles_and_places: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 4 4"]:
+def build_poses(angles_and_places: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 4 4"]:
     """Build poses from roll, pitch, yaw (radians; rolled first, yawed last) and x, y, z."""
     (sr, sp, sy), (cr, cp, cy) = (
         np.moveaxis(turn(angles_and_places[..., :3]), -1, 0) for turn in (np.sin, np.cos)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gscompleter.errors import InputError, quoted, refuse_pointer
+from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.reading import check_plain, read_bytes
 
 MAX_BYTES = 1 << 30
@@ -36,8 +36,8 @@ def load_plain(path: Path) -> Any:
         raise
     except Exception as error:  # damaged pickles raise anything
         raise InputError(
-            f"{quoted(path)} is no pickle of plain values ({type(error).__name__}: "
-            f"{quoted(str(error))}); write it again with lists and numbers only."
+            f"{quote_value(path)} is no pickle of plain values ({type(error).__name__}: "
+            f"{quote_value(str(error))}); write it again with lists and numbers only."
         ) from error
 
 
@@ -49,7 +49,7 @@ class _Plain(pickle._Unpickler):
     """
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
-        found = KNOWN.get((module.replace("numpy._core", "numpy.core"), name))
+        found = CONSTRUCTORS.get((module.replace("numpy._core", "numpy.core"), name))
         if found is None:
             raise pickle.UnpicklingError(f"it names {module}.{name}")
         return found
@@ -63,33 +63,33 @@ class _Kind:
 
     def __init__(self, code: str, align: bool = False, copy: bool = False) -> None:
         if code not in NUMBERS:
-            raise pickle.UnpicklingError(f"it holds NumPy values of the kind {quoted(code)}")
+            raise pickle.UnpicklingError(f"it holds NumPy values of the kind {quote_value(code)}")
         self.code, self.order = code, "="
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         self.order = state[1] if state[1] in ("<", ">", "=") else "="
 
 
-def _number(kind: _Kind, data: bytes) -> bool | int | float:
+def _build_number(kind: _Kind, data: bytes) -> bool | int | float:
     (value,) = np.frombuffer(data, np.dtype(kind.order + kind.code)).tolist()
     return value
 
 
-def _bytes_of(text: str, encoding: str) -> bytes:
+def _encode(text: str, encoding: str) -> bytes:
     if encoding != "latin1":
-        raise pickle.UnpicklingError(f"it uses the encoding {quoted(encoding)}")
+        raise pickle.UnpicklingError(f"it uses the encoding {quote_value(encoding)}")
     return text.encode("latin1")
 
 
-KNOWN: dict[tuple[str, str], Callable[..., Any]] = {
-    ("numpy.core.multiarray", "scalar"): _number,
+CONSTRUCTORS: dict[tuple[str, str], Callable[..., Any]] = {
+    ("numpy.core.multiarray", "scalar"): _build_number,
     ("numpy", "dtype"): _Kind,
-    ("_codecs", "encode"): _bytes_of,
+    ("_codecs", "encode"): _encode,
 }
 """Constructors for the accepted names."""
 
 
-def _guarded(code: bytes, is_plain: Callable[[list[Any]], bool]) -> Callable[[Any], None]:
+def _guard(code: bytes, is_plain: Callable[[list[Any]], bool]) -> Callable[[Any], None]:
     """Run an instruction only if the unpickler's stack is plain."""
     load: Callable[[Any], None] = pickle._Unpickler.dispatch[code[0]]
 
@@ -101,16 +101,16 @@ def _guarded(code: bytes, is_plain: Callable[[list[Any]], bool]) -> Callable[[An
     return load_guarded
 
 
-def _are_keys(keys: Sequence[Any]) -> bool:
+def _has_plain_keys(keys: Sequence[Any]) -> bool:
     return all(key is None or isinstance(key, (str, int, float)) for key in keys)
 
 
 _Plain.dispatch = {
     **pickle._Unpickler.dispatch,
-    pickle.SETITEM[0]: _guarded(pickle.SETITEM, lambda stack: _are_keys(stack[-2:-1])),
-    pickle.SETITEMS[0]: _guarded(pickle.SETITEMS, lambda stack: _are_keys(stack[::2])),
-    pickle.DICT[0]: _guarded(pickle.DICT, lambda stack: _are_keys(stack[::2])),
-    pickle.BUILD[0]: _guarded(pickle.BUILD, lambda stack: isinstance(stack[-2], _Kind)),
+    pickle.SETITEM[0]: _guard(pickle.SETITEM, lambda stack: _has_plain_keys(stack[-2:-1])),
+    pickle.SETITEMS[0]: _guard(pickle.SETITEMS, lambda stack: _has_plain_keys(stack[::2])),
+    pickle.DICT[0]: _guard(pickle.DICT, lambda stack: _has_plain_keys(stack[::2])),
+    pickle.BUILD[0]: _guard(pickle.BUILD, lambda stack: isinstance(stack[-2], _Kind)),
 }
 for _code in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET):
     del _Plain.dispatch[_code[0]]

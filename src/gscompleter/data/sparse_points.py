@@ -19,11 +19,11 @@ MIN_POINTS = 100
 """Fewest visible points that define a depth range."""
 PERCENTILES = (0.01, 0.99)
 """Percentiles of z-depth; points beyond are taken for mismatches."""
-NEAR_ROOM, FAR_ROOM = 0.5, 2.0
+NEAR_FACTOR, FAR_FACTOR = 0.5, 2.0
 """Factors on the nearest and farthest depth, because many surfaces have no points."""
 
 
-def with_depth_range(
+def add_depth_range(
     photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
 ) -> Photographs:
     """Set missing near and far planes from the points that the cameras of `frames` see."""
@@ -32,7 +32,7 @@ def with_depth_range(
     points = photographs.points()
     if points is None:
         return photographs
-    found = depth_range_of_points(points, [photographs.camera(f, resolution) for f in frames])
+    found = compute_depth_range(points, [photographs.camera(f, resolution) for f in frames])
     near, far = found or (None, None)
     near = near if photographs.near is None else photographs.near
     far = far if photographs.far is None else photographs.far
@@ -40,27 +40,27 @@ def with_depth_range(
     return photographs if empty else replace(photographs, near=near, far=far)
 
 
-def depth_range_of_points(
+def compute_depth_range(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera]
 ) -> tuple[float, float] | None:
     """Compute near and far planes (scene units) around the points that the cameras see.
 
     Returns None for too few points. Hidden points count too; the percentiles tolerate them.
     """
-    depths = torch.cat([torch.zeros(0), *(_depths_in_sight(points, c) for c in cameras)])
+    depths = torch.cat([torch.zeros(0), *(_compute_visible_depths(points, c) for c in cameras)])
     if len(depths) < MIN_POINTS:
         return None
     low, high = np.quantile(depths.double().numpy(), PERCENTILES).tolist()
-    near, far = with_room(low, high)
+    near, far = widen_depth_range(low, high)
     return (near, far) if DEPTH_RANGE[0] <= near < far <= DEPTH_RANGE[1] else None
 
 
-def with_room(nearest: float, farthest: float) -> tuple[float, float]:
+def widen_depth_range(nearest: float, farthest: float) -> tuple[float, float]:
     """Widen a depth range (scene units) for surfaces without points."""
-    return NEAR_ROOM * nearest, FAR_ROOM * farthest
+    return NEAR_FACTOR * nearest, FAR_FACTOR * farthest
 
 
-def _depths_in_sight(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "m"]:
+def _compute_visible_depths(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "m"]:
     """Compute the z-depths of the points that project into the image."""
     local = (points - camera.center) @ camera.c2w[:3, :3]
     front = local[local[:, 2] > 0]

@@ -19,19 +19,19 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
 
-from gscompleter.data.frame import DOWNSCALED
+from gscompleter.data.frame import DOWNSCALE_FACTORS
 from gscompleter.data.image_folders import MASKS
-from gscompleter.data.match_pairs import in_order
-from gscompleter.data.upright import Upright, write_upright
-from gscompleter.errors import InputError, names_listed, quoted
-from gscompleter.io.files import SUMMARY, output_folder
+from gscompleter.data.match_pairs import make_sort_key
+from gscompleter.data.upright import UprightCopy, write_upright
+from gscompleter.errors import InputError, join_names, quote_value
+from gscompleter.io.files import SUMMARY_FILE, open_output_folder
 from gscompleter.io.json_file import read_json
 from gscompleter.progress import track
-from gscompleter.threads import threads
+from gscompleter.threads import get_thread_count
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Endings of photographs, in any case."""
-NO_PHOTOGRAPHS = (MASKS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALED))
+OTHER_FOLDERS = (MASKS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALE_FACTORS))
 """Folders that hold no photographs of the user."""
 POSES = "colmap"
 """Output folder of a completion for the poses found for it."""
@@ -69,15 +69,15 @@ class FoundPoses:
     """True if the result is from an earlier run."""
 
     @property
-    def registered(self) -> int:
+    def num_registered(self) -> int:
         """Number of cameras found."""
         return self.photographs - len(self.missing)
 
     @property
-    def is_too_little(self) -> bool:
+    def is_too_small(self) -> bool:
         """True if the model has too few photographs or points."""
         enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * self.photographs)
-        return self.registered < enough or self.points < MIN_POINTS
+        return self.num_registered < enough or self.points < MIN_POINTS
 
     @property
     def notes(self) -> list[str]:
@@ -85,7 +85,8 @@ class FoundPoses:
         notes, place = [], ""
         if self.focal is not None:
             notes.append(
-                f"{self.registered} of {self.photographs} cameras were found with a focal length "
+                f"{self.num_registered} of {self.photographs} cameras were found with a focal "
+                "length "
                 f"of {self.focal:.0f} px, fixed at plausible values first, because COLMAP failed "
                 "with a free one."
             )
@@ -97,7 +98,7 @@ class FoundPoses:
             )
             place = " in it"
         if self.missing:
-            names = names_listed(self.missing, MAX_NAMED)
+            names = join_names(self.missing, MAX_NAMED)
             notes.append(f"No camera was found{place} for {names}; they are left out.")
         return notes
 
@@ -109,32 +110,33 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
         InputError: If there are too few photographs, cameras or points, a photograph is damaged,
             the lens is implausible, pycolmap is missing or fails, or `out` cannot be written.
     """
-    names = photographs_in(photographs)
-    known = _fingerprint(photographs, names)
-    earlier = _found_earlier(out, known)
+    names = list_photograph_files(photographs)
+    known = _compute_fingerprint(photographs, names)
+    earlier = _read_earlier(out, known)
     if earlier is not None:
         return earlier
     check_pycolmap()
-    with output_folder(out, overwrite) as folder:
-        found = _find(photographs, names, folder)
+    with open_output_folder(out, overwrite) as folder:
+        found = _run(photographs, names, folder)
         content = {"found": asdict(found), "photographs": known}
-        (folder / SUMMARY).write_text(json.dumps(content, indent=1))
+        (folder / SUMMARY_FILE).write_text(json.dumps(content, indent=1))
     return found
 
 
-def holds_photographs(path: Path) -> bool:
+def has_photographs(path: Path) -> bool:
     """Check whether `path` is a folder with photographs, with or without cameras."""
-    return os.path.isdir(path) and bool(_listed(path))
+    return os.path.isdir(path) and bool(_walk_photographs(path))
 
 
-def photographs_in(folder: Path) -> list[str]:
+def list_photograph_files(folder: Path) -> list[str]:
     """List the photographs below a folder in natural order; at least `MIN_PHOTOGRAPHS`."""
     if not os.path.isdir(folder):
-        raise InputError(f"There is no folder {quoted(folder)}; name a folder of photographs.")
-    names = _listed(folder)
+        raise InputError(f"There is no folder {quote_value(folder)}; name a folder of photographs.")
+    names = _walk_photographs(folder)
     if len(names) < MIN_PHOTOGRAPHS:
         raise InputError(
-            f"There are {len(names)} photographs ({', '.join(ENDINGS)}) in {quoted(folder)}, and "
+            f"There are {len(names)} photographs ({', '.join(ENDINGS)}) in {quote_value(folder)}, "
+            "and "
             f"at least {MIN_PHOTOGRAPHS} are needed to find their cameras; add more."
         )
     return names
@@ -149,32 +151,32 @@ def check_pycolmap() -> None:
         )
 
 
-def _listed(folder: Path) -> list[str]:
+def _walk_photographs(folder: Path) -> list[str]:
     found: list[Path] = []
     for home, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if is_own(Path(home, name))]
         shown = (Path(home, name) for name in files if not name.startswith("."))
         found += [path.relative_to(folder) for path in shown if path.suffix.lower() in ENDINGS]
-    return sorted((path.as_posix() for path in found), key=in_order)
+    return sorted((path.as_posix() for path in found), key=make_sort_key)
 
 
 def is_own(folder: Path) -> bool:
     """Check that a folder may hold photographs: not hidden, masks, depth, copies or our result."""
-    if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
+    if folder.name.startswith(".") or folder.name.casefold() in OTHER_FOLDERS:
         return False
-    return not os.path.isfile(folder / SUMMARY)
+    return not os.path.isfile(folder / SUMMARY_FILE)
 
 
-def _fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
+def _compute_fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
     stats = {name: (folder / name).stat() for name in names}
     return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
 
-def _found_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
+def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
     """Read the earlier result for these photographs; None if missing or too small."""
-    if not os.path.isfile(out / SUMMARY) or not os.path.isdir(out / "sparse" / "0"):
+    if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
         return None
-    content = read_json(out / SUMMARY, "name another folder")
+    content = read_json(out / SUMMARY_FILE, "name another folder")
     if not isinstance(content, dict) or content.get("photographs") != known:
         return None
     found = content["found"]
@@ -187,20 +189,20 @@ def _found_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | No
         found.get("focal"),
         reused=True,
     )
-    return None if earlier.is_too_little else earlier
+    return None if earlier.is_too_small else earlier
 
 
-def _find(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
+def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
     """Write `images` and `sparse/0` into `folder`."""
     copies = [
         write_upright(photographs, name, folder / "images")
         for name in track(names, "Turning photographs upright")
     ]
-    result = _mapped(copies, folder)
+    result = _map(copies, folder)
     if not result["registered"]:
         raise InputError(
             f"COLMAP found no cameras for the {len(names)} photographs in "
-            f"{quoted(str(photographs))}; add photographs of the same scene that overlap by "
+            f"{quote_value(str(photographs))}; add photographs of the same scene that overlap by "
             "two thirds and are sharp."
         )
     registered = set(result["registered"])
@@ -218,17 +220,17 @@ def _find(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
 
 def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> None:
     """Raise an InputError for a model that is too small or has an implausible lens."""
-    if not found.is_too_little and defect is None:
+    if not found.is_too_small and defect is None:
         return
     lens = "" if defect is None else f", {defect}"
     raise InputError(
-        f"COLMAP placed {found.registered} of {found.photographs} photographs in "
-        f"{quoted(photographs, 40)}, with {found.points:,} points{lens}, which is no usable "
+        f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
+        f"{quote_value(photographs, 40)}, with {found.points:,} points{lens}, which is no usable "
         "model; add sharp photographs that overlap by two thirds, or name their cameras."
     )
 
 
-def _mapped(copies: Sequence[Upright], folder: Path) -> dict[str, Any]:
+def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
     """Run `mapping_process` on the copies in `folder/images`."""
     with tempfile.TemporaryDirectory(dir=folder) as work:
         job = {
@@ -236,16 +238,16 @@ def _mapped(copies: Sequence[Upright], folder: Path) -> dict[str, Any]:
             "work": work,
             "model": str(folder / "sparse" / "0"),
             "photographs": [asdict(copy) for copy in copies],
-            "threads": min(MAX_THREADS, threads()),
+            "threads": min(MAX_THREADS, get_thread_count()),
             "wanted": math.ceil(WANTED_SHARE * len(copies)),
             "min_points": MIN_POINTS,
         }
         (Path(work) / "job.json").write_text(json.dumps(job), encoding="utf-8")
         with (Path(work) / "complaints.txt").open("w+", errors="replace") as complaints:
-            return _result_of(Path(work) / "job.json", complaints)
+            return _run_process(Path(work) / "job.json", complaints)
 
 
-def _result_of(job: Path, complaints: IO[str]) -> dict[str, Any]:
+def _run_process(job: Path, complaints: IO[str]) -> dict[str, Any]:
     process = subprocess.Popen(
         [sys.executable, "-m", PROCESS, str(job)],
         stdin=subprocess.DEVNULL,
@@ -254,17 +256,17 @@ def _result_of(job: Path, complaints: IO[str]) -> dict[str, Any]:
         text=True,
     )
     try:
-        phase, result = _followed(process)
+        phase, result = _follow(process)
         process.wait()
     finally:
         process.kill()
         process.wait()
     if result is None:
-        raise InputError(_gave_up(phase, process.returncode, complaints))
+        raise InputError(_explain_failure(phase, process.returncode, complaints))
     return result
 
 
-def _followed(process: subprocess.Popen[str]) -> tuple[str, dict[str, Any] | None]:
+def _follow(process: subprocess.Popen[str]) -> tuple[str, dict[str, Any] | None]:
     """Show the progress of a process; return the last phase and its result."""
     assert process.stdout is not None
     phase, result = "Starting", None
@@ -283,10 +285,10 @@ def _show(lines: Iterator[dict[str, Any]], phase: str, steps: int) -> None:
             return
 
 
-def _gave_up(phase: str, code: int, complaints: IO[str]) -> str:
+def _explain_failure(phase: str, code: int, complaints: IO[str]) -> str:
     complaints.seek(0)
     messages = [line.strip() for line in complaints if line.strip()]
-    reason = f": {quoted(messages[-1], 200)}" if messages else f" with exit code {code}"
+    reason = f": {quote_value(messages[-1], 200)}" if messages else f" with exit code {code}"
     return (
         f"COLMAP gave up while {phase[0].lower()}{phase[1:]}{reason}; leave out photographs that "
         "may be damaged, and try again."

@@ -13,22 +13,22 @@ from typing import Any
 
 from PIL import Image, ImageOps
 
-from gscompleter.errors import InputError, quoted, refuse_pointer
-from gscompleter.io.image import FORMATS
+from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.io.image import IMAGE_FORMATS
 from gscompleter.reading import check_file
 
 MAX_SIDE = 1600
 """Longest side of a copy in pixels; SIFT finds no better features in larger ones."""
 QUALITY = 95
 """JPEG quality of rotated or shrunk copies."""
-FULL_FRAME = 43.2666
+FULL_FRAME_DIAGONAL = 43.2666
 """Diagonal of 36 x 24 mm, the reference of EXIF's "focal length in 35 mm film"."""
 ORIENTATION, MAKE, MODEL = 0x0112, 0x010F, 0x0110
 EXIF, FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x8769, 0x920A, 0xA405
 
 
 @dataclass(frozen=True)
-class Upright:
+class UprightCopy:
     """An upright copy of a photograph, and known data of its camera."""
 
     name: str
@@ -43,7 +43,7 @@ class Upright:
     """Key of camera, lens and zoom from EXIF."""
 
 
-def write_upright(root: Path, source: str, folder: Path) -> Upright:
+def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
     """Write an upright copy of the photograph `root`/`source` to the same place in `folder`.
 
     A small upright 8-bit JPEG or PNG is copied byte for byte; a format that COLMAP may not read
@@ -52,39 +52,49 @@ def write_upright(root: Path, source: str, folder: Path) -> Upright:
     check_file(root / source)
     refuse_pointer(root / source)
     try:
-        with Image.open(root / source, formats=FORMATS) as image:
+        with Image.open(root / source, formats=IMAGE_FORMATS) as image:
             exif = image.getexif()
-            name = _name(source, image.format)
-            target = _free(folder / name, root / source)
-            width, height = _write(image, exif, root / source, target)
-            return Upright(name, source, width, height, _focal(exif, width, height), _lens(exif))
+            name = _name_copy(source, image.format)
+            target = _reserve_path(folder / name, root / source)
+            width, height = _write_copy(image, exif, root / source, target)
+            return UprightCopy(
+                name,
+                source,
+                width,
+                height,
+                _compute_focal(exif, width, height),
+                _describe_lens(exif),
+            )
     except InputError:
         raise
     # Damaged files raise anything.
     except Exception as error:
         raise InputError(
-            f"{quoted(root / source)} cannot be read as an image ({quoted(str(error))}); copy it "
+            f"{quote_value(root / source)} cannot be read as an image "
+            f"({quote_value(str(error))}); copy it "
             "again, or take it out of the folder."
         ) from error
 
 
-def _name(source: str, format: str | None) -> str:
+def _name_copy(source: str, format: str | None) -> str:
     """Name the copy; in COLMAP's lists a space ends a name, and # begins a comment."""
     return re.sub(r"[\s#]", "_", source) + ("" if format in ("JPEG", "PNG") else ".png")
 
 
-def _free(target: Path, source: Path) -> Path:
+def _reserve_path(target: Path, source: Path) -> Path:
     """Create the folder of the copy; refuse a name that is taken."""
     if target.exists():
         raise InputError(
-            f"The copy of {quoted(source)} would be called {target.name} like that of another "
+            f"The copy of {quote_value(source)} would be called {target.name} like that of another "
             "photograph; rename one of them."
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     return target
 
 
-def _write(image: Image.Image, exif: Image.Exif, source: Path, target: Path) -> tuple[int, int]:
+def _write_copy(
+    image: Image.Image, exif: Image.Exif, source: Path, target: Path
+) -> tuple[int, int]:
     plain = image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L")
     upright = exif.get(ORIENTATION, 1) == 1
     if plain and upright and max(image.size) <= MAX_SIDE:
@@ -103,15 +113,15 @@ def _write(image: Image.Image, exif: Image.Exif, source: Path, target: Path) -> 
     return copy.size
 
 
-def _focal(exif: Image.Exif, width: int, height: int) -> float | None:
+def _compute_focal(exif: Image.Exif, width: int, height: int) -> float | None:
     """Compute the focal length in pixels from the 35 mm equivalent; None if there is none."""
-    millimetres = _number(exif.get_ifd(EXIF).get(FOCAL_LENGTH_35))
+    millimetres = _parse_number(exif.get_ifd(EXIF).get(FOCAL_LENGTH_35))
     if millimetres is None or not 1 <= millimetres <= 5000:
         return None
-    return millimetres / FULL_FRAME * float(width**2 + height**2) ** 0.5
+    return millimetres / FULL_FRAME_DIAGONAL * float(width**2 + height**2) ** 0.5
 
 
-def _lens(exif: Image.Exif) -> str:
+def _describe_lens(exif: Image.Exif) -> str:
     detail = exif.get_ifd(EXIF)
     values = (
         exif.get(MAKE),
@@ -122,7 +132,7 @@ def _lens(exif: Image.Exif) -> str:
     return " ".join(str(value) for value in values if value is not None)
 
 
-def _number(value: Any) -> float | None:
+def _parse_number(value: Any) -> float | None:
     """Convert an EXIF value; broken ones are common and give None."""
     try:
         return float(value)

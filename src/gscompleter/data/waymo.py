@@ -22,11 +22,16 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.lens import Distortion
 from gscompleter.data.limits import MAX_SIDE
-from gscompleter.data.moving_objects import Box, upright
+from gscompleter.data.moving_objects import Box, build_upright_pose
 from gscompleter.data.parquet import ADVICE, read_columns
-from gscompleter.data.photographs import Photographs, along_a_road
-from gscompleter.data.range_image import inclinations_of, moved, points_of, poses_of
-from gscompleter.errors import InputError, quoted
+from gscompleter.data.photographs import Photographs, build_drive
+from gscompleter.data.range_image import (
+    build_poses,
+    compute_inclinations,
+    compute_points,
+    transform_points,
+)
+from gscompleter.errors import InputError, quote_value
 
 IMAGES = "camera_image"
 CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
@@ -45,7 +50,7 @@ LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "k3", "p1", "p2")
 TIME, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
 
 
-def holds_waymo(path: Path) -> bool:
+def has_waymo(path: Path) -> bool:
     """Check whether `path` is a folder of segments, or the photographs of one."""
     if os.path.isdir(path):
         return any((path / IMAGES).glob("*.parquet"))
@@ -62,7 +67,7 @@ def open_waymo(path: Path) -> Iterator[Photographs]:
         segments = [Segment(path, name) for name in names]
     else:
         segments = [Segment(path.parent.parent, path.stem)]
-    return map(_photographs, segments)
+    return map(_open_segment, segments)
 
 
 @dataclass(frozen=True)
@@ -73,77 +78,79 @@ class Segment:
     """Folder with a subfolder per component."""
     name: str
 
-    def file(self, component: str) -> Path:
+    def get_path(self, component: str) -> Path:
         """Return the path of a component."""
         return self.root / component / f"{self.name}.parquet"
 
-    def has(self, *components: str) -> bool:
+    def has_components(self, *components: str) -> bool:
         """Check whether all these components exist."""
-        return all(os.path.isfile(self.file(component)) for component in components)
+        return all(os.path.isfile(self.get_path(component)) for component in components)
 
-    def rows(
+    def read_rows(
         self, component: str, columns: dict[str, str], **where: int
     ) -> Iterator[dict[str, Any]]:
         """Read rows of a component as dicts with the keys of `columns`, filtered by `where`."""
         keys = {{"time": TIME, "camera": CAMERA}[key]: value for key, value in where.items()}
-        found = read_columns(self.file(component), list(columns.values()), keys)
+        found = read_columns(self.get_path(component), list(columns.values()), keys)
         values = [found[column] for column in columns.values()]
         return (dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True))
 
 
-def _photographs(segment: Segment) -> Photographs:
-    file = segment.file(IMAGES)
+def _open_segment(segment: Segment) -> Photographs:
+    file = segment.get_path(IMAGES)
     columns = {"time": TIME, "camera": CAMERA, "pose": "[CameraImageComponent].pose.transform"}
-    cameras = _cameras(segment)
+    cameras = _read_cameras(segment)
     rows = sorted(
-        (row for row in segment.rows(IMAGES, columns) if row["camera"] in CAMERAS),
+        (row for row in segment.read_rows(IMAGES, columns) if row["camera"] in CAMERAS),
         key=lambda row: (row["camera"], row["time"]),
     )
     if not rows:
-        raise InputError(f"{quoted(file)} holds no photographs; {ADVICE}.")
-    frames = [_frame(segment, cameras, **row) for row in rows]
-    return along_a_road(segment.name, str(file), frames, front=CAMERAS[1])
+        raise InputError(f"{quote_value(file)} holds no photographs; {ADVICE}.")
+    frames = [_make_frame(segment, cameras, **row) for row in rows]
+    return build_drive(segment.name, str(file), frames, front=CAMERAS[1])
 
 
-def _frame(
+def _make_frame(
     segment: Segment,
     cameras: dict[int, tuple[Intrinsics, Float[np.ndarray, "4 4"]]],
     time: int,
     camera: int,
     pose: Any,
 ) -> Frame:
-    title = f"the photograph of {CAMERAS[camera]} at {time} in {quoted(segment.file(IMAGES))}"
+    title = (
+        f"the photograph of {CAMERAS[camera]} at {time} in {quote_value(segment.get_path(IMAGES))}"
+    )
     if camera not in cameras:
         raise InputError(f"The camera of {title} has no calibration; {ADVICE}.")
     intrinsics, vehicle_from_camera = cameras[camera]
-    measured = segment.has("lidar", "lidar_calibration", "vehicle_pose")
-    boxed = segment.has("lidar_box", "vehicle_pose")
+    measured = segment.has_components("lidar", "lidar_calibration", "vehicle_pose")
+    boxed = segment.has_components("lidar_box", "vehicle_pose")
     return Frame(
         f"{CAMERAS[camera]}/{time}",
         title,
-        _matrix(pose, title) @ vehicle_from_camera @ CAMERA_FROM_OPENCV,
+        _parse_matrix(pose, title) @ vehicle_from_camera @ CAMERA_FROM_OPENCV,
         intrinsics,
-        partial(_image, segment, time, camera),
+        partial(_read_image, segment, time, camera),
         sensor=CAMERAS[camera],
-        measured=partial(_points, segment, time) if measured else None,
-        boxes=partial(_boxes, segment, time) if boxed else None,
+        laser_points=partial(_read_points, segment, time) if measured else None,
+        boxes=partial(_read_boxes, segment, time) if boxed else None,
     )
 
 
-def _cameras(segment: Segment) -> dict[int, tuple[Intrinsics, Float[np.ndarray, "4 4"]]]:
+def _read_cameras(segment: Segment) -> dict[int, tuple[Intrinsics, Float[np.ndarray, "4 4"]]]:
     """Read intrinsics and pose on the vehicle (Waymo axes) of each camera."""
     prefix = "[CameraCalibrationComponent]"
     columns = {"camera": CAMERA, **{key: f"{prefix}.intrinsic.{key}" for key in LENS}}
     columns |= {"width": f"{prefix}.width", "height": f"{prefix}.height"}
     columns |= {"pose": f"{prefix}.extrinsic.transform"}
-    title = str(segment.file("camera_calibration"))
+    title = str(segment.get_path("camera_calibration"))
     return {
-        row["camera"]: (_intrinsics(row, title), _matrix(row["pose"], title))
-        for row in segment.rows("camera_calibration", columns)
+        row["camera"]: (_parse_intrinsics(row, title), _parse_matrix(row["pose"], title))
+        for row in segment.read_rows("camera_calibration", columns)
     }
 
 
-def _intrinsics(row: dict[str, Any], title: str) -> Intrinsics:
+def _parse_intrinsics(row: dict[str, Any], title: str) -> Intrinsics:
     values = {key: value for key, value in row.items() if key != "pose"}
     if any(value is None or not np.isfinite(value) for value in values.values()):
         raise InputError(f"A camera in {title} lacks intrinsics; {ADVICE}.")
@@ -160,126 +167,129 @@ def _intrinsics(row: dict[str, Any], title: str) -> Intrinsics:
     )
 
 
-def _image(segment: Segment, time: int, camera: int) -> bytes:
+def _read_image(segment: Segment, time: int, camera: int) -> bytes:
     columns = {"image": "[CameraImageComponent].image"}
-    found = [row["image"] for row in segment.rows(IMAGES, columns, time=time, camera=camera)]
+    found = [row["image"] for row in segment.read_rows(IMAGES, columns, time=time, camera=camera)]
     if len(found) != 1 or not isinstance(found[0], bytes):
         raise InputError(
-            f"{quoted(segment.file(IMAGES))} has no image of {CAMERAS[camera]} at {time}; {ADVICE}."
+            f"{quote_value(segment.get_path(IMAGES))} has no image of {CAMERAS[camera]} at "
+            f"{time}; {ADVICE}."
         )
     return found[0]
 
 
 @lru_cache(maxsize=2)
-def _points(segment: Segment, time: int) -> Float[np.ndarray, "n 3"]:
+def _read_points(segment: Segment, time: int) -> Float[np.ndarray, "n 3"]:
     """Read the first laser returns in the world frame, in metres.
 
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
-    vehicle = _vehicle(segment, time)
+    vehicle = _read_vehicle_pose(segment, time)
     prefix = "[LiDARComponent].range_image_return1"
     columns = {"laser": LASER, "values": f"{prefix}.values", "shape": f"{prefix}.shape"}
-    lasers, turning = _lasers(segment), _poses_while_turning(segment, time)
+    lasers, turning = _read_lasers(segment), _read_pixel_poses(segment, time)
     points = [np.zeros((0, 3))]
-    for row in segment.rows("lidar", columns, time=time):
-        laser, image = row["laser"], _image_of(row, segment.file("lidar"))
+    for row in segment.read_rows("lidar", columns, time=time):
+        laser, image = row["laser"], _reshape_image(row, segment.get_path("lidar"))
         if image is None:
             continue
         ranges, poses = image[..., 0], turning.get(laser, vehicle)
-        if laser not in lasers or not _fit_together(ranges, lasers[laser][0], poses):
+        if laser not in lasers or not _is_consistent(ranges, lasers[laser][0], poses):
             raise InputError(
-                f"Laser {laser} of {quoted(segment.file('lidar'))} does not fit its calibration or "
+                f"Laser {laser} of {quote_value(segment.get_path('lidar'))} does not fit its "
+                "calibration or "
                 f"its poses; {ADVICE}."
             )
-        points.append(_hits(ranges, *lasers[laser], poses))
+        points.append(_compute_hits(ranges, *lasers[laser], poses))
     return np.concatenate(points)
 
 
-def _fit_together(ranges: np.ndarray, beams: Beams, poses: np.ndarray) -> bool:
+def _is_consistent(ranges: np.ndarray, beams: Beams, poses: np.ndarray) -> bool:
     """Check that the range image has one beam per row and one pose per pixel, if any."""
     values, low, high = beams
     known = low is not None and high is not None if values is None else len(values) == len(ranges)
     return known and (poses.ndim == 2 or poses.shape[:2] == ranges.shape)
 
 
-def _hits(
+def _compute_hits(
     ranges: Float[np.ndarray, "h w"],
     beams: Beams,
     extrinsic: Float[np.ndarray, "4 4"],
     vehicle: Float[np.ndarray, "h w 4 4"] | Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "n 3"]:
     """Compute hit points in the world frame; `vehicle` is one pose or one per pixel."""
-    local = points_of(ranges, inclinations_of(*beams, len(ranges)), extrinsic)
+    local = compute_points(ranges, compute_inclinations(*beams, len(ranges)), extrinsic)
     hit = np.isfinite(ranges) & (ranges > 0)
-    return moved(local[hit], vehicle if vehicle.ndim == 2 else vehicle[hit])
+    return transform_points(local[hit], vehicle if vehicle.ndim == 2 else vehicle[hit])
 
 
-def _vehicle(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
-    title = str(segment.file("vehicle_pose"))
+def _read_vehicle_pose(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
+    title = str(segment.get_path("vehicle_pose"))
     columns = {"pose": "[VehiclePoseComponent].world_from_vehicle.transform"}
     found = [
-        _matrix(row["pose"], title) for row in segment.rows("vehicle_pose", columns, time=time)
+        _parse_matrix(row["pose"], title)
+        for row in segment.read_rows("vehicle_pose", columns, time=time)
     ]
     if len(found) != 1:
         raise InputError(f"{title} has {len(found)} poses at {time}; {ADVICE}.")
     return found[0]
 
 
-def _lasers(segment: Segment) -> dict[int, tuple[Beams, Float[np.ndarray, "4 4"]]]:
+def _read_lasers(segment: Segment) -> dict[int, tuple[Beams, Float[np.ndarray, "4 4"]]]:
     prefix = "[LiDARCalibrationComponent]"
     columns = {"laser": LASER, "pose": f"{prefix}.extrinsic.transform"}
     columns |= {key: f"{prefix}.beam_inclination.{key}" for key in ("values", "min", "max")}
-    title = str(segment.file("lidar_calibration"))
+    title = str(segment.get_path("lidar_calibration"))
     return {
-        row["laser"]: ((row["values"], row["min"], row["max"]), _matrix(row["pose"], title))
-        for row in segment.rows("lidar_calibration", columns)
+        row["laser"]: ((row["values"], row["min"], row["max"]), _parse_matrix(row["pose"], title))
+        for row in segment.read_rows("lidar_calibration", columns)
     }
 
 
-def _poses_while_turning(segment: Segment, time: int) -> dict[int, Float[np.ndarray, "h w 4 4"]]:
+def _read_pixel_poses(segment: Segment, time: int) -> dict[int, Float[np.ndarray, "h w 4 4"]]:
     """Read vehicle poses per pixel of each range image, if present."""
-    if not segment.has("lidar_pose"):
+    if not segment.has_components("lidar_pose"):
         return {}
     prefix = "[LiDARPoseComponent].range_image_return1"
     columns = {"laser": LASER, "values": f"{prefix}.values", "shape": f"{prefix}.shape"}
     images = {
-        row["laser"]: _image_of(row, segment.file("lidar_pose"))
-        for row in segment.rows("lidar_pose", columns, time=time)
+        row["laser"]: _reshape_image(row, segment.get_path("lidar_pose"))
+        for row in segment.read_rows("lidar_pose", columns, time=time)
     }
-    return {laser: poses_of(image) for laser, image in images.items() if image is not None}
+    return {laser: build_poses(image) for laser, image in images.items() if image is not None}
 
 
-def _image_of(row: dict[str, Any], file: Path) -> Float[np.ndarray, "h w c"] | None:
+def _reshape_image(row: dict[str, Any], file: Path) -> Float[np.ndarray, "h w c"] | None:
     values, shape = row["values"], row["shape"]
     if values is None or shape is None:
         return None
     if len(shape) != 3 or any(side < 1 for side in shape) or len(values) != np.prod(shape):
-        raise InputError(f"A range image in {quoted(file)} is damaged; {ADVICE}.")
+        raise InputError(f"A range image in {quote_value(file)} is damaged; {ADVICE}.")
     return np.asarray(values, dtype=np.float64).reshape(shape)
 
 
-def _boxes(segment: Segment, time: int) -> tuple[Box, ...]:
+def _read_boxes(segment: Segment, time: int) -> tuple[Box, ...]:
     """Read the boxes of objects around the vehicle, except signs."""
-    vehicle = _vehicle(segment, time)
+    vehicle = _read_vehicle_pose(segment, time)
     prefix = "[LiDARBoxComponent]"
     columns = {"type": f"{prefix}.type", "heading": f"{prefix}.box.heading"}
     columns |= {f"center_{axis}": f"{prefix}.box.center.{axis}" for axis in "xyz"}
     columns |= {f"size_{axis}": f"{prefix}.box.size.{axis}" for axis in "xyz"}
     columns |= {f"speed_{axis}": f"{prefix}.speed.{axis}" for axis in "xyz"}
-    rows = segment.rows("lidar_box", columns, time=time)
-    return tuple(_box(row, vehicle) for row in rows if row["type"] != SIGN)
+    rows = segment.read_rows("lidar_box", columns, time=time)
+    return tuple(_parse_box(row, vehicle) for row in rows if row["type"] != SIGN)
 
 
-def _box(row: dict[str, Any], vehicle: Float[np.ndarray, "4 4"]) -> Box:
+def _parse_box(row: dict[str, Any], vehicle: Float[np.ndarray, "4 4"]) -> Box:
     def read(key: str) -> Float[np.ndarray, "3"]:
         return np.array([row[f"{key}_{axis}"] for axis in "xyz"], dtype=np.float64)
 
     speed, (length, width, height) = float(np.linalg.norm(read("speed"))), read("size").tolist()
-    pose = vehicle @ upright(read("center"), np.float64(row["heading"]))
+    pose = vehicle @ build_upright_pose(read("center"), np.float64(row["heading"]))
     return Box(pose, (length, width, height), speed if np.isfinite(speed) else None)
 
 
-def _matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:
+def _parse_matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:
     if values is None or len(values) != 16 or not np.isfinite(values).all():
         raise InputError(f"A transform in {title} is damaged; {ADVICE}.")
     return np.asarray(values, dtype=np.float64).reshape(4, 4)

@@ -10,53 +10,51 @@ from typing import Literal
 import numpy as np
 
 from gscompleter.errors import InputError
-from gscompleter.frames.fit import FrameFit, frame_fit
-from gscompleter.frames.matching import photographs_of
-from gscompleter.frames.refinement import refined
-from gscompleter.frames.search import searched
+from gscompleter.frames.fit import SplatFit, score_splat
+from gscompleter.frames.matching import extract_photo_features
+from gscompleter.frames.refinement import refine_similarity
+from gscompleter.frames.search import search_similarities
 from gscompleter.frames.similarity import (
     Matrix,
-    moved_camera,
-    moved_view,
-    pose_of,
-    stand_apart,
+    get_pose,
+    has_baseline,
+    transform_camera,
+    transform_view,
 )
-from gscompleter.frames.thinning import thinned
-from gscompleter.frames.trainers import Points, Poses, trainers_frames
-from gscompleter.frames.witnesses import LONG_SIDE, rough_points
+from gscompleter.frames.thinning import thin_gaussians
+from gscompleter.frames.trainers import Points, Poses, compute_trainer_frames
+from gscompleter.frames.witnesses import LONG_SIDE, estimate_points
 from gscompleter.render import Renderer
-from gscompleter.render.proxy import proxy_of
+from gscompleter.render.proxy import build_proxy
 from gscompleter.types import Gaussians, View
 
-CLEARLY = 2.0
+MIN_IMPROVEMENT = 2.0
 """Gain in dB by which a frame must fit better than a simpler one; blur alone can cause 1 dB."""
 
-FAR_OFF = 2.0
+DRIFT_WARNING = 2.0
 """Displacement in pixels of the small photographs from which the user is warned."""
 
-Method = Literal["given", "cameras", "dataparser", "normalised", "similarity"]
-Candidate = tuple[Method, Matrix]
+AlignmentMethod = Literal["given", "cameras", "dataparser", "normalised", "similarity"]
+FrameProposal = tuple[AlignmentMethod, Matrix]
 """A transform from the photographs' frame to the splat's, and its source."""
 
 
 @dataclass(frozen=True)
-class SplatFrame:
+class SplatAlignment:
     """The frame of a splat relative to its photographs."""
 
-    method: Method
+    method: AlignmentMethod
     """Source of the transform: none, a file of the trainer, its normalisation, or the images."""
     transform: Matrix
     """From the frame of the photographs to that of the splat."""
-    fit: FrameFit
+    fit: SplatFit
     """Fit of the splat to the photographs under `transform`."""
-    given: FrameFit
+    given_fit: SplatFit
     """Fit under the identity."""
 
-    def sentence(self) -> str:
+    def describe(self) -> str:
         """Describe the alignment in a sentence."""
-        found = (
-            f"it fits the photographs at {self.fit.psnr:.1f} dB ({self.given.psnr:.1f} dB as given)"
-        )
+        found = f"it fits the photographs at {self.fit.psnr:.1f} dB ({self.given_fit.psnr:.1f} dB as given)"
         where = {
             "given": f"The splat fits the photographs as it is, at {self.fit.psnr:.1f} dB",
             "cameras": f"The splat is in the frame of its trainer's camera list: {found}",
@@ -64,7 +62,7 @@ class SplatFrame:
             "normalised": f"The splat is in the frame that its trainer normalised to: {found}",
             "similarity": f"The splat is in a frame found by matching image features: {found}",
         }[self.method]
-        if not FAR_OFF < self.fit.drift < math.inf:
+        if not DRIFT_WARNING < self.fit.drift < math.inf:
             return f"{where}."
         return (
             f"{where}; but details are off by {self.fit.drift:.1f} px in images of {LONG_SIDE} px."
@@ -72,7 +70,7 @@ class SplatFrame:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class AlignmentData:
     """The splat and the photographs that it is aligned with."""
 
     scene: Gaussians
@@ -81,24 +79,24 @@ class Evidence:
     """A few small photographs, in their own frame."""
     renderer: Renderer
 
-    def near(self, transform: Matrix) -> Evidence:
+    def restrict_to(self, transform: Matrix) -> AlignmentData:
         """Simplify the splat to what the cameras see under `transform`, photographs to splat."""
-        cameras = [moved_camera(view.camera, transform) for view in self.views]
-        proxy = proxy_of(self.scene, cameras)
-        return replace(self, scene=thinned(self.scene if proxy is None else proxy.scene))
+        cameras = [transform_camera(view.camera, transform) for view in self.views]
+        proxy = build_proxy(self.scene, cameras)
+        return replace(self, scene=thin_gaussians(self.scene if proxy is None else proxy.scene))
 
-    def at(self, transform: Matrix) -> FrameFit:
+    def score_transform(self, transform: Matrix) -> SplatFit:
         """Score a transform from the photographs' frame to the splat's."""
-        views = [moved_view(view, transform) for view in self.views]
-        return frame_fit(self.near(transform).scene, views, self.renderer)
+        views = [transform_view(view, transform) for view in self.views]
+        return score_splat(self.restrict_to(transform).scene, views, self.renderer)
 
 
-def find_frame(
-    evidence: Evidence,
+def estimate_alignment(
+    data: AlignmentData,
     poses: Poses,
     points: Points | None = None,
-    left: Iterable[Candidate] = (),
-) -> SplatFrame:
+    trainer_frames: Iterable[FrameProposal] = (),
+) -> SplatAlignment:
     """Estimate the frame of the splat by how well it fits its photographs.
 
     Frames are tried from the simplest on, up to the first that is exact. One that fits is replaced
@@ -109,79 +107,83 @@ def find_frame(
     Raises:
         InputError: No frame fits.
     """
-    given = evidence.at(np.eye(4))
-    best = SplatFrame("given", np.eye(4), given, given)
-    if given.in_place:
+    given = data.score_transform(np.eye(4))
+    best = SplatAlignment("given", np.eye(4), given, given)
+    if given.is_exact:
         return best
-    if not given.fits:
-        best = known_frame(evidence, best, candidates(poses, points, left))
-    if best.fit.fits:
-        return best if best.fit.in_place else polished(evidence, best)
-    found = similarity_frame(evidence, points, best.given)
+    if not given.is_match:
+        best = select_known_frame(data, best, propose_frames(poses, points, trainer_frames))
+    if best.fit.is_match:
+        return best if best.fit.is_exact else polish(data, best)
+    found = search_alignment(data, points, best.given_fit)
     if found is None:
         raise InputError(
             f"The splat does not show what the photographs show: at their cameras it covers "
-            f"{100 * best.given.covered:.0f} % of the pixels and matches them at "
-            f"{best.given.psnr:.1f} dB, and no other frame was found; give the photographs and "
+            f"{100 * best.given_fit.coverage:.0f} % of the pixels and matches them at "
+            f"{best.given_fit.psnr:.1f} dB, and no other frame was found; give the photographs and "
             "poses that the splat was trained on."
         )
     return found
 
 
-def candidates(
-    poses: Poses, points: Points | None, left: Iterable[Candidate]
-) -> Iterator[Candidate]:
+def propose_frames(
+    poses: Poses, points: Points | None, trainer_frames: Iterable[FrameProposal]
+) -> Iterator[FrameProposal]:
     """Yield frames that are known without the images, the simplest first."""
-    yield from left
-    for _, transform in trainers_frames(poses, points):
+    yield from trainer_frames
+    for _, transform in compute_trainer_frames(poses, points):
         yield "normalised", transform
 
 
-def known_frame(evidence: Evidence, best: SplatFrame, others: Iterable[Candidate]) -> SplatFrame:
+def select_known_frame(
+    data: AlignmentData, best: SplatAlignment, others: Iterable[FrameProposal]
+) -> SplatAlignment:
     """Select the best of `best` and `others`, stopping at the first that is exact."""
     for method, transform in others:
-        fit = evidence.at(transform)
-        if better(fit, best.fit):
-            best = SplatFrame(method, transform, fit, best.given)
-        if best.fit.in_place:
+        fit = data.score_transform(transform)
+        if is_better(fit, best.fit):
+            best = SplatAlignment(method, transform, fit, best.given_fit)
+        if best.fit.is_exact:
             break
     return best
 
 
-def better(fit: FrameFit, than: FrameFit) -> bool:
+def is_better(fit: SplatFit, than: SplatFit) -> bool:
     """Return True if a fit is clearly better and has at least half of the coverage."""
-    if not fit.fits or fit.covered < 0.5 * than.covered:
+    if not fit.is_match or fit.coverage < 0.5 * than.coverage:
         return False
-    return not than.fits or fit.margin > than.margin + CLEARLY
+    return not than.is_match or fit.margin > than.margin + MIN_IMPROVEMENT
 
 
-def polished(evidence: Evidence, found: SplatFrame) -> SplatFrame:
+def polish(data: AlignmentData, found: SplatAlignment) -> SplatAlignment:
     """Refine an alignment by image features; keep `found` unless the result is clearly better."""
-    evidence = evidence.near(found.transform)
-    photographs = photographs_of(evidence.views)
-    transform = refined(evidence.scene, photographs, found.transform, evidence.renderer)
+    data = data.restrict_to(found.transform)
+    photographs = extract_photo_features(data.views)
+    transform = refine_similarity(data.scene, photographs, found.transform, data.renderer)
     if transform is None:
         return found
-    fit = evidence.at(transform)
+    fit = data.score_transform(transform)
     return (
-        SplatFrame("similarity", transform, fit, found.given) if better(fit, found.fit) else found
+        SplatAlignment("similarity", transform, fit, found.given_fit)
+        if is_better(fit, found.fit)
+        else found
     )
 
 
-def similarity_frame(
-    evidence: Evidence, points: Points | None, given: FrameFit
-) -> SplatFrame | None:
+def search_alignment(
+    data: AlignmentData, points: Points | None, given: SplatFit
+) -> SplatAlignment | None:
     """Search all directions for the first similarity that fits, or return None."""
-    renderer = evidence.renderer
-    if not stand_apart([pose_of(view.camera) for view in evidence.views]):
+    renderer = data.renderer
+    if not has_baseline([get_pose(view.camera) for view in data.views]):
         return None
-    photographs = photographs_of(evidence.views)
-    place = rough_points(evidence.views) if points is None else points
-    for start in searched(thinned(evidence.scene), photographs, place, renderer):
-        transform = refined(evidence.near(start).scene, photographs, start, renderer)
+    photographs = extract_photo_features(data.views)
+    place = estimate_points(data.views) if points is None else points
+    for start in search_similarities(thin_gaussians(data.scene), photographs, place, renderer):
+        transform = refine_similarity(data.restrict_to(start).scene, photographs, start, renderer)
         if transform is None:
             continue
-        fit = evidence.at(transform)
-        if fit.fits:
-            return SplatFrame("similarity", transform, fit, given)
+        fit = data.score_transform(transform)
+        if fit.is_match:
+            return SplatAlignment("similarity", transform, fit, given)
     return None

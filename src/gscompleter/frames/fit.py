@@ -11,14 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.coverage import COVERED
-from gscompleter.frames.drift import drift
-from gscompleter.geometry import z_depths
-from gscompleter.render import Renderer, each_view
+from gscompleter.frames.drift import measure_drift
+from gscompleter.geometry import compute_z_depths
+from gscompleter.render import Renderer, get_view_map
 from gscompleter.types import Camera, Gaussians, Render, View
 
-GAINS = (0.5, 2.0)
+GAIN_RANGE = (0.5, 2.0)
 """Range of the exposure gain between a render and a photograph."""
-MIN_COVERED = 0.05
+MIN_COVERAGE = 0.05
 """Smallest share of covered pixels for a valid score."""
 MIN_MARGIN = 3.0
 """Smallest margin in dB of a match: half of the photograph's variance is explained."""
@@ -39,19 +39,19 @@ class ImageFit:
     """PSNR in dB over the covered pixels, after matching the exposure."""
     margin: float
     """PSNR above that of the best flat image, in dB."""
-    covered: float
+    coverage: float
     drift: float
     """Displacement of corners from render to photograph, in pixels; infinity if unknown."""
 
     @property
-    def shows(self) -> bool:
+    def is_match(self) -> bool:
         """True if the splat shows the content of the photograph."""
-        flat = self.psnr >= MIN_PSNR and self.covered >= 0.5
-        return self.covered >= MIN_COVERED and (self.margin >= MIN_MARGIN or flat)
+        flat = self.psnr >= MIN_PSNR and self.coverage >= 0.5
+        return self.coverage >= MIN_COVERAGE and (self.margin >= MIN_MARGIN or flat)
 
 
 @dataclass(frozen=True)
-class FrameFit:
+class SplatFit:
     """Fit of the splat to several photographs.
 
     Figures are medians over the better half of those that see the splat: it may not be trained on
@@ -61,82 +61,84 @@ class FrameFit:
     images: tuple[ImageFit, ...]
 
     @property
-    def fits(self) -> bool:
+    def is_match(self) -> bool:
         """True if the splat matches two photographs, or the only one."""
-        shown = sum(image.shows for image in self.images)
+        shown = sum(image.is_match for image in self.images)
         return shown >= max(1, min(2, len(self.images)))
 
     @property
-    def in_place(self) -> bool:
+    def is_exact(self) -> bool:
         """True if the splat fits and is displaced by at most `MAX_DRIFT`."""
-        return self.fits and self.drift <= MAX_DRIFT
+        return self.is_match and self.drift <= MAX_DRIFT
 
     @property
     def psnr(self) -> float:
         """PSNR in dB; 0 if no photograph sees the splat."""
-        return self._middle("psnr", 0.0)
+        return self._compute_median("psnr", 0.0)
 
     @property
     def margin(self) -> float:
         """PSNR above that of the best flat image, in dB."""
-        return self._middle("margin", 0.0)
+        return self._compute_median("margin", 0.0)
 
     @property
     def drift(self) -> float:
         """Displacement in pixels; infinity if unknown."""
-        return self._middle("drift", math.inf)
+        return self._compute_median("drift", math.inf)
 
     @property
-    def covered(self) -> float:
+    def coverage(self) -> float:
         """Mean share of the pixels that the splat covers, over all photographs."""
-        return sum(image.covered for image in self.images) / max(len(self.images), 1)
+        return sum(image.coverage for image in self.images) / max(len(self.images), 1)
 
-    def _middle(self, name: str, otherwise: float) -> float:
-        seen = [image for image in self.images if image.covered >= MIN_COVERED]
+    def _compute_median(self, name: str, otherwise: float) -> float:
+        seen = [image for image in self.images if image.coverage >= MIN_COVERAGE]
         seen.sort(key=lambda image: image.margin, reverse=True)
         values = sorted(getattr(image, name) for image in seen[: math.ceil(len(seen) / 2)])
         return values[len(values) // 2] if values else otherwise
 
 
-def frame_fit(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> FrameFit:
+def score_splat(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> SplatFit:
     """Score `scene` against photographs whose cameras are in its frame."""
 
     def fit(view: View) -> ImageFit:
-        return compared(seen_from(scene, view.camera, renderer), view.image)
+        return score_image(render_from(scene, view.camera, renderer), view.image)
 
-    return FrameFit(tuple(each_view(scene)(fit, views)))
+    return SplatFit(tuple(get_view_map(scene)(fit, views)))
 
 
-def seen_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
+def render_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
     """Render `scene`, with a near plane derived from its own depths."""
-    z = z_depths(scene.means, camera)
+    z = compute_z_depths(scene.means, camera)
     unit = z[z > 0].median().item() if (z > 0).any() else 1.0
     with torch.no_grad():
         return renderer.render(scene, replace(camera, near=0.1 * unit))
 
 
-def compared(render: Render, photograph: Float[Tensor, "h w 3"]) -> ImageFit:
+def score_image(render: Render, photograph: Float[Tensor, "h w 3"]) -> ImageFit:
     """Score a render against one photograph."""
     where = render.alpha >= COVERED
     covered = where.float().mean().item()
-    if covered < MIN_COVERED:
+    if covered < MIN_COVERAGE:
         return ImageFit(0.0, 0.0, covered, math.inf)
     truth = photograph[where].double()
-    rendered = evened_out(render.image[where].double(), truth)
-    psnr = decibels((rendered - truth).square().mean())
-    margin = psnr - decibels((truth - truth.mean()).square().mean())
+    rendered = match_exposure(render.image[where].double(), truth)
+    psnr = convert_to_psnr((rendered - truth).square().mean())
+    margin = psnr - convert_to_psnr((truth - truth.mean()).square().mean())
     shown = photograph.double().index_put((where,), rendered)
     before, after = (i.mean(dim=-1).cpu().numpy() for i in (shown, photograph.double()))
-    return ImageFit(psnr, margin, covered, drift(before, after, where.cpu().numpy()))
+    return ImageFit(psnr, margin, covered, measure_drift(before, after, where.cpu().numpy()))
 
 
-def evened_out(drawn: Float[Tensor, "n 3"], truth: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Match the exposure of `truth` by one gain and one offset (least squares)."""
-    centred = drawn - drawn.mean()
+def match_exposure(
+    rendered: Float[Tensor, "n 3"], truth: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Match the exposure of `photograph` by one gain and one offset (least squares)."""
+    centred = rendered - rendered.mean()
     gain = (centred * (truth - truth.mean())).sum() / centred.square().sum().clamp_min(1e-12)
-    return gain.clamp(*GAINS) * centred + truth.mean()
+    return gain.clamp(*GAIN_RANGE) * centred + truth.mean()
 
 
-def decibels(error: Float[Tensor, ""]) -> float:
+def convert_to_psnr(error: Float[Tensor, ""]) -> float:
     """Convert a mean squared error to PSNR in dB, at most 100."""
     return -10 * math.log10(max(error.item(), 1e-10))

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gscompleter.data.photographs import Photographs
-from gscompleter.frames.beside import GivenSplat, frames_left
-from gscompleter.frames.finding import Evidence, SplatFrame, find_frame
-from gscompleter.frames.witnesses import usable_poses, witnesses
+from gscompleter.frames.beside import InputSplat, read_trainer_frames
+from gscompleter.frames.finding import AlignmentData, SplatAlignment, estimate_alignment
+from gscompleter.frames.witnesses import collect_poses, sample_views
 from gscompleter.render import Renderer
 
 
-def frame_of_splat(
-    splat: GivenSplat, photographs: Photographs, frames: Sequence[int], renderer: Renderer
-) -> SplatFrame:
+def align_splat(
+    splat: InputSplat, photographs: Photographs, frames: Sequence[int], renderer: Renderer
+) -> SplatAlignment:
     """Estimate the transform from photographs to splat, relative to their origins.
 
     The photographs numbered `frames` are used in any case.
@@ -21,11 +21,11 @@ def frame_of_splat(
     Raises:
         InputError: No frame fits, or one of `frames` cannot be read.
     """
-    views = [view.to(splat.scene.means.device) for view in witnesses(photographs, frames)]
+    views = [view.to(splat.scene.means.device) for view in sample_views(photographs, frames)]
     points = photographs.points()
-    return find_frame(
-        Evidence(splat.scene, views, renderer),
-        usable_poses(photographs),
+    return estimate_alignment(
+        AlignmentData(splat.scene, views, renderer),
+        collect_poses(photographs),
         None if points is None else points.double().numpy(),
-        frames_left(splat, photographs),
+        read_trainer_frames(splat, photographs),
     )

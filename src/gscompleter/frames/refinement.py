@@ -8,53 +8,60 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.frames.matching import MAX_ERROR, Located, Photograph, located
+from gscompleter.frames.matching import (
+    MAX_REPROJECTION_ERROR,
+    LocatedPhoto,
+    PhotoFeatures,
+    locate_photos,
+)
 from gscompleter.frames.similarity import (
     Matrix,
-    moved_camera,
-    pose_of,
-    similarity,
-    similarity_between,
-    stand_apart,
+    fit_pose_similarity,
+    get_pose,
+    has_baseline,
+    make_similarity,
+    transform_camera,
 )
-from gscompleter.render import Renderer, each_view
+from gscompleter.render import Renderer, get_view_map
 from gscompleter.types import Gaussians
 
-ROUNDS = 2
+NUM_ROUNDS = 2
 """Iterations, each with renders at the cameras of the previous one."""
-SETTLED = 0.25
+MAX_SHIFT = 0.25
 """Median change of the reprojected points, in pixels, at which the iteration stops."""
 
 
-def refined(
-    scene: Gaussians, photographs: Sequence[Photograph], transform: Matrix, renderer: Renderer
+def refine_similarity(
+    scene: Gaussians, photographs: Sequence[PhotoFeatures], transform: Matrix, renderer: Renderer
 ) -> Matrix | None:
     """Refine a similarity (photographs to splat) by features; None if too few match."""
-    for _ in range(ROUNDS):
-        cameras = [moved_camera(photograph.camera, transform) for photograph in photographs]
+    for _ in range(NUM_ROUNDS):
+        cameras = [transform_camera(photograph.camera, transform) for photograph in photographs]
         alone = [[photograph] for photograph in photographs]
-        places = each_view(scene)(partial(located, scene, renderer=renderer), cameras, alone)
+        places = get_view_map(scene)(
+            partial(locate_photos, scene, renderer=renderer), cameras, alone
+        )
         found = [place for these in places for place in these]
-        better = similarity_of(found)
+        better = fit_similarity(found)
         if better is None:
             return None
-        moved = np.median([_shift(place, transform, better) for place in found])
+        moved = np.median([_compute_shift(place, transform, better) for place in found])
         transform = better
-        if moved <= SETTLED:
+        if moved <= MAX_SHIFT:
             break
     return transform
 
 
-def similarity_of(found: Sequence[Located]) -> Matrix | None:
+def fit_similarity(found: Sequence[LocatedPhoto]) -> Matrix | None:
     """Fit photographs' frame to splat's frame by located photographs; None if too few."""
-    before = [pose_of(place.photograph.camera) for place in found]
-    if not stand_apart(before):
+    before = [get_pose(place.photograph.camera) for place in found]
+    if not has_baseline(before):
         return None
-    start = similarity_between(before, [place.pose for place in found])
-    return reprojected(found, start) if np.linalg.det(start[:3, :3]) > 0 else None
+    start = fit_pose_similarity(before, [place.pose for place in found])
+    return minimize_reprojection(found, start) if np.linalg.det(start[:3, :3]) > 0 else None
 
 
-def reprojected(found: Sequence[Located], start: Matrix) -> Matrix:
+def minimize_reprojection(found: Sequence[LocatedPhoto], start: Matrix) -> Matrix:
     """Minimize the robust reprojection error over similarities.
 
     The seven unknowns move the splat's points in the photographs' frame: logarithm of the scale,
@@ -64,39 +71,43 @@ def reprojected(found: Sequence[Located], start: Matrix) -> Matrix:
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    points = [brought_back(place, start) for place in found]
+    points = [transform_back(place, start) for place in found]
     center = np.median(np.concatenate(points), axis=0)
     unit = float(np.median(np.linalg.norm(np.concatenate(points) - center, axis=1)))
 
     def change(unknowns: Float[np.ndarray, "7"]) -> Matrix:
         turn = np.exp(unknowns[0]) * Rotation.from_rotvec(unknowns[1:4]).as_matrix()
-        return similarity(1.0, turn, center + unit * unknowns[4:] - turn @ center)
+        return make_similarity(1.0, turn, center + unit * unknowns[4:] - turn @ center)
 
     def errors(unknowns: Float[np.ndarray, "7"]) -> Float[np.ndarray, "m"]:
         moved = change(unknowns)
         pairs = zip(found, points, strict=True)
-        return np.concatenate([_misses(p @ moved[:3, :3].T + moved[:3, 3], f) for f, p in pairs])
+        return np.concatenate(
+            [_compute_residuals(p @ moved[:3, :3].T + moved[:3, 3], f) for f, p in pairs]
+        )
 
-    answer = least_squares(errors, np.zeros(7), loss="cauchy", f_scale=0.3 * MAX_ERROR)
+    answer = least_squares(errors, np.zeros(7), loss="cauchy", f_scale=0.3 * MAX_REPROJECTION_ERROR)
     return start @ np.linalg.inv(change(answer.x))
 
 
-def brought_back(place: Located, transform: Matrix) -> Float[np.ndarray, "m 3"]:
+def transform_back(photo: LocatedPhoto, transform: Matrix) -> Float[np.ndarray, "m 3"]:
     """Transform the inlier points of a photograph to the photographs' frame."""
     back = np.linalg.inv(transform)
-    return place.points @ back[:3, :3].T + back[:3, 3]
+    return photo.points @ back[:3, :3].T + back[:3, 3]
 
 
-def _shift(place: Located, before: Matrix, after: Matrix) -> float:
+def _compute_shift(photo: LocatedPhoto, before: Matrix, after: Matrix) -> float:
     """Compute the median change of the reprojection error between two similarities, in pixels."""
-    seen = [_misses(brought_back(place, m), place) for m in (before, after)]
+    seen = [_compute_residuals(transform_back(photo, m), photo) for m in (before, after)]
     return float(np.median(np.abs(seen[1] - seen[0])))
 
 
-def _misses(points: Float[np.ndarray, "m 3"], place: Located) -> Float[np.ndarray, "k"]:
+def _compute_residuals(
+    points: Float[np.ndarray, "m 3"], photo: LocatedPhoto
+) -> Float[np.ndarray, "k"]:
     """Compute the reprojection errors along x and y, in pixels."""
-    pose = pose_of(place.photograph.camera)
+    pose = get_pose(photo.photograph.camera)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    homogeneous = local @ place.photograph.camera.K.detach().cpu().double().numpy().T
+    homogeneous = local @ photo.photograph.camera.K.detach().cpu().double().numpy().T
     ahead = np.maximum(homogeneous[:, 2:], 1e-9 * np.abs(homogeneous).max())
-    return np.clip(homogeneous[:, :2] / ahead - place.pixels, -1e4, 1e4).ravel()
+    return np.clip(homogeneous[:, :2] / ahead - photo.pixels, -1e4, 1e4).ravel()

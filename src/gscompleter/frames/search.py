@@ -7,57 +7,57 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.frames.matching import Photograph, located
-from gscompleter.frames.refinement import similarity_of
-from gscompleter.frames.similarity import Matrix, moved_camera, pose_of, similarity
-from gscompleter.frames.trainers import Points, shortest_turn
+from gscompleter.frames.matching import PhotoFeatures, locate_photos
+from gscompleter.frames.refinement import fit_similarity
+from gscompleter.frames.similarity import Matrix, get_pose, make_similarity, transform_camera
+from gscompleter.frames.trainers import Points, align_directions
 from gscompleter.render import Renderer
 from gscompleter.types import Gaussians
 
-Middle = tuple[Float[np.ndarray, "3"], float]
+CenterRadius = tuple[Float[np.ndarray, "3"], float]
 """Centre and radius of points."""
 
-DIRECTIONS = 40
+NUM_DIRECTIONS = 40
 """Directions around the splat, about 30° apart; features tolerate half of that and any roll."""
-ZOOMS = (1.0, 0.6, 1.7)
+SCALE_FACTORS = (1.0, 0.6, 1.7)
 """Trial factors on the size of the splat, which far Gaussians and floaters blur."""
 
 
-def searched(
-    scene: Gaussians, photographs: Sequence[Photograph], points: Points, renderer: Renderer
+def search_similarities(
+    scene: Gaussians, photographs: Sequence[PhotoFeatures], points: Points, renderer: Renderer
 ) -> Iterator[Matrix]:
     """Yield similarities from photographs to splat by which some photographs match."""
     seer = photographs[len(photographs) // 2].camera
     if len(scene) == 0:
         return
     solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
-    goal = middle_of(solid)
+    goal = compute_center_radius(solid)
     if goal[1] == 0:  # most of it is one point: all directions are alike
         return
-    for transform in starts(pose_of(seer), middle_of(points), goal):
-        found = located(scene, moved_camera(seer, transform), photographs, renderer)
-        answer = similarity_of(found)
+    for transform in generate_starts(get_pose(seer), compute_center_radius(points), goal):
+        found = locate_photos(scene, transform_camera(seer, transform), photographs, renderer)
+        answer = fit_similarity(found)
         if answer is not None:
             yield answer
 
 
-def starts(pose: Matrix, place: Middle, goal: Middle) -> Iterator[Matrix]:
+def generate_starts(pose: Matrix, start: CenterRadius, goal: CenterRadius) -> Iterator[Matrix]:
     """Yield similarities that map `place` to `goal` (centre, radius), from all directions."""
-    (center, radius), (new_center, new_radius) = place, goal
-    for zoom in ZOOMS:
+    (center, radius), (new_center, new_radius) = start, goal
+    for zoom in SCALE_FACTORS:
         scale = zoom * new_radius / max(radius, 1e-12)
-        for direction in directions(DIRECTIONS):
-            turn = shortest_turn(pose[:3, 2], direction)
-            yield similarity(scale, turn, new_center - scale * turn @ center)
+        for direction in sample_directions(NUM_DIRECTIONS):
+            turn = align_directions(pose[:3, 2], direction)
+            yield make_similarity(scale, turn, new_center - scale * turn @ center)
 
 
-def middle_of(points: Points) -> Middle:
+def compute_center_radius(points: Points) -> CenterRadius:
     """Compute centre and radius of points as medians, which ignore floaters."""
     center = np.median(points, axis=0)
     return center, float(np.median(np.linalg.norm(points - center, axis=1)))
 
 
-def directions(count: int) -> Float[np.ndarray, "n 3"]:
+def sample_directions(count: int) -> Float[np.ndarray, "n 3"]:
     """Sample unit vectors on a golden spiral over the sphere."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)

@@ -8,29 +8,29 @@ import numpy as np
 import torch
 
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.poses import pose_defect
+from gscompleter.data.poses import find_pose_defect
 from gscompleter.errors import InputError
 from gscompleter.frames.trainers import Points, Poses
 from gscompleter.matching.depth_range import estimate_depth_range
 from gscompleter.types import View
 
-COUNT = 8
+NUM_SAMPLE_VIEWS = 8
 """Number of sample photographs."""
 LONG_SIDE = 320
 """Their longer side in pixels: enough for features and for a blur of one pixel."""
 
 
-def witnesses(photographs: Photographs, frames: Sequence[int]) -> list[View]:
+def sample_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
     """Load the first of `frames` and further photographs spread over all.
 
     Raises:
         InputError: One of `frames` cannot be read; other unreadable photographs are skipped.
     """
-    named = list(frames)[: COUNT // 2]
-    spread = np.linspace(0, len(photographs) - 1, COUNT).round().astype(int).tolist()
+    named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
+    spread = np.linspace(0, len(photographs) - 1, NUM_SAMPLE_VIEWS).round().astype(int).tolist()
     others = [frame for frame in dict.fromkeys(spread) if frame not in named]
     views = photographs.views(named, LONG_SIDE)
-    for frame in others[: COUNT - len(views)]:
+    for frame in others[: NUM_SAMPLE_VIEWS - len(views)]:
         try:
             views += photographs.views([frame], LONG_SIDE)
         except InputError:
@@ -38,15 +38,15 @@ def witnesses(photographs: Photographs, frames: Sequence[int]) -> list[View]:
     return views
 
 
-def usable_poses(photographs: Photographs) -> Poses:
+def collect_poses(photographs: Photographs) -> Poses:
     """Collect the valid camera-to-world poses, relative to the photographs' origin."""
-    poses = [frame.c2w for frame in photographs.frames if pose_defect(frame.c2w) is None]
+    poses = [frame.c2w for frame in photographs.frames if find_pose_defect(frame.c2w) is None]
     shifted = np.stack(poses).astype(np.float64)
     shifted[:, :3, 3] -= photographs.origin
     return shifted
 
 
-def rough_points(views: Sequence[View]) -> Points:
+def estimate_points(views: Sequence[View]) -> Points:
     """Estimate scene points without a sparse cloud: a grid at the median depth of each view."""
     near, far = estimate_depth_range(views)
     depth = float(np.sqrt(near * far))

@@ -18,8 +18,8 @@ MAX_GAIN = 2.0
 """Largest plausible gain; its inverse is the smallest."""
 
 
-def gains(
-    colours: Sequence[Float[Tensor, "h w 3"]],
+def match_exposures(
+    colors: Sequence[Float[Tensor, "h w 3"]],
     visible: Sequence[Bool[Tensor, "h w"]],
     reference: int,
 ) -> list[Float[Tensor, "3"]]:
@@ -28,9 +28,9 @@ def gains(
     The pairs that share most `visible` pixels are matched first; gains without enough of them stay
     1.
     """
-    ones = torch.ones(3, dtype=colours[reference].dtype, device=colours[reference].device)
+    ones = torch.ones(3, dtype=colors[reference].dtype, device=colors[reference].device)
     found = {reference: ones}
-    waiting = [i for i in range(len(colours)) if i != reference]
+    waiting = [i for i in range(len(colors)) if i != reference]
     while waiting:
         pairs = [(i, j, int((visible[i] & visible[j]).sum())) for i in waiting for j in found]
         best, known, shared = max(pairs, key=lambda pair: pair[2])
@@ -38,12 +38,14 @@ def gains(
         overlap = visible[best] & visible[known]
         found[best] = ones
         if shared >= MIN_PIXELS:
-            own, other = colours[best][overlap], colours[known][overlap]
-            found[best] = found[known] * median_ratio(own, other)
-    return [found[i].clamp(1 / MAX_GAIN, MAX_GAIN) for i in range(len(colours))]
+            own, other = colors[best][overlap], colors[known][overlap]
+            found[best] = found[known] * compute_median_ratio(own, other)
+    return [found[i].clamp(1 / MAX_GAIN, MAX_GAIN) for i in range(len(colors))]
 
 
-def median_ratio(own: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+def compute_median_ratio(
+    own: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"]
+) -> Float[Tensor, "3"]:
     """Compute the median of `other / own` per channel; 1 without enough exposed values."""
     ratios = torch.ones_like(own[0])
     for channel in range(3):

@@ -10,7 +10,7 @@ ROUNDS = 5
 """Number of fits; each one leaves out the outliers of the previous one."""
 
 
-def robust_affine(
+def fit_robust_affine(
     x: Float[Tensor, "n c"], y: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
     """Fit `y = gain * x + offset` per channel by trimmed least squares, starting at gain 1.

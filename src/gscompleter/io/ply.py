@@ -22,9 +22,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted, refuse_pointer
-from gscompleter.io.files import replacing
-from gscompleter.kernels.sharing import side_by_side
+from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.io.files import replace_file
+from gscompleter.kernels.sharing import map_in_parallel
 from gscompleter.reading import open_file
 from gscompleter.types import Gaussians
 
@@ -56,7 +56,7 @@ _MAX_LOGIT = 30.0
 _MAX_SCALE = 1e38
 """Larger scales are clamped to this one, which is finite in float32."""
 
-MODE = "comment SplatRenderMode: mip"
+MODE_COMMENT = "comment SplatRenderMode: mip"
 """Header line that marks antialiased Gaussians."""
 _MODE_LINE = re.compile(
     r"(?:comment|obj_info)\s+(?:SplatRenderMode|(?:postshot[._])?anti[-_ ]?alias(?:ed|ing)?)"
@@ -65,7 +65,7 @@ _MODE_LINE = re.compile(
 )
 _ANTIALIASED = ("mip", "antialiased", "1", "true")
 
-BLOCK = 8192
+BLOCK_ROWS = 8192
 """Rows processed at a time, so that all their columns stay in the cache."""
 
 
@@ -121,19 +121,20 @@ def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
             if words[0] == "format":
                 file_format = words[1]
             elif words[0] == "element":
-                elements.append(Element(words[1], _count(words[2])))
+                elements.append(Element(words[1], _parse_count(words[2])))
             elif words[0] == "property":
-                elements[-1].properties.append(_property(words[1:]))
+                elements[-1].properties.append(_parse_property(words[1:]))
             else:
                 raise ValueError
         except (IndexError, KeyError, ValueError) as error:
             raise InputError(
-                f"{path} has a broken header: the line '{quoted(' '.join(words))}' is invalid; "
+                f"{path} has a broken header: the line '{quote_value(' '.join(words))}' is "
+                "invalid; "
                 "export it again."
             ) from error
     if file_format not in _BYTE_ORDERS:
         raise InputError(
-            f"{path} has the PLY format '{quoted(file_format)}'; ascii, "
+            f"{path} has the PLY format '{quote_value(file_format)}'; ascii, "
             "binary_little_endian and binary_big_endian are known."
         )
     return file_format, elements
@@ -148,13 +149,13 @@ def read_mode(file: BinaryIO) -> bool:
     return bool(modes) and modes[-1] in _ANTIALIASED
 
 
-def _count(word: str) -> int:
+def _parse_count(word: str) -> int:
     if not word.isdecimal():
         raise ValueError(word)
     return int(word)
 
 
-def _property(words: list[str]) -> Property:
+def _parse_property(words: list[str]) -> Property:
     if words[0] == "list":
         return Property(words[3], _SCALARS[words[2]], _COUNTS[words[1]])
     return Property(words[1], _SCALARS[words[0]])
@@ -167,14 +168,14 @@ def read_vertices(
     for element in ahead:
         _check_claim(file, element, file_format, path)
     if file_format == "ascii":
-        return _ascii_vertices(file, ahead, vertex, path)
+        return _read_ascii_vertices(file, ahead, vertex, path)
     byte_order = _BYTE_ORDERS[file_format]
     for element in ahead:
         _skip(file, element, byte_order, path)
     dtype = vertex.dtype(byte_order)
-    remaining = _bytes_left(file)
+    remaining = _count_bytes_left(file)
     if remaining < vertex.count * dtype.itemsize:
-        raise _truncated(path, remaining // dtype.itemsize, vertex.count)
+        raise _make_truncation_error(path, remaining // dtype.itemsize, vertex.count)
     if vertex.count == 0:
         return np.empty(0, dtype)
     # Rows are copied into columns directly from the memory map.
@@ -186,12 +187,12 @@ def _check_claim(file: BinaryIO, element: Element, file_format: str, path: Path)
     sizes = [np.dtype(p.count_kind or p.kind).itemsize for p in element.properties]
     # A number of an ASCII file has at least a digit and a separator.
     least = 2 * max(len(sizes), 1) if file_format == "ascii" else sum(sizes)
-    remaining = _bytes_left(file) + 1  # the last line may lack its end
+    remaining = _count_bytes_left(file) + 1  # the last line may lack its end
     if element.count * least > remaining:
-        raise _truncated(path, remaining // least, element.count, element.name)
+        raise _make_truncation_error(path, remaining // least, element.count, element.name)
 
 
-def _bytes_left(file: BinaryIO) -> int:
+def _count_bytes_left(file: BinaryIO) -> int:
     return max(os.fstat(file.fileno()).st_size - file.tell(), 0)
 
 
@@ -206,14 +207,14 @@ def _skip(file: BinaryIO, element: Element, byte_order: str, path: Path) -> None
                 size = np.dtype(prop.count_kind).itemsize
                 counted = file.read(size)
                 if len(counted) < size:
-                    raise _truncated(path, row, element.count, element.name)
+                    raise _make_truncation_error(path, row, element.count, element.name)
                 length = int(np.frombuffer(counted, byte_order + prop.count_kind)[0])
                 if length < 0:
                     raise InputError(f"{path} holds a list of negative length; write it anew.")
             file.seek(length * np.dtype(prop.kind).itemsize, io.SEEK_CUR)
 
 
-def _ascii_vertices(
+def _read_ascii_vertices(
     file: BinaryIO, ahead: list[Element], vertex: Element, path: Path
 ) -> np.ndarray:
     lines = (line for line in file if line.strip())
@@ -223,7 +224,7 @@ def _ascii_vertices(
     width = len(vertex.properties)
     whole = len(rows) - (1 if rows and len(rows[-1]) < width else 0)
     if whole < vertex.count:
-        raise _truncated(path, whole, vertex.count)
+        raise _make_truncation_error(path, whole, vertex.count)
     try:
         table = np.array(rows, dtype=np.float64).reshape(vertex.count, width)
     except ValueError as error:
@@ -238,9 +239,12 @@ def _ascii_vertices(
     return vertices
 
 
-def _truncated(path: Path, found: int, expected: int, what: str = "Gaussian") -> InputError:
+def _make_truncation_error(
+    path: Path, found: int, expected: int, what: str = "Gaussian"
+) -> InputError:
     return InputError(
-        f"{path} is truncated: {found:,} of {quoted(f'{expected:,}')} {quoted(what)}s are there; "
+        f"{path} is truncated: {found:,} of {quote_value(f'{expected:,}')} {quote_value(what)}s "
+        "are there; "
         "fetch or write the file again."
     )
 
@@ -257,29 +261,29 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         InputError: The file is missing, no 3DGS .ply, empty, truncated or has invalid values.
     """
     path = Path(path)
-    return whole(_read(path), path, drop_nonfinite)
+    return require_finite(_read_gaussians(path), path, drop_nonfinite)
 
 
-def drawable_rows(path: Path) -> Bool[Tensor, "n"]:
+def find_finite_rows(path: Path) -> Bool[Tensor, "n"]:
     """Mark the Gaussians of a 3DGS .ply that `load_ply` keeps with `drop_nonfinite`."""
-    return drawable(_read(path))
+    return find_finite(_read_gaussians(path))
 
 
-def _read(path: Path) -> Gaussians:
+def _read_gaussians(path: Path) -> Gaussians:
     """Read all Gaussians of a file, non-finite ones included."""
     try:
         with open_file(path) as file:
             file_format, elements = read_header(file, path)
             is_antialiased = read_mode(file)
-            vertex = _gaussian_element(elements, path)
+            vertex = _find_gaussian_element(elements, path)
             ahead = elements[: elements.index(vertex)]
             vertices = read_vertices(file, file_format, ahead, vertex, path)
     except OSError as error:
-        raise InputError(f"Cannot read {quoted(path)}: {error.strerror}.") from error
-    return _gaussians(vertices, vertex, is_antialiased)
+        raise InputError(f"Cannot read {quote_value(path)}: {error.strerror}.") from error
+    return _decode_gaussians(vertices, vertex, is_antialiased)
 
 
-def _gaussian_element(elements: list[Element], path: Path) -> Element:
+def _find_gaussian_element(elements: list[Element], path: Path) -> Element:
     """Find the vertex element and check that it contains Gaussians."""
     found = {element.name: element for element in elements}
     vertex = found.get("vertex")
@@ -290,7 +294,7 @@ def _gaussian_element(elements: list[Element], path: Path) -> Element:
         if len({p.name for p in element.properties}) < len(element.properties):
             raise InputError(
                 f"{path} has a broken header: a property of its element "
-                f"'{quoted(element.name)}' is named twice; write it anew."
+                f"'{quote_value(element.name)}' is named twice; write it anew."
             )
     if "chunk" in found or "packed_position" in names:
         raise InputError(
@@ -317,12 +321,12 @@ def _gaussian_element(elements: list[Element], path: Path) -> Element:
     return vertex
 
 
-def _gaussians(vertices: np.ndarray, vertex: Element, is_antialiased: bool) -> Gaussians:
+def _decode_gaussians(vertices: np.ndarray, vertex: Element, is_antialiased: bool) -> Gaussians:
     def columns(names: tuple[str, ...]) -> Float[Tensor, "n c"]:
         table = np.empty((len(vertices), len(names)), np.float32)
         # A double beyond the range of float32 becomes infinite, and is checked later.
         with np.errstate(over="ignore"):
-            for rows in blocks(len(vertices)):
+            for rows in iterate_blocks(len(vertices)):
                 for column, name in enumerate(names):
                     table[rows, column] = vertices[name][rows]
         return torch.from_numpy(table)
@@ -330,7 +334,7 @@ def _gaussians(vertices: np.ndarray, vertex: Element, is_antialiased: bool) -> G
     names = {p.name for p in vertex.properties}
     num_rest = sum(name.startswith("f_rest_") for name in names)
     rests = tuple(f"f_rest_{i}" for i in range(num_rest))
-    tables = side_by_side(columns, [rests, _MEANS, _QUATS, (*_SCALES, "opacity"), _DC])
+    tables = map_in_parallel(columns, [rests, _MEANS, _QUATS, (*_SCALES, "opacity"), _DC])
     rest, means, quats, encoded, dc = tables
     rest = rest.view(len(vertices), 3, num_rest // 3).transpose(1, 2)
     generated = np.zeros(len(vertices), np.uint8)
@@ -340,8 +344,8 @@ def _gaussians(vertices: np.ndarray, vertex: Element, is_antialiased: bool) -> G
     return Gaussians(
         means=means,
         quats=quats,
-        scales=_decoded_scales(encoded),
-        opacities=_decoded_opacities(encoded),
+        scales=_decode_scales(encoded),
+        opacities=_decode_opacities(encoded),
         sh=torch.cat([dc[:, None], rest], dim=1).contiguous(),
         generated=torch.from_numpy(generated),
         encoded=encoded,
@@ -349,26 +353,26 @@ def _gaussians(vertices: np.ndarray, vertex: Element, is_antialiased: bool) -> G
     )
 
 
-def whole(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
+def require_finite(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
     """Refuse non-finite Gaussians of the file `path`, or drop them if some are finite."""
-    good = drawable(gaussians)
+    good = find_finite(gaussians)
     bad = int((~good).sum())
     if bad == 0:
         return gaussians
     if not drop_nonfinite:
         raise InputError(
-            f"{quoted(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a "
+            f"{quote_value(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a "
             "rotation of zeros; repair it, or drop what is not finite.",
             "drop_nonfinite",
         )
     if bad == len(good):
         raise InputError(
-            f"{quoted(path)} holds no Gaussian without NaN or infinity; write it anew."
+            f"{quote_value(path)} holds no Gaussian without NaN or infinity; write it anew."
         )
     return gaussians[good]
 
 
-def drawable(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+def find_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     """Mark Gaussians without NaN, infinity (except in logits) and zero quaternions."""
     scales = gaussians.scales if gaussians.encoded is None else gaussians.encoded[:, :3]
     opacities, good = gaussians.opacities, (gaussians.quats != 0).any(1)
@@ -391,16 +395,16 @@ def note_infinite_opacities(gaussians: Gaussians) -> str | None:
     )
 
 
-def blocks(count: int) -> Iterator[slice]:
+def iterate_blocks(count: int) -> Iterator[slice]:
     """Yield slices of `BLOCK_ROWS` rows from 0 to `count`."""
-    return (slice(start, start + BLOCK) for start in range(0, count, BLOCK))
+    return (slice(start, start + BLOCK_ROWS) for start in range(0, count, BLOCK_ROWS))
 
 
-def _decoded_scales(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
+def _decode_scales(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
     return encoded[:, :3].double().exp_().float()
 
 
-def _decoded_opacities(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
+def _decode_opacities(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
     return encoded[:, 3].double().sigmoid_().float()
 
 
@@ -417,8 +421,8 @@ def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
     if gaussians.encoded is None:
         return anew
     held = gaussians.encoded
-    same_scales = _decoded_scales(held) == gaussians.scales
-    same_opacities = _decoded_opacities(held) == gaussians.opacities
+    same_scales = _decode_scales(held) == gaussians.scales
+    same_opacities = _decode_opacities(held) == gaussians.opacities
     same = torch.cat([same_scales, same_opacities[:, None]], dim=1)
     return torch.where(same & held.isfinite(), held, anew)
 
@@ -438,18 +442,18 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
     gaussians = gaussians.to("cpu")
     kinds = {"<f4": "float", "|u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [MODE] if gaussians.is_antialiased else []
+    lines += [MODE_COMMENT] if gaussians.is_antialiased else []
     lines += [f"element vertex {len(gaussians)}"]
-    dtype = rows_of(gaussians[:0], provenance).dtype
+    dtype = make_rows(gaussians[:0], provenance).dtype
     lines += [f"property {kinds[dtype[name].str]} {name}" for name in dtype.names or ()]
     header = "\n".join([*lines, "end_header", ""])
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(header.encode("ascii"))
-        for block in blocks(len(gaussians)):
-            file.write(rows_of(gaussians[block], provenance).view(np.uint8).data)
+        for block in iterate_blocks(len(gaussians)):
+            file.write(make_rows(gaussians[block], provenance).view(np.uint8).data)
 
 
-def rows_of(gaussians: Gaussians, provenance: bool) -> np.ndarray:
+def make_rows(gaussians: Gaussians, provenance: bool) -> np.ndarray:
     """Make one row per Gaussian in the standard layout, with or without `generated`."""
     num_rest = 3 * (gaussians.sh.shape[1] - 1)
     rest = tuple(f"f_rest_{i}" for i in range(num_rest))

@@ -10,9 +10,9 @@ from numba.extending import intrinsic
 
 BLOCK = 256
 """Gaussians per block."""
-LEAST = np.float32(1e-6)
+MIN_ANGLE_WEIGHT = np.float32(1e-6)
 """Smallest angular weight: opposite photographs count if there are no others."""
-NONE = np.float32(1e-20)
+MIN_DIVISOR = np.float32(1e-20)
 """Smallest divisor."""
 
 # Abramowitz and Stegun 4.4.46: acos(x) = sqrt(1 - x) p(x) from 0 to 1, to 2e-8.
@@ -24,7 +24,7 @@ _E3, _E4, _E5 = map(np.float32, (0.055278135, 0.00918687438, 0.000938116473))
 _LOG2_E, _PI = np.float32(1.4426950408889634), np.float32(math.pi)
 
 
-class Place(NamedTuple):
+class CameraPose(NamedTuple):
     """The position and viewing direction of a camera, float32."""
 
     center: np.ndarray
@@ -36,7 +36,7 @@ class Place(NamedTuple):
 
 
 @intrinsic
-def _float_of(typing, bits):
+def _bits_to_float(typing, bits):
     return types.float32(
         types.int32
     ), lambda context, builder, signature, arguments: builder.bitcast(arguments[0], ir.FloatType())
@@ -53,17 +53,17 @@ def _acos(x):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _exp_of_negative(x):
+def _exp_negative(x):
     """Compute exp(-x) for x >= 0; beyond 80 it is practically 0."""
     power = max(-_LOG2_E * x, np.float32(-120))
     whole = np.int32(power)
     rest = power - np.float32(whole)
     series = _E0 + rest * (_E1 + rest * (_E2 + rest * (_E3 + rest * (_E4 + rest * _E5))))
-    return series * _float_of(np.int32((whole + 127) << 23))
+    return series * _bits_to_float(np.int32((whole + 127) << 23))
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def _pixel_area(means, i, place):
+def _compute_pixel_area(means, i, place):
     """Compute the area of a pixel at the depth of Gaussian i, in squared scene units."""
     center, forward = place.center, place.forward
     z = (means[i, 0] - center[0]) * forward[0]
@@ -74,38 +74,40 @@ def _pixel_area(means, i, place):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def tell(begin, end, sums, means, place, areas, agreement):
+def measure_photo_agreement(begin, end, sums, means, place, areas, agreement):
     """Compute the visible area of the Gaussians begin..end in a photograph, and its agreement.
 
     sums [n, 3] float32: compositing weights, and their products with agreement, summed over pixels.
     """
     for i in range(begin, end):
-        areas[i] = sums[i, 0] * _pixel_area(means, i, place)
+        areas[i] = sums[i, 0] * _compute_pixel_area(means, i, place)
         agreement[i] = sums[i, 1] / max(sums[i, 0], np.float32(1e-9))
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _listen(x, y, z, rays, center, turn, areas, agreement, heard):
+def _add_agreement(x, y, z, rays, center, turn, areas, agreement, totals):
     """Add the weighted agreement of the photograph at `center` to the sums of a block."""
     one = np.float32(1)
     ray_x, ray_y, ray_z = rays
-    agreeing, weights, largest = heard
+    agreeing, weights, largest = totals
     center_x, center_y, center_z = center
     for j in range(len(areas)):
         dx, dy, dz = x[j] - center_x, y[j] - center_y, z[j] - center_z
-        inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, NONE))
+        inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_DIVISOR))
         turned = _acos((dx * ray_x[j] + dy * ray_y[j] + dz * ray_z[j]) * inverse) * turn
-        weight = areas[j] * (_exp_of_negative(turned * turned) + LEAST)
+        weight = areas[j] * (_exp_negative(turned * turned) + MIN_ANGLE_WEIGHT)
         agreeing[j] += weight * agreement[j]
         weights[j] += weight
         largest[j] = max(largest[j], areas[j])
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def support(begin, end, centers, areas, agreement, means, sums, place, max_turn, enough, values):
+def accumulate_trust(
+    begin, end, centers, areas, agreement, means, sums, place, max_turn, enough, values
+):
     """Compute the trust of the Gaussians begin..end as seen from a camera; 1 if it sees nothing.
 
-    centers [k, 3], areas [k, n], agreement [k, n] float32: see `gscompleter.types.Evidence`.
+    centers [k, 3], areas [k, n], agreement [k, n] float32: see `gscompleter.types.PhotoObservations`.
     sums [n] float32: compositing weights at the camera. place: its `CameraPose`.
     max_turn: angle at which the weight of a photograph has fallen to 1/e, in radians.
     enough: share of the area seen by the camera that a photograph has to see for full trust.
@@ -120,17 +122,17 @@ def support(begin, end, centers, areas, agreement, means, sums, place, max_turn,
         for j in range(count):
             x[j], y[j], z[j] = means[start + j, 0], means[start + j, 1], means[start + j, 2]
             dx, dy, dz = x[j] - place.center[0], y[j] - place.center[1], z[j] - place.center[2]
-            inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, NONE))
+            inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_DIVISOR))
             ray_x[j], ray_y[j], ray_z[j] = dx * inverse, dy * inverse, dz * inverse
         for k in range(len(centers)):
             center = centers[k, 0], centers[k, 1], centers[k, 2]
             shown = areas[k, start : start + count], agreement[k, start : start + count]
-            _listen(
+            _add_agreement(
                 x, y, z, (ray_x, ray_y, ray_z), center, turn, *shown, (agreeing, weights, largest)
             )
         for j in range(count):
             i = start + j
-            needed = max(sums[i] * _pixel_area(means, i, place), NONE)
+            needed = max(sums[i] * _compute_pixel_area(means, i, place), MIN_DIVISOR)
             share = min(largest[j] / (enough * needed), one)
-            supported = share * agreeing[j] / max(weights[j], NONE)
+            supported = share * agreeing[j] / max(weights[j], MIN_DIVISOR)
             values[i] = supported if sums[i] > 0 else one

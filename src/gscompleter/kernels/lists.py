@@ -15,7 +15,7 @@ TILE_SHIFT = 4
 
 
 @intrinsic
-def _bits_of(typing, value):
+def _float_to_bits(typing, value):
     """Reinterpret a float32 as uint32; positive numbers keep their order."""
     return types.uint32(
         types.float32
@@ -37,7 +37,7 @@ def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
 
 
 @njit(cache=True, nogil=True)
-def places_of(counts):
+def counts_to_offsets(counts):
     """Turn counts [chunks, tiles] into offsets in place, and return the starts of the lists."""
     chunks, tiles = counts.shape
     tile_start = np.empty(tiles + 1, np.int64)
@@ -66,7 +66,7 @@ def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entri
                 if splats[i, DEPTH] <= depth_limits[tile]:
                     place = places[tile]
                     places[tile] = place + 1
-                    entries[place], keys[place] = i, _bits_of(splats[i, DEPTH])
+                    entries[place], keys[place] = i, _float_to_bits(splats[i, DEPTH])
 
 
 @njit(cache=True, nogil=True)
@@ -144,7 +144,7 @@ def number_by_use(entries, count):
 
 
 @njit(cache=True, nogil=True)
-def take_splats(begin, end, rows, splats, opacities, boxes, taken):
+def copy_splats(begin, end, rows, splats, opacities, boxes, taken):
     """Copy the splats of `rows` to the places begin..end of the arrays in `taken`."""
     to_splats, to_opacities, to_boxes = taken
     for place in range(begin, end):
@@ -172,7 +172,7 @@ def sum_entries(begin, end, slot_start, gradients, written, totals):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def sum_by_name(begin, end, entries, rows, gradients, written, totals):
+def sum_by_gaussian(begin, end, entries, rows, gradients, written, totals):
     """Add the gradients of the entries of splats begin..end to those of their Gaussians.
 
     gradients [e, c] float32 count if written [e]. rows [splats]: Gaussian of each splat.

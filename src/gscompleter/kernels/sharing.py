@@ -28,31 +28,31 @@ _thread = _Thread()
 
 
 def _stay_alone():
-    _thread.alone = True
+    _thread.is_alone = True
 
 
-def sharing(threads):
+def count_threads(threads):
     """Return how many threads a kernel called here uses, if `threads` are available."""
-    return 1 if _thread.alone else threads or numba.config.NUMBA_NUM_THREADS
+    return 1 if _thread.is_alone else threads or numba.config.NUMBA_NUM_THREADS
 
 
 def share(kernel, count, *arguments, threads=None):
-    """Run `kernel(begin, end, *arguments)` over range(count) on several threads.
+    """Run `kernel(begin, end, *load_arguments)` over range(count) on several threads.
 
     `threads` defaults to NUMBA_NUM_THREADS; the result does not depend on it.
     """
-    threads = sharing(threads)
-    run(kernel, [(*piece, *arguments) for piece in pieces_of(count, threads)], threads)
+    threads = count_threads(threads)
+    run(kernel, [(*piece, *arguments) for piece in split_into_pieces(count, threads)], threads)
 
 
-def pieces_of(count, threads):
+def split_into_pieces(count, threads):
     """Split range(count) into pieces for `threads` threads."""
-    return ranges(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
+    return split_range(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
 
 
 def run(kernel, calls, threads=None):
     """Run a kernel for each of `calls`, on this thread and idle ones, and return the results."""
-    threads = sharing(threads)
+    threads = count_threads(threads)
     if threads == 1 or len(calls) == 1:
         return [kernel(*arguments) for arguments in calls]
     results, waiting = [None] * len(calls), iter(enumerate(calls))
@@ -61,7 +61,7 @@ def run(kernel, calls, threads=None):
         for number, arguments in waiting:
             results[number] = kernel(*arguments)
 
-    pool = thread_pool(threads - 1, os.getpid())
+    pool = get_thread_pool(threads - 1, os.getpid())
     helpers = [pool.submit(work) for _ in range(min(threads, len(calls)) - 1)]
     try:
         work()
@@ -72,7 +72,7 @@ def run(kernel, calls, threads=None):
     return results
 
 
-def side_by_side(function, *arguments):
+def map_in_parallel(function, *arguments):
     """Map `function`, which may call kernels, over the arguments on several threads."""
     threads = numba.config.NUMBA_NUM_THREADS
     if threads == 1:
@@ -81,7 +81,7 @@ def side_by_side(function, *arguments):
         return list(pool.map(function, *arguments))
 
 
-def many_at_once(function, *arguments):
+def map_small_tasks(function, *arguments):
     """Map `function` lazily over small tasks, each with its kernels on a single thread."""
     threads = numba.config.NUMBA_NUM_THREADS
     if threads == 1:
@@ -92,7 +92,7 @@ def many_at_once(function, *arguments):
 
 
 @contextmanager
-def meanwhile(function, *arguments):
+def run_in_background(function, *arguments):
     """Run `function`, which may call kernels, on a thread beside the `with` block.
 
     The block gets a function that waits for the result. With one thread, `function` runs only then.
@@ -104,7 +104,7 @@ def meanwhile(function, *arguments):
         yield pool.submit(function, *arguments).result
 
 
-def ranges(count, pieces):
+def split_range(count, pieces):
     """Split range(count) into at most `pieces` contiguous ranges of about equal length."""
     pieces = max(1, min(pieces, count))
     bounds = [count * piece // pieces for piece in range(pieces + 1)]
@@ -112,6 +112,6 @@ def ranges(count, pieces):
 
 
 @lru_cache(maxsize=8)
-def thread_pool(threads, process):
+def get_thread_pool(threads, process):
     """Return the thread pool of a process; a forked one makes its own."""
     return ThreadPoolExecutor(threads, thread_name_prefix="gscompleter")

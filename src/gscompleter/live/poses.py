@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from gscompleter.geometry import quats_from, rotations_from
+from gscompleter.geometry import quats_to_rotations, rotations_to_quats
 from gscompleter.types import Camera
 
-DISTANCE = 3.0
+SCENE_DISTANCE = 3.0
 """Distance of the middle of the depth range, in page units."""
 
 
 @dataclass(frozen=True)
-class Pose:
+class PagePose:
     """Position, rotation and field of view of a page camera."""
 
     wxyz: Float[np.ndarray, "4"]
@@ -32,24 +32,24 @@ class Pose:
     """Vertical field of view, in radians."""
 
 
-def unit_of(camera: Camera) -> float:
+def compute_page_unit(camera: Camera) -> float:
     """Compute page units per scene unit from a camera with a depth range."""
     assert camera.near is not None
     assert camera.far is not None
-    return DISTANCE / math.sqrt(camera.near * camera.far)
+    return SCENE_DISTANCE / math.sqrt(camera.near * camera.far)
 
 
-def pose_of(camera: Camera, unit: float) -> Pose:
+def camera_to_page(camera: Camera, unit: float) -> PagePose:
     """Convert a scene camera to a page pose."""
     c2w = camera.c2w.detach().cpu().double()
     fov = 2 * math.atan(camera.height / 2 / camera.K[1, 1].item())
-    return Pose(quats_from(c2w[:3, :3]).numpy(), c2w[:3, 3].numpy() * unit, fov)
+    return PagePose(rotations_to_quats(c2w[:3, :3]).numpy(), c2w[:3, 3].numpy() * unit, fov)
 
 
-def camera_of(pose: Pose, height: int, width: int, unit: float) -> Camera:
+def camera_from_page(pose: PagePose, height: int, width: int, unit: float) -> Camera:
     """Convert a page pose to a scene camera with the same vertical field of view."""
     c2w = torch.eye(4, dtype=torch.float64)
-    c2w[:3, :3] = rotations_from(torch.from_numpy(np.asarray(pose.wxyz, dtype=np.float64)))
+    c2w[:3, :3] = quats_to_rotations(torch.from_numpy(np.asarray(pose.wxyz, dtype=np.float64)))
     c2w[:3, 3] = torch.from_numpy(np.asarray(pose.position, dtype=np.float64)) / unit
     focal = height / 2 / math.tan(pose.fov / 2)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])

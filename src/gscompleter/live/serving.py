@@ -14,11 +14,11 @@ from websockets.asyncio import server as websockets
 
 from gscompleter.errors import InputError
 
-LOCAL = ("127.0.0.1", "localhost")
-OWN_PAGES = re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?")
+LOCAL_HOSTS = ("127.0.0.1", "localhost")
+LOCAL_ORIGIN = re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?")
 
 
-def serving(host: str, port: int) -> viser.ViserServer:
+def start_server(host: str, port: int) -> viser.ViserServer:
     """Start a server, which runs in threads of its own."""
     try:
         socket.create_server((host, port)).close()
@@ -27,12 +27,12 @@ def serving(host: str, port: int) -> viser.ViserServer:
             f"{host} cannot use port {port} ({error.strerror}); choose another port.",
             "port",
         ) from error
-    with redirect_stdout(StringIO()), only_own_pages(host):  # viser prints a box
+    with redirect_stdout(StringIO()), refuse_foreign_origins(host):  # viser prints a box
         return viser.ViserServer(host, port, verbose=False)
 
 
 @contextmanager
-def only_own_pages(host: str) -> Iterator[None]:
+def refuse_foreign_origins(host: str) -> Iterator[None]:
     """Make servers started inside refuse pages of other origins if `host` is this machine.
 
     Any page in a browser may connect to this machine; only its `Origin` shows its source.
@@ -40,8 +40,8 @@ def only_own_pages(host: str) -> Iterator[None]:
     connect.
     """
     plain = websockets.serve
-    if host in LOCAL:
-        websockets.serve = partial(plain, origins=[OWN_PAGES, None])  # type: ignore[misc, assignment]
+    if host in LOCAL_HOSTS:
+        websockets.serve = partial(plain, origins=[LOCAL_ORIGIN, None])  # type: ignore[misc, assignment]
     try:
         yield
     finally:

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from gscompleter.geometry import rotations_from
+from gscompleter.geometry import quats_to_rotations
 from gscompleter.types import SH_C0, Gaussians
 
-TINT = (1.0, 0.45, 0.9)
+TINT_FACTORS = (1.0, 0.45, 0.9)
 
 
 @dataclass(frozen=True)
-class Splat:
+class PageSplat:
     """Gaussians in a unit of their own: the median of their largest scales.
 
     The page keeps covariances in float16, in which those of a scene in kilometres would vanish.
@@ -29,14 +29,14 @@ class Splat:
     """Length of the unit, in scene units."""
 
 
-def splat_of(gaussians: Gaussians, tinted: bool = False) -> Splat:
+def make_page_splat(gaussians: Gaussians, tinted: bool = False) -> PageSplat:
     """Convert one or more Gaussians for the page."""
     gaussians = gaussians.to("cpu")
     size = gaussians.scales.amax(dim=1).median().item()
-    axes = rotations_from(gaussians.quats) * (gaussians.scales / size)[:, None, :]
+    axes = quats_to_rotations(gaussians.quats) * (gaussians.scales / size)[:, None, :]
     rgbs = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
-    tint = torch.tensor(TINT if tinted else (1.0, 1.0, 1.0))
-    return Splat(
+    tint = torch.tensor(TINT_FACTORS if tinted else (1.0, 1.0, 1.0))
+    return PageSplat(
         (gaussians.means / size).numpy(),
         (axes @ axes.transpose(1, 2)).numpy(),
         (rgbs * tint).numpy(),

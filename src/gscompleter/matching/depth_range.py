@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.errors import InputError
-from gscompleter.matching.neighbours import Neighbours, neighbours_among
-from gscompleter.matching.stereo_image import StereoImage, stereo_images
-from gscompleter.matching.triangulation import inverse_depths
+from gscompleter.matching.neighbours import Neighbours, find_neighbours
+from gscompleter.matching.stereo_image import StereoImage, make_stereo_images
+from gscompleter.matching.triangulation import triangulate_valid
 from gscompleter.types import View
 
 MIN_MATCHES = 12
@@ -26,18 +26,18 @@ def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
     Raises:
         InputError: There are fewer than two views, or no baseline between them.
     """
-    images, unit = stereo_images(views)
-    neighbours = neighbours_among(images)
-    inverse = triangulated(images, neighbours)
+    images, unit = make_stereo_images(views)
+    neighbours = find_neighbours(images)
+    inverse = triangulate_neighbours(images, neighbours)
     if len(inverse) < MIN_MATCHES:
-        near, far = range_from_baselines(images, neighbours)
+        near, far = derive_range_from_baselines(images, neighbours)
     else:
         low, high = np.quantile(inverse, [0.02, 0.98])
         near, far = 0.5 / high, 4.0 / low
     return near * unit, far * unit
 
 
-def depth_range_of(
+def get_depth_range(
     views: Sequence[View],
     estimate: Callable[[Sequence[View]], tuple[float, float]] = estimate_depth_range,
 ) -> tuple[float, float]:
@@ -54,24 +54,26 @@ def depth_range_of(
     return near, far
 
 
-def range_from_baselines(
+def derive_range_from_baselines(
     images: Sequence[StereoImage], neighbours: Neighbours
 ) -> tuple[float, float]:
     """Derive a depth range from a parallax of 0.4 image widths and of a third of a pixel."""
     focal = float(np.median([image.K[0, 0] for image in images]))
     width = float(np.median([image.size[1] for image in images]))
-    pairs = [(i, others[0]) for i, others in enumerate(neighbours.of) if others]
+    pairs = [(i, others[0]) for i, others in enumerate(neighbours.neighbours_of) if others]
     apart = [float(np.linalg.norm(images[i].center - images[j].center)) for i, j in pairs]
     baseline = float(np.median(apart))
     return baseline * focal / (0.4 * width), baseline * 3.0 * focal
 
 
-def triangulated(images: Sequence[StereoImage], neighbours: Neighbours) -> Float[np.ndarray, "n"]:
+def triangulate_neighbours(
+    images: Sequence[StereoImage], neighbours: Neighbours
+) -> Float[np.ndarray, "n"]:
     """Triangulate the matches of neighbouring views; inverse z-depth per widest baseline."""
     found = [np.zeros(0)]
     for i, j in neighbours.pairs:
         a, b = neighbours.matches[i, j]
         if len(a):
-            found.append(inverse_depths(images[i], images[j], a, b))
-            found.append(inverse_depths(images[j], images[i], b, a))
+            found.append(triangulate_valid(images[i], images[j], a, b))
+            found.append(triangulate_valid(images[j], images[i], b, a))
     return np.concatenate(found)

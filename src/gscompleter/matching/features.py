@@ -15,23 +15,23 @@ Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
 Pixels = Float[np.ndarray, "m 2"]
 
 
-KEPT = 32
+CACHE_SIZE = 32
 """Images whose features are cached, because each target matches them again."""
 
 
-def features_of(view: StereoImage) -> Features:
+def detect_features(view: StereoImage) -> Features:
     """Detect the features of a view outside its ignored pixels."""
     grey = cv2.cvtColor((view.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
-    pixels, descriptors = _features_in(grey.tobytes(), grey.shape)
-    if view.ignored is None:
+    pixels, descriptors = _detect_features(grey.tobytes(), grey.shape)
+    if view.ignore_mask is None:
         return pixels, descriptors
     columns, rows = pixels.astype(int).T
-    counted = ~view.ignored[rows, columns]
+    counted = ~view.ignore_mask[rows, columns]
     return pixels[counted], descriptors[counted]
 
 
-@lru_cache(KEPT)
-def _features_in(grey: bytes, size: tuple[int, int]) -> Features:
+@lru_cache(CACHE_SIZE)
+def _detect_features(grey: bytes, size: tuple[int, int]) -> Features:
     detector = cv2.SIFT.create(2000, contrastThreshold=0.02)
     image = np.frombuffer(grey, np.uint8).reshape(size)
     keypoints, descriptors = detector.detectAndCompute(image, None)
@@ -40,7 +40,7 @@ def _features_in(grey: bytes, size: tuple[int, int]) -> Features:
     return np.array([k.pt for k in keypoints], np.float64) + 0.5, descriptors.astype(np.float64)
 
 
-def matches(a: Features, b: Features) -> tuple[Pixels, Pixels]:
+def match_features(a: Features, b: Features) -> tuple[Pixels, Pixels]:
     """Match mutual nearest neighbours that pass the ratio test."""
     if len(a[0]) < 2 or len(b[0]) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))

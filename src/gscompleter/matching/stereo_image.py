@@ -25,7 +25,7 @@ class StereoImage:
     rotation: Float[np.ndarray, "3 3"]
     """Rotation from camera to world axes."""
     center: Float[np.ndarray, "3"]
-    ignored: Bool[np.ndarray, "h w"] | None = None
+    ignore_mask: Bool[np.ndarray, "h w"] | None = None
     """True at pixels that are not matched, or None to match all."""
 
     @property
@@ -34,7 +34,7 @@ class StereoImage:
         return self.image.shape[0], self.image.shape[1]
 
 
-def stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]:
+def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]:
     """Convert views to units of their widest baseline; return it in scene units too.
 
     Camera offsets are rounded to 2^-16 baselines, so that a scaled scene gives identical results.
@@ -59,34 +59,38 @@ def stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]:
             "them; give photographs taken from different positions."
         )
     offsets = np.round((centers - centers[0]) / unit * 2**16) / 2**16
-    return [_stereo_image(view, offset) for view, offset in zip(views, offsets, strict=True)], unit
+    return [
+        _make_stereo_image(view, offset) for view, offset in zip(views, offsets, strict=True)
+    ], unit
 
 
-def _stereo_image(view: View, center: Float[np.ndarray, "3"]) -> StereoImage:
+def _make_stereo_image(view: View, center: Float[np.ndarray, "3"]) -> StereoImage:
     camera = view.camera
     return StereoImage(
         np.ascontiguousarray(view.image.detach().cpu().float().numpy()),
         camera.K.detach().cpu().double().numpy(),
         camera.c2w[:3, :3].detach().cpu().double().numpy(),
         center,
-        None if view.ignored is None else view.ignored.cpu().numpy(),
+        None if view.ignore_mask is None else view.ignore_mask.cpu().numpy(),
     )
 
 
-def contrast(
+def compute_contrast(
     a: Float32[np.ndarray, "h w 3"], b: Float32[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w"]:
     """Compute the largest channel difference of each pixel of two images."""
-    return largest(cv2.absdiff(a, b))
+    return take_largest_channel(cv2.absdiff(a, b))
 
 
-def largest(values: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+def take_largest_channel(values: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
     """Compute the largest channel of each pixel."""
     red, green, blue = cv2.split(values)
     return cv2.max(cv2.max(red, green), blue)
 
 
-def source_from_reference(reference: StereoImage, source: StereoImage) -> Float[np.ndarray, "3 4"]:
+def compute_source_from_reference(
+    reference: StereoImage, source: StereoImage
+) -> Float[np.ndarray, "3 4"]:
     """Compute [A | b], the transform from reference pixels to source pixels.
 
     A pixel (x, y, 1) at inverse depth w maps to A (x, y, 1) + b w, whose third entry is the z-depth

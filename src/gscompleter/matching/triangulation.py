@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from gscompleter.matching.features import Pixels
-from gscompleter.matching.stereo_image import StereoImage, source_from_reference
+from gscompleter.matching.stereo_image import StereoImage, compute_source_from_reference
 
 MAX_ERROR = 3.0
 """Largest distance of a match from its epipolar line, in pixels; poses are noisy."""
@@ -14,7 +14,7 @@ MIN_PARALLAX = 1.0
 """Smallest parallax that gives a depth, in pixels."""
 
 
-def inverse_depths(
+def triangulate_valid(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> Float[np.ndarray, "k"]:
     """Triangulate the valid matches; return inverse z-depth in `reference`."""
@@ -26,7 +26,7 @@ def triangulate(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Triangulate all matches; return inverse z-depth in `reference` and a validity mask."""
-    transform = source_from_reference(reference, source).astype(np.float64)
+    transform = compute_source_from_reference(reference, source).astype(np.float64)
     at_infinity = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ transform[:, :3].T
     b = transform[:, 3]
     # Solve matched * (A p + b w)_2 = (A p + b w)_xy for w by least squares.

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def flip_map(
+def compute_flip_map(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "h w"] | None:
     """Compute the FLIP error per pixel of two sRGB images; None if the package is missing."""

@@ -16,19 +16,19 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.geometry import inside, project, sample
+from gscompleter.geometry import is_inside, project, sample
 from gscompleter.render import Renderer
-from gscompleter.stages.integration import falling_on, keep_in_holes
+from gscompleter.stages.integration import filter_holes, project_mask
 from gscompleter.types import Camera, DepthMap, Gaussians
 
 MIN_OPACITY = 1 / 255
 """Opacity below which renderers drop a Gaussian."""
 
-MATCHED = 0.05
+MATCH_DISTANCE = 0.05
 """Largest distance of a match, as a share of the median context depth at the target."""
 
 
-def abs_rel(
+def compute_abs_rel(
     depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]
 ) -> float | None:
     """Compute mean(|depth - truth| / truth) over pixels of `where` with known truth; 0 is best.
@@ -41,7 +41,7 @@ def abs_rel(
     return ((d - t).abs() / t).mean().item()
 
 
-def num_known(truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]) -> int | None:
+def count_known(truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]) -> int | None:
     """Count the pixels of `where` with positive truth; None without truth."""
     return None if truth is None else int((where & (truth > 0)).sum())
 
@@ -58,7 +58,7 @@ class CloudDistances:
         """Mean distance in scene units, not squared, so that floaters do not dominate."""
         return float(self.a_to_b.mean() + self.b_to_a.mean()) / 2
 
-    def f_score(self, threshold: float) -> float:
+    def compute_f_score(self, threshold: float) -> float:
         """Compute 2 P R / (P + R); 1 is best, and 0 if P = R = 0.
 
         Precision P is the share of A within `threshold` (scene units) of B, recall R that of B near
@@ -70,12 +70,14 @@ class CloudDistances:
         return 2 * precision * recall / total if total > 0 else 0.0
 
 
-def cloud_distances(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> CloudDistances:
+def compute_cloud_distances(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> CloudDistances:
     """Compute exact nearest-neighbour distances between two point sets, both ways."""
-    return CloudDistances(nearest(a, b), nearest(b, a))
+    return CloudDistances(compute_nearest_distances(a, b), compute_nearest_distances(b, a))
 
 
-def nearest(points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]) -> Float[np.ndarray, "n"]:
+def compute_nearest_distances(
+    points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]
+) -> Float[np.ndarray, "n"]:
     """Compute the Euclidean distance of each point to the nearest of `others`, in float64.
 
     Raises:
@@ -117,7 +119,7 @@ class Alignment:
 
 
 @torch.no_grad()
-def alignment(
+def measure_alignment(
     added: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
 ) -> Alignment:
     """Measure AbsRel, Chamfer distance and F-score of the added Gaussians against `context`.
@@ -128,16 +130,16 @@ def alignment(
     the overlap, matched with everything added. A perfect completion does not reach 0, because
     Gaussians are spaced and depths mix at edges: compare methods on the same cases.
     """
-    added, context = drawable(added), drawable(context)
+    added, context = drop_transparent(added), drop_transparent(context)
     generated = renderer.render(added, target).depth_map()
     reference = renderer.render(context, target).depth_map()
     overlap = generated.valid & reference.valid
-    error = abs_rel(generated.depth, reference.depth, overlap)
+    error = compute_abs_rel(generated.depth, reference.depth, overlap)
     return compare_clouds(added, context, target, reference, overlap, error)
 
 
 @torch.no_grad()
-def primitive_alignment(
+def measure_primitive_alignment(
     registered: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
 ) -> Alignment:
     """Measure the same for all registered Gaussians, without filtering and rendering them.
@@ -146,9 +148,9 @@ def primitive_alignment(
     overlap. AbsRel is the mean of |z - D| / D with the z-depth z of the mean and the rendered
     context depth D. Renders would favour scattered Gaussians, which cover fewer and easier pixels.
     """
-    registered, context = drawable(registered), drawable(context)
+    registered, context = drop_transparent(registered), drop_transparent(context)
     reference = renderer.render(context, target).depth_map()
-    points = registered[falling_on(reference.valid, registered, target)].means
+    points = registered[project_mask(reference.valid, registered, target)].means
     pixels, z = project(points, target)
     x, y = pixels.long().unbind(-1)
     overlap = torch.zeros_like(reference.valid)
@@ -171,26 +173,29 @@ def compare_clouds(
     if count == 0:
         return Alignment(share, count, None, None, None, None)
     scale = reference.depth[reference.valid].double().median().item()
-    threshold = MATCHED * scale
-    points = keep_in_holes(generated, None, overlap, target).means
-    surface = keep_in_holes(context, None, overlap, target).means
-    surface = surface[on_surface(surface, reference.depth, target, threshold)]
+    threshold = MATCH_DISTANCE * scale
+    points = filter_holes(generated, None, overlap, target).means
+    surface = filter_holes(context, None, overlap, target).means
+    surface = surface[find_on_surface(surface, reference.depth, target, threshold)]
     if len(points) == 0 or len(surface) == 0:
         return Alignment(share, count, scale, error, None, None)
-    distances = CloudDistances(nearest(points, context.means), nearest(surface, generated.means))
-    f_score = distances.f_score(threshold)
+    distances = CloudDistances(
+        compute_nearest_distances(points, context.means),
+        compute_nearest_distances(surface, generated.means),
+    )
+    f_score = distances.compute_f_score(threshold)
     return Alignment(share, count, scale, error, distances.chamfer, f_score)
 
 
-def drawable(gaussians: Gaussians) -> Gaussians:
+def drop_transparent(gaussians: Gaussians) -> Gaussians:
     """Drop Gaussians that no renderer shows."""
     return gaussians[gaussians.opacities >= MIN_OPACITY]
 
 
-def on_surface(
+def find_on_surface(
     points: Float[Tensor, "n 3"], depth: Float[Tensor, "h w"], camera: Camera, tolerance: float
 ) -> Bool[Tensor, "n"]:
     """Find points whose z-depth is that of their pixel, within `tolerance` in scene units."""
     pixels, z = project(points, camera)
     at_pixel = sample(depth[..., None], pixels, "nearest")[..., 0]
-    return inside(pixels, z, camera) & ((z - at_pixel).abs() <= tolerance)
+    return is_inside(pixels, z, camera) & ((z - at_pixel).abs() <= tolerance)

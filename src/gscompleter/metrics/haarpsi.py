@@ -28,10 +28,10 @@ def haarpsi(
     Images are halved first, as published; a pixel counts if half of its area is in `where`. None
     without such a pixel.
     """
-    of_image, of_truth = planes(image), planes(truth)
-    similarity, weight = similarities(of_image, of_truth)
+    of_image, of_truth = convert_to_yiq(image), convert_to_yiq(truth)
+    similarity, weight = compute_similarities(of_image, of_truth)
     if where is not None:
-        inside = halved(where[None].double().cpu())[0] >= 0.5
+        inside = halve_image(where[None].double().cpu())[0] >= 0.5
         similarity, weight = similarity[:, inside], weight[:, inside]
     if similarity.numel() == 0:
         return None
@@ -41,19 +41,23 @@ def haarpsi(
     return (mean.logit() / ALPHA).square().item()
 
 
-def planes(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 half_h half_w"]:
+def convert_to_yiq(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 half_h half_w"]:
     """Convert to YIQ in units of 8-bit colours, at half the size."""
     colours = 255 * image.clamp(0, 1).double().cpu()
-    return halved((colours @ colours.new_tensor(YIQ).T).movedim(-1, 0))
+    return halve_image((colours @ colours.new_tensor(YIQ).T).movedim(-1, 0))
 
 
-def similarities(
+def compute_similarities(
     a: Float[Tensor, "3 h w"], b: Float[Tensor, "3 h w"]
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 h w"]]:
     """Compare two finer scales of luminance, and chrominance; the coarsest scale gives weights."""
-    of_a, of_b = ([wavelets(p[0], scale) for scale in (1, 2, 3)] for p in (a, b))
-    luminance = torch.stack([alike(x, y) for x, y in zip(of_a[:2], of_b[:2], strict=True)]).mean(0)
-    chrominance = alike(neighbour_means(a[1:]), neighbour_means(b[1:])).mean(0, keepdim=True)
+    of_a, of_b = ([compute_wavelets(p[0], scale) for scale in (1, 2, 3)] for p in (a, b))
+    luminance = torch.stack(
+        [compare_values(x, y) for x, y in zip(of_a[:2], of_b[:2], strict=True)]
+    ).mean(0)
+    chrominance = compare_values(average_neighbours(a[1:]), average_neighbours(b[1:])).mean(
+        0, keepdim=True
+    )
     weight = torch.maximum(of_a[2], of_b[2])
     return (
         torch.cat([luminance, chrominance]),
@@ -61,12 +65,12 @@ def similarities(
     )
 
 
-def alike(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+def compare_values(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Compute (2 a b + c) / (a² + b² + c), which is 1 for equal values."""
     return (2 * a * b + C) / (a**2 + b**2 + C)
 
 
-def wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tensor, "2 h w"]:
+def compute_wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tensor, "2 h w"]:
     """Compute magnitudes of Haar wavelets of 2^scale pixels, along columns and rows."""
     size = 2**scale
     step = luminance.new_full((size, size), 1 / size)
@@ -76,12 +80,12 @@ def wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tensor, "2 h 
     return conv2d(padded, torch.stack([step, step.T])[:, None])[0].abs()
 
 
-def neighbour_means(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
+def average_neighbours(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
     """Compute magnitudes of the means of 2 x 2 pixels, one for every pixel."""
     return avg_pool2d(pad(values, (0, 1, 0, 1)), 2, stride=1).abs()
 
 
-def halved(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c half_h half_w"]:
+def halve_image(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c half_h half_w"]:
     """Average 2 x 2 pixels, with black beyond an odd side."""
     h, w = values.shape[1:]
     return avg_pool2d(pad(values, (0, w % 2, 0, h % 2)), 2)

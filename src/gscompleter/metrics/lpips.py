@@ -55,7 +55,7 @@ class Network:
     linear: WeightsFile
 
 
-def vgg_layers() -> tuple[tuple[int, int, int, int] | str, ...]:
+def make_vgg_layers() -> tuple[tuple[int, int, int, int] | str, ...]:
     """Return the layers of VGG16: blocks of 3 x 3 convolutions, each followed by pooling."""
     layers: list[tuple[int, int, int, int] | str] = []
     for channels, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
@@ -76,7 +76,7 @@ LINEAR = (
 # are not published; several independent projects record the same values.
 NETWORKS: dict[str, Network] = {
     "vgg": Network(
-        layers=vgg_layers(),
+        layers=make_vgg_layers(),
         pool=2,
         taps=(3, 8, 15, 22, 29),
         channels=(64, 128, 256, 512, 512),
@@ -131,7 +131,7 @@ class Lpips(nn.Module):
     def __init__(self, network: Network) -> None:
         super().__init__()
         self.network = network
-        self.features = backbone(network)
+        self.features = build_backbone(network)
         for i, channels in enumerate(network.channels):
             # w_l. The published names count a dropout layer, which is used in training only.
             model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
@@ -151,14 +151,20 @@ class Lpips(nn.Module):
                 f"LPIPS needs images of at least {self.network.min_side} pixels per side, "
                 f"got {height} x {width}."
             )
-        pairs = zip(self.unit_features(image.clamp(0, 1)), self.unit_features(truth), strict=True)
+        pairs = zip(
+            self.compute_unit_features(image.clamp(0, 1)),
+            self.compute_unit_features(truth),
+            strict=True,
+        )
         terms = [
             self.get_submodule(f"lin{i}.model")((a - b).square()).mean()
             for i, (a, b) in enumerate(pairs)
         ]
         return torch.stack(terms).sum()
 
-    def unit_features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "1 _ _ _"]]:
+    def compute_unit_features(
+        self, image: Float[Tensor, "h w 3"]
+    ) -> list[Float[Tensor, "1 _ _ _"]]:
         """Compute features at the five taps, of unit length along the channels."""
         x = image.to(self.shift).permute(2, 0, 1) * 2 - 1
         x = ((x - self.shift) / self.scale)[None]
@@ -171,7 +177,7 @@ class Lpips(nn.Module):
         return found
 
 
-def backbone(network: Network) -> nn.Sequential:
+def build_backbone(network: Network) -> nn.Sequential:
     """Build the layers up to the last tap, numbered as in torchvision."""
     modules: list[nn.Module] = []
     channels = 3
@@ -208,7 +214,7 @@ def load_lpips(
         raise InputError(f"There is no LPIPS network {network!r}; choose {' or '.join(NETWORKS)}.")
     wanted = NETWORKS[network]
     files = (wanted.backbone, wanted.linear)
-    paths = [locate(file, wanted, folder, download and folder is None) for file in files]
+    paths = [locate_weights(file, wanted, folder, download and folder is None) for file in files]
     of_backbone, of_linear = map(read_weights, paths, files)
     metric = Lpips(wanted)
     # The file also holds the classifier, which the metric does not use.
@@ -222,14 +228,16 @@ def load_lpips(
     return metric.eval().requires_grad_(False)
 
 
-def place_of(file: WeightsFile, folder: Path | None) -> Path:
+def get_weights_path(file: WeightsFile, folder: Path | None) -> Path:
     """Return the expected path of a file, in `folder` or in the cache of torch.hub."""
     return (Path(torch.hub.get_dir()) / file.cache if folder is None else folder) / file.name
 
 
-def locate(file: WeightsFile, network: Network, folder: Path | None, download: bool) -> Path:
+def locate_weights(
+    file: WeightsFile, network: Network, folder: Path | None, download: bool
+) -> Path:
     """Return the path of a weights file, downloaded if needed and allowed."""
-    path = place_of(file, folder)
+    path = get_weights_path(file, folder)
     if path.is_file():
         return path
     failure = ""
@@ -242,7 +250,7 @@ def locate(file: WeightsFile, network: Network, folder: Path | None, download: b
         except (OSError, RuntimeError) as error:
             failure = f" (the download failed: {error})"
     files = (network.backbone, network.linear)
-    places = " and ".join(dict.fromkeys(str(place_of(f, folder).parent) for f in files))
+    places = " and ".join(dict.fromkeys(str(get_weights_path(f, folder).parent) for f in files))
     needed = " and ".join(f.url for f in files)
     raise WeightsNotAvailable(f"LPIPS lacks {path.name}{failure}; put {needed} into {places}.")
 
@@ -257,12 +265,12 @@ def read_weights(path: Path, file: WeightsFile) -> Mapping[str, Tensor]:
     return weights
 
 
-cached_lpips = lru_cache(maxsize=2)(load_lpips)
+load_cached_lpips = lru_cache(maxsize=2)(load_lpips)
 """`load_lpips` with a cache of two networks."""
 
 
 @torch.no_grad()
-def lpips_if_available(
+def compute_lpips(
     image: Float[Tensor, "h w 3"],
     truth: Float[Tensor, "h w 3"],
     network: NetworkName = "vgg",
@@ -270,7 +278,7 @@ def lpips_if_available(
 ) -> float | None:
     """Compute LPIPS, or return None if the weights are not on this machine."""
     try:
-        metric = cached_lpips(network, folder, download=False)
+        metric = load_cached_lpips(network, folder, download=False)
     except WeightsNotAvailable:
         return None
     return float(metric(image, truth).item())

@@ -10,19 +10,24 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.metrics.flip import flip_map
+from gscompleter.metrics.flip import compute_flip_map
 from gscompleter.metrics.geometry import (
     Alignment,
-    abs_rel,
-    alignment,
-    num_known,
-    primitive_alignment,
+    compute_abs_rel,
+    count_known,
+    measure_alignment,
+    measure_primitive_alignment,
 )
 from gscompleter.metrics.haarpsi import haarpsi
-from gscompleter.metrics.image import MAX_PSNR, gradient_energy_ratio, masked_psnr, ssim
-from gscompleter.metrics.lpips import lpips_if_available
+from gscompleter.metrics.image import (
+    MAX_PSNR,
+    compute_gradient_energy_ratio,
+    compute_masked_psnr,
+    ssim,
+)
+from gscompleter.metrics.lpips import compute_lpips
 from gscompleter.render import Renderer
-from gscompleter.stages.integration import hole_mask
+from gscompleter.stages.integration import compute_hole_mask
 from gscompleter.types import Camera, Gaussians, Render, View
 
 Image = Float[Tensor, "h w 3"]
@@ -61,7 +66,7 @@ class Quality:
 
 
 @dataclass(frozen=True)
-class Looks:
+class PerceptualQuality:
     """Scores of a part of an image that do not reward blur; None without a pixel."""
 
     flip: float | None
@@ -113,14 +118,14 @@ class Scores:
     registered_chamfer: float | None = None
     """Their Chamfer distance as a share of the median depth at the target."""
     registered_f_score: float | None = None
-    hole_looks: Looks | None = None
+    hole_looks: PerceptualQuality | None = None
     """At the target in the hole, after completion."""
-    observed_looks: Looks | None = None
+    observed_looks: PerceptualQuality | None = None
     """At the target over all other pixels."""
 
 
 @dataclass(frozen=True)
-class Drawings:
+class TargetRenders:
     """Renders at the target."""
 
     before: Render
@@ -137,7 +142,7 @@ def score(
     truth: Truth,
     renderer: Renderer,
     registered: Gaussians | None = None,
-) -> tuple[Scores, Drawings]:
+) -> tuple[Scores, TargetRenders]:
     """Score a completion, and return the renders at the target.
 
     `added` is None if existing Gaussians were changed; `registered` has all lifted Gaussians.
@@ -145,40 +150,44 @@ def score(
     target = truth.target
     was = renderer.render(before, target.camera)
     now = renderer.render(after, target.camera)
-    counted = target.counted
-    holes, covered = hole_mask(was.alpha), now.depth_map().valid & counted
-    context = _drawn(before, after, truth.views, renderer)
-    beside = _drawn(before, after, truth.neighbours, renderer)
+    counted = target.valid_mask
+    holes, covered = compute_hole_mask(was.alpha), now.depth_map().valid & counted
+    context = _render_views(before, after, truth.views, renderer)
+    beside = _render_views(before, after, truth.neighbours, renderer)
     scores = Scores(
         hole_fraction=holes.float().mean().item(),
-        target_before=quality(was.image, target),
-        target_after=quality(now.image, target),
-        hole_psnr=masked_psnr(now.image, target.image, holes & counted),
-        observed_psnr=_masked_change(was, now, target, ~holes & counted),
-        neighbours_psnr=mean_change(_changes(beside, counted_psnr)),
-        context_psnr=_changes(context, counted_psnr),
-        context_ssim=_changes(context, counted_ssim),
-        depth_observed=abs_rel(now.depth, target.depth, ~holes & covered),
-        depth_hole=abs_rel(now.depth, target.depth, holes & covered),
-        depth_observed_pixels=num_known(target.depth, ~holes & covered),
-        depth_hole_pixels=num_known(target.depth, holes & covered),
-        hole_looks=looks(target.compared(now.image), target.image, holes & counted),
-        observed_looks=looks(target.compared(now.image), target.image, ~holes & counted),
+        target_before=measure_quality(was.image, target),
+        target_after=measure_quality(now.image, target),
+        hole_psnr=compute_masked_psnr(now.image, target.image, holes & counted),
+        observed_psnr=_measure_masked_change(was, now, target, ~holes & counted),
+        neighbours_psnr=average_changes(_measure_changes(beside, compute_view_psnr)),
+        context_psnr=_measure_changes(context, compute_view_psnr),
+        context_ssim=_measure_changes(context, compute_view_ssim),
+        depth_observed=compute_abs_rel(now.depth, target.depth, ~holes & covered),
+        depth_hole=compute_abs_rel(now.depth, target.depth, holes & covered),
+        depth_observed_pixels=count_known(target.depth, ~holes & covered),
+        depth_hole_pixels=count_known(target.depth, holes & covered),
+        hole_looks=measure_perceptual_quality(
+            target.fill_ignored(now.image), target.image, holes & counted
+        ),
+        observed_looks=measure_perceptual_quality(
+            target.fill_ignored(now.image), target.image, ~holes & counted
+        ),
     )
     if added is not None and len(added) > 0:
-        aligned = alignment(added, before, target.camera, renderer)
+        aligned = measure_alignment(added, before, target.camera, renderer)
         scores = replace(
             scores,
-            depth_rim=rim_error(added, was, target.camera, renderer),
-            **alignment_scores("align", aligned),
+            depth_rim=measure_seam_step(added, was, target.camera, renderer),
+            **name_alignment_scores("align", aligned),
         )
     if registered is not None and len(registered) > 0:
-        aligned = primitive_alignment(registered, before, target.camera, renderer)
-        scores = replace(scores, **alignment_scores("registered", aligned))
-    return scores, Drawings(was, now, holes)
+        aligned = measure_primitive_alignment(registered, before, target.camera, renderer)
+        scores = replace(scores, **name_alignment_scores("registered", aligned))
+    return scores, TargetRenders(was, now, holes)
 
 
-def alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
+def name_alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
     """Return the fields of `Scores` for an alignment, prefixed by `name`."""
     return {
         f"{name}_pixels": aligned.pixels,
@@ -188,44 +197,44 @@ def alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
     }
 
 
-def quality(image: Float[Tensor, "h w 3"], photograph: View) -> Quality:
+def measure_quality(image: Float[Tensor, "h w 3"], photograph: View) -> Quality:
     """Compute PSNR, SSIM and, if the weights are available, LPIPS.
 
     Ignored pixels of the photograph do not count for PSNR and count as equal for the others.
     """
-    truth, compared = photograph.image, photograph.compared(image)
+    truth, compared = photograph.image, photograph.fill_ignored(image)
     return Quality(
-        counted_psnr(image, photograph),
-        counted_ssim(image, photograph),
-        lpips_if_available(compared, truth, "vgg"),
-        lpips_if_available(compared, truth, "alex"),
+        compute_view_psnr(image, photograph),
+        compute_view_ssim(image, photograph),
+        compute_lpips(compared, truth, "vgg"),
+        compute_lpips(compared, truth, "alex"),
     )
 
 
-def counted_psnr(image: Float[Tensor, "h w 3"], photograph: View) -> float:
+def compute_view_psnr(image: Float[Tensor, "h w 3"], photograph: View) -> float:
     """Compute PSNR in dB over valid pixels of the photograph; `MAX_PSNR` if there are none."""
-    counted = masked_psnr(image, photograph.image, photograph.counted)
+    counted = compute_masked_psnr(image, photograph.image, photograph.valid_mask)
     return MAX_PSNR if counted is None else counted
 
 
-def counted_ssim(image: Float[Tensor, "h w 3"], photograph: View) -> float:
+def compute_view_ssim(image: Float[Tensor, "h w 3"], photograph: View) -> float:
     """Compute SSIM, with ignored pixels of the photograph counted as equal."""
-    return ssim(photograph.compared(image), photograph.image)
+    return ssim(photograph.fill_ignored(image), photograph.image)
 
 
-def looks(
+def measure_perceptual_quality(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
-) -> Looks:
+) -> PerceptualQuality:
     """Compute FLIP, HaarPSI and the gradient energy ratio over the pixels of `where`."""
-    errors = flip_map(image, truth)
-    return Looks(
+    errors = compute_flip_map(image, truth)
+    return PerceptualQuality(
         None if errors is None or not where.any() else errors[where.cpu()].mean().item(),
         haarpsi(image, truth, where),
-        gradient_energy_ratio(image, truth, where),
+        compute_gradient_energy_ratio(image, truth, where),
     )
 
 
-def rim_error(
+def measure_seam_step(
     added: Gaussians, context: Render, target: Camera, renderer: Renderer
 ) -> float | None:
     """Compute the median of |D_added - D_context| / D_context; None for too few pixels."""
@@ -236,7 +245,7 @@ def rim_error(
     return ((alone.depth - context.depth).abs() / context.depth)[both].median().item()
 
 
-def mean_change(changes: Sequence[Change]) -> Change | None:
+def average_changes(changes: Sequence[Change]) -> Change | None:
     """Average the scores before and after; None for an empty sequence."""
     if not changes:
         return None
@@ -244,15 +253,15 @@ def mean_change(changes: Sequence[Change]) -> Change | None:
     return Change(sum(c.before for c in changes) / n, sum(c.after for c in changes) / n)
 
 
-def _masked_change(
+def _measure_masked_change(
     before: Render, after: Render, target: View, where: Bool[Tensor, "h w"]
 ) -> Change | None:
-    was = masked_psnr(before.image, target.image, where)
-    now = masked_psnr(after.image, target.image, where)
+    was = compute_masked_psnr(before.image, target.image, where)
+    now = compute_masked_psnr(after.image, target.image, where)
     return None if was is None or now is None else Change(was, now)
 
 
-def _drawn(
+def _render_views(
     before: Gaussians, after: Gaussians, views: Sequence[View], renderer: Renderer
 ) -> list[tuple[Image, Image, View]]:
     """Render each view before and after, and add its photograph."""
@@ -266,7 +275,7 @@ def _drawn(
     ]
 
 
-def _changes(
-    drawn: Sequence[tuple[Image, Image, View]], metric: Callable[[Image, View], float]
+def _measure_changes(
+    renders: Sequence[tuple[Image, Image, View]], metric: Callable[[Image, View], float]
 ) -> tuple[Change, ...]:
-    return tuple(Change(metric(was, view), metric(now, view)) for was, now, view in drawn)
+    return tuple(Change(metric(was, view), metric(now, view)) for was, now, view in renders)

@@ -15,28 +15,28 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.geometry import at_depths
-from gscompleter.render import AppearanceRender, ColourErrors, DepthRender, OpacityRender, Renderer
+from gscompleter.geometry import move_to_depths
+from gscompleter.render import AppearanceRender, ColorErrors, DepthRender, OpacityRender, Renderer
 from gscompleter.render.painting import (
-    DrawnAnew,
-    errors_by_slopes,
-    grey,
-    looking,
-    painted,
-    sums_by_slopes,
+    FullRedraw,
+    backproject_by_autograd,
+    backproject_errors_by_autograd,
+    set_appearance,
+    set_colors,
+    to_grey,
 )
-from gscompleter.render.spherical_harmonics import colours_from
+from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render, merge
 
 
 @runtime_checkable
-class Drawing(Renderer, Protocol):
+class CullingRenderer(Renderer, Protocol):
     """A renderer as a `CudaFrozenScene` needs it."""
 
-    def visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
+    def find_visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
         """Return True for Gaussians that reach the image, ignoring occlusion."""
 
-    def plan(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
+    def vary_opacities(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
         """Prepare renders with opacities [n] that are no larger than their own."""
 
 
@@ -64,22 +64,22 @@ class CudaRenderer:
         if len(gaussians) == 0:
             empty = torch.zeros(camera.height, camera.width, device=gaussians.means.device)
             return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
-        color_and_depth, alpha, _ = self.rasterized(gaussians, camera)
+        color_and_depth, alpha, _ = self.rasterize(gaussians, camera)
         return Render(color_and_depth[0, ..., :3], color_and_depth[0, ..., 3], alpha[0, ..., 0])
 
-    def freeze(self, context: Gaussians, camera: Camera) -> CudaView:
+    def freeze(self, context: Gaussians, camera: Camera) -> CudaFrozenScene:
         """Prepare `context` for many renders from `camera`."""
-        return frozen_by(self, context, camera)
+        return freeze_with(self, context, camera)
 
     @torch.no_grad()
-    def visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
+    def find_visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
         """Return True for Gaussians whose box touches the image: gsplat gives them a radius."""
         if len(gaussians) == 0:
             return torch.zeros_like(gaussians.generated, dtype=torch.bool)
-        radii = self.rasterized(gaussians, camera)[2]["radii"]
+        radii = self.rasterize(gaussians, camera)[2]["radii"]
         return (radii.reshape(len(gaussians), -1) > 0).all(dim=1)
 
-    def plan(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
+    def vary_opacities(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
         """Project, sort and bin once.
 
         Fainter Gaussians render the same in the larger box, where alpha 1/255 drops the rest.
@@ -87,11 +87,11 @@ class CudaRenderer:
         from gsplat import rasterize_to_pixels
 
         with torch.no_grad():
-            _, _, seen = self.rasterized(gaussians, camera)
+            _, _, seen = self.rasterize(gaussians, camera)
             given, rendered = gaussians.opacities, seen["opacities"].reshape(-1)
             factors = torch.where(given > 0, rendered / given, 0.0)  # 1 unless antialiased
             center = camera.center.to(gaussians.means.device)
-            colors = colours_from(gaussians.sh, gaussians.means, center)
+            colors = evaluate_colors(gaussians.sh, gaussians.means, center)
             values = torch.cat([colors[None], seen["depths"][..., None]], dim=-1)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
@@ -111,7 +111,7 @@ class CudaRenderer:
 
         return render
 
-    def rasterized(
+    def rasterize(
         self, gaussians: Gaussians, camera: Camera
     ) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"], dict[str, Any]]:
         """Rasterize at least one Gaussian: colour and depth, alpha, and gsplat's metadata."""
@@ -139,13 +139,13 @@ class CudaRenderer:
 
 
 @dataclass(frozen=True)
-class CudaView:
+class CudaFrozenScene:
     """A frozen scene that keeps only Gaussians visible to its camera.
 
     Each composite still projects and sorts all of them, since new ones may lie anywhere in between.
     """
 
-    drawing: Drawing
+    renderer: CullingRenderer
     scene: Gaussians
     camera: Camera
     rows: Int64[Tensor, "m"]
@@ -154,73 +154,77 @@ class CudaView:
     """Number of Gaussians of the context."""
 
     @cached_property
-    def context(self) -> Render:
+    def render(self) -> Render:
         """The render of the context alone."""
         with torch.no_grad():
-            return self.drawing.render(self.scene, self.camera)
+            return self.renderer.render(self.scene, self.camera)
 
     @cached_property
-    def reaching(self) -> Int64[Tensor, "seen"]:
+    def visible_rows(self) -> Int64[Tensor, "seen"]:
         """Indices in `scene` of the Gaussians that reach the image."""
-        return self.drawing.visible(self.scene, self.camera).nonzero()[:, 0]
+        return self.renderer.find_visible(self.scene, self.camera).nonzero()[:, 0]
 
     @cached_property
-    def seen(self) -> Gaussians:
+    def visible_scene(self) -> Gaussians:
         """The visible Gaussians, with their colours as this camera sees them."""
-        kept = self.scene[self.reaching]
+        kept = self.scene[self.visible_rows]
         center = self.camera.center.to(kept.means.device)
-        colors = colours_from(kept.sh, kept.means, center)
-        return painted(kept, colors)
+        colors = evaluate_colors(kept.sh, kept.means, center)
+        return set_colors(kept, colors)
 
-    def extended(self, new: Gaussians) -> CudaView:
+    def extend(self, new: Gaussians) -> CudaFrozenScene:
         """Add `new` to the visible Gaussians."""
         numbers = self.count + torch.arange(len(new), device=self.rows.device)
-        rows = torch.cat([self.rows[self.reaching], numbers])
+        rows = torch.cat([self.rows[self.visible_rows], numbers])
         count = self.count + len(new)
-        return replace(self, scene=merge([self.seen, new]), rows=rows, count=count)
+        return replace(self, scene=merge([self.visible_scene, new]), rows=rows, count=count)
 
-    def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+    def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Backproject `image` by autograd."""
-        sums = layers.new_zeros((self.count, 3))
+        sums = image.new_zeros((self.count, 3))
         return sums.index_copy(
-            0, self.rows[self.reaching], sums_by_slopes(self._painted, self.seen, layers)
+            0,
+            self.rows[self.visible_rows],
+            backproject_by_autograd(self._render_colors, self.visible_scene, image),
         )
 
-    def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+    def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Render the visible Gaussians with the values as grey."""
-        return self._painted(grey(values[self.rows[self.reaching]]))[..., 0]
+        return self._render_colors(to_grey(values[self.rows[self.visible_rows]]))[..., 0]
 
-    def _painted(self, colours: Float[Tensor, "seen 3"]) -> Float[Tensor, "h w 3"]:
-        return self.drawing.render(painted(self.seen, colours), self.camera).image
+    def _render_colors(self, colors: Float[Tensor, "seen 3"]) -> Float[Tensor, "h w 3"]:
+        return self.renderer.render(set_colors(self.visible_scene, colors), self.camera).image
 
     def composite(self, new: Gaussians) -> Render:
         """Render context and `new`."""
-        return self.drawing.render(merge([self.seen, new]), self.camera)
+        return self.renderer.render(merge([self.visible_scene, new]), self.camera)
 
-    def plan(self, new: Gaussians) -> OpacityRender:
+    def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities, with boxes that hold for every opacity."""
         opaque = replace(new, opacities=torch.ones_like(new.opacities))
-        render = self.drawing.plan(merge([self.seen, opaque]), self.camera)
-        return lambda opacities: render(torch.cat([self.seen.opacities, opacities]))
+        render = self.renderer.vary_opacities(merge([self.visible_scene, opaque]), self.camera)
+        return lambda opacities: render(torch.cat([self.visible_scene.opacities, opacities]))
 
-    def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
+    def vary_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
         """Fix all of `new` but its appearance; each render is a full redraw."""
-        return DrawnAnew(lambda *looks: self.composite(looking(new, *looks)).image)
+        return FullRedraw(lambda *looks: self.composite(set_appearance(new, *looks)).image)
 
-    def plan_colours(self, new: Gaussians) -> ColourErrors:
+    def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Fix all of `new` but its colours; each render is a full redraw."""
 
         def render(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-            return self.composite(painted(new, colors)).image
+            return self.composite(set_colors(new, colors)).image
 
-        return lambda colors, photograph: errors_by_slopes(render, new, colors, photograph)
+        return lambda colors, photograph: backproject_errors_by_autograd(
+            render, new, colors, photograph
+        )
 
-    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Fix all of `new` but its depths; each render is a full redraw."""
-        return lambda depths: self.composite(at_depths(new, self.camera, depths))
+        return lambda depths: self.composite(move_to_depths(new, self.camera, depths))
 
 
-def frozen_by(drawing: Drawing, context: Gaussians, camera: Camera) -> CudaView:
+def freeze_with(renderer: CullingRenderer, context: Gaussians, camera: Camera) -> CudaFrozenScene:
     """Freeze all of `context`."""
     rows = torch.arange(len(context), device=context.means.device)
-    return CudaView(drawing, context, camera, rows, len(context))
+    return CudaFrozenScene(renderer, context, camera, rows, len(context))

@@ -20,21 +20,21 @@ from torch.autograd.function import once_differentiable
 
 from gscompleter.kernels import rasterizer as kernels
 from gscompleter.kernels.rasterizer import Fragments
-from gscompleter.kernels.sharing import pieces_of, run
+from gscompleter.kernels.sharing import run, split_into_pieces
 
 if TYPE_CHECKING:
-    from gscompleter.render import LooksError
-    from gscompleter.render.cpu import Binned, CpuView, Viewpoint
+    from gscompleter.render import AppearanceError
+    from gscompleter.render.cpu import BinnedSplats, CpuFrozenScene, Viewpoint
 
 
 @dataclass(frozen=True)
-class Folded:
+class BakedScene:
     """A frozen scene with new Gaussians that vary in opacity and colour only."""
 
     viewpoint: Viewpoint
     image: Float32[ndarray, "h w 3"]
     """The frozen scene alone."""
-    binned: Binned
+    binned: BinnedSplats
     means: Float32[ndarray, "n 3"]
     fragments: Sequence[Fragments]
     """One item per group of tiles."""
@@ -43,131 +43,137 @@ class Folded:
         self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
     ) -> Float[Tensor, "h w 3"]:
         """Render the image; differentiable."""
-        image: Tensor = _Drawn.apply(self, opacities, sh)
+        image: Tensor = _ImageFunction.apply(self, opacities, sh)
         return image
 
-    def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
+    def make_error(
+        self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]
+    ) -> AppearanceError:
         """Make the error function, which evaluates only pixels that have fragments."""
-        held = Held(self, float32(wanted), float32(weights))
+        held = ImageComparison(self, to_float32(wanted), to_float32(weights))
 
         def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:
-            missed: Tensor = _Missed.apply(held, opacities, sh)
+            missed: Tensor = _ErrorFunction.apply(held, opacities, sh)
             return missed
 
         return error
 
     @cached_property
-    def shown(self) -> Int64[ndarray, "shown"]:
+    def visible_rows(self) -> Int64[ndarray, "shown"]:
         """Indices of the Gaussians that have fragments."""
         named = np.zeros(len(self.means), np.bool_)
         for piece in self.fragments:
             named[piece.names[piece.names >= 0]] = True
         return np.flatnonzero(named)
 
-    def colours(self, sh: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n 3"]:
+    def shade(self, sh: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n 3"]:
         """Compute the colours seen by the camera; those of invisible Gaussians are undefined."""
         colors = np.empty((len(sh), 3), np.float32)
-        seen = (self.shown, self.viewpoint.pinhole.center, self.means)
-        self.viewpoint.share(kernels.shade, len(self.shown), *seen, sh, colors)
+        seen = (self.visible_rows, self.viewpoint.pinhole.center, self.means)
+        self.viewpoint.share(kernels.shade, len(self.visible_rows), *seen, sh, colors)
         return colors
 
-    def draw(
-        self, opacities: Float32[ndarray, "n"], colours: Float32[ndarray, "n 3"]
+    def render(
+        self, opacities: Float32[ndarray, "n"], colors: Float32[ndarray, "n 3"]
     ) -> Float32[ndarray, "h w 3"]:
         """Render the frozen image with the pixels that have fragments."""
         image = self.image.copy()
-        self.draw_fragments(opacities, colours, image)
+        self.render_fragments(opacities, colors, image)
         return image
 
-    def draw_fragments(
+    def render_fragments(
         self,
         opacities: Float32[ndarray, "n"],
-        colours: Float32[ndarray, "n 3"],
+        colors: Float32[ndarray, "n 3"],
         image: Float32[ndarray, "h w 3"],
     ) -> None:
         """Write the pixels that have fragments."""
-        calls = [(piece, opacities, colours, image) for piece in self.fragments]
-        run(kernels.draw_fragments, calls, self.viewpoint.threads)
+        calls = [(piece, opacities, colors, image) for piece in self.fragments]
+        run(kernels.render_fragments, calls, self.viewpoint.threads)
 
-    def slopes(
+    def compute_gradients(
         self,
         opacities: Float32[ndarray, "n"],
-        colours: Float32[ndarray, "n 3"],
+        colors: Float32[ndarray, "n 3"],
         image: Float32[ndarray, "h w 3"],
         d_image: Float32[ndarray, "h w 3"],
     ) -> Float32[ndarray, "n 4"]:
         """Compute gradients of opacities and colours from those of the image."""
         values = np.empty((len(self.binned.slots), 4), np.float32)
         written = np.zeros(len(values), np.bool_)
-        arguments = (opacities, colours, image, d_image, values, written)
+        arguments = (opacities, colors, image, d_image, values, written)
         pieces = [(piece, *arguments) for piece in self.fragments]
-        run(kernels.draw_fragments_backward, pieces, self.viewpoint.threads)
-        return self.viewpoint.sums(self.binned, (values, written))
+        run(kernels.render_fragments_backward, pieces, self.viewpoint.threads)
+        return self.viewpoint.sum_by_gaussian(self.binned, (values, written))
 
-    def slopes_of_sh(
-        self, colours: Float32[ndarray, "n 3"], slopes: Float32[ndarray, "n 3"], bands: int
+    def compute_sh_gradients(
+        self, colors: Float32[ndarray, "n 3"], d_colors: Float32[ndarray, "n 3"], bands: int
     ) -> Float32[ndarray, "n k 3"]:
         """Compute gradients of spherical harmonics from those of colours."""
-        d_sh = np.zeros((len(colours), bands, 3), np.float32)
-        seen = (self.shown, self.viewpoint.pinhole.center, self.means)
-        received = (colours, slopes, d_sh)
-        self.viewpoint.share(kernels.shade_backward, len(self.shown), *seen, *received)
+        d_sh = np.zeros((len(colors), bands, 3), np.float32)
+        seen = (self.visible_rows, self.viewpoint.pinhole.center, self.means)
+        received = (colors, d_colors, d_sh)
+        self.viewpoint.share(kernels.shade_backward, len(self.visible_rows), *seen, *received)
         return d_sh
 
 
 @dataclass(frozen=True)
-class Held:
+class ImageComparison:
     """A weighted target image for a `BakedScene`."""
 
-    folded: Folded
+    scene: BakedScene
     wanted: Float32[ndarray, "h w 3"]
     weights: Float32[ndarray, "h w"]
 
-    def missed(self, image: Float32[ndarray, "h w 3"]) -> tuple[float, Float32[ndarray, "h w 3"]]:
+    def compute_error(
+        self, image: Float32[ndarray, "h w 3"]
+    ) -> tuple[float, Float32[ndarray, "h w 3"]]:
         """Compute the error of the pixels that have fragments, and its gradients in them."""
         d_image = np.empty_like(image)
-        errors = np.zeros(self.folded.viewpoint.tiles)  # summed in one order on any threads
+        errors = np.zeros(self.scene.viewpoint.tiles)  # summed in one order on any threads
         seen = (image, self.wanted, self.weights, d_image, errors)
-        pieces = [(piece, *seen) for piece in self.folded.fragments]
-        run(kernels.compare_fragments, pieces, self.folded.viewpoint.threads)
+        pieces = [(piece, *seen) for piece in self.scene.fragments]
+        run(kernels.compare_fragments, pieces, self.scene.viewpoint.threads)
         return float(errors.sum()), d_image
 
     @cached_property
-    def elsewhere(self) -> float:
+    def frozen_error(self) -> float:
         """The constant error of all other pixels."""
-        frozen = self.folded.image
+        frozen = self.scene.image
         squares = np.square(frozen - self.wanted).sum(axis=2, dtype=np.float64)
-        return float((self.weights * squares).sum()) - self.missed(frozen)[0]
+        return float((self.weights * squares).sum()) - self.compute_error(frozen)[0]
 
 
-class _Missed(torch.autograd.Function):
+class _ErrorFunction(torch.autograd.Function):
     """The error of the image of a `BakedScene`."""
 
     @staticmethod
-    def forward(ctx: Any, held: Held, opacities: Tensor, sh: Tensor) -> Tensor:
-        folded = held.folded
-        colors, opaque = folded.colours(float32(sh)), float32(opacities)
+    def forward(ctx: Any, held: ImageComparison, opacities: Tensor, sh: Tensor) -> Tensor:
+        folded = held.scene
+        colors, opaque = folded.shade(to_float32(sh)), to_float32(opacities)
         image = np.empty_like(folded.image)
-        folded.draw_fragments(opaque, colors, image)
-        error, d_image = held.missed(image)
+        folded.render_fragments(opaque, colors, image)
+        error, d_image = held.compute_error(image)
         ctx.scene = (folded, opaque, colors, image, d_image, sh.shape[1])
-        return torch.tensor(held.elsewhere + error, dtype=torch.float32)
+        return torch.tensor(held.frozen_error + error, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_error: Tensor) -> tuple[Tensor | None, ...]:
         folded, opacities, colors, image, d_image, bands = ctx.scene
         found = d_error.item() * folded.slopes(opacities, colors, image, d_image)
-        return None, *slopes_of_looks(folded, colors, found, bands, ctx.needs_input_grad[2])
+        return None, *compute_appearance_gradients(
+            folded, colors, found, bands, ctx.needs_input_grad[2]
+        )
 
 
-class _Drawn(torch.autograd.Function):
+class _ImageFunction(torch.autograd.Function):
     """The image of a `BakedScene`."""
 
     @staticmethod
-    def forward(ctx: Any, folded: Folded, opacities: Tensor, sh: Tensor) -> Tensor:
-        colors, opaque = folded.colours(float32(sh)), float32(opacities)
-        image = folded.draw(opaque, colors)
+    def forward(ctx: Any, folded: BakedScene, opacities: Tensor, sh: Tensor) -> Tensor:
+        colors, opaque = folded.shade(to_float32(sh)), to_float32(opacities)
+        image = folded.render(opaque, colors)
         ctx.scene = (folded, opaque, colors, image, sh.shape[1])
         return torch.from_numpy(image)
 
@@ -175,37 +181,42 @@ class _Drawn(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, d_image: Tensor) -> tuple[Tensor | None, ...]:
         folded, opacities, colors, image, bands = ctx.scene
-        found = folded.slopes(opacities, colors, image, float32(d_image))
-        return None, *slopes_of_looks(folded, colors, found, bands, ctx.needs_input_grad[2])
+        found = folded.slopes(opacities, colors, image, to_float32(d_image))
+        return None, *compute_appearance_gradients(
+            folded, colors, found, bands, ctx.needs_input_grad[2]
+        )
 
 
-def slopes_of_looks(
-    folded: Folded,
-    colours: Float32[ndarray, "n 3"],
-    slopes: Float32[ndarray, "n 4"],
+def compute_appearance_gradients(
+    scene: BakedScene,
+    colors: Float32[ndarray, "n 3"],
+    gradients: Float32[ndarray, "n 4"],
     bands: int,
-    of_sh: bool,
+    wants_sh: bool,
 ) -> tuple[Tensor, Tensor | None]:
     """Compute gradients of opacities and, if `wants_sh`, of spherical harmonics."""
-    opacities = torch.from_numpy(np.ascontiguousarray(slopes[:, 0]))
-    if not of_sh:
+    opacities = torch.from_numpy(np.ascontiguousarray(gradients[:, 0]))
+    if not wants_sh:
         return opacities, None
-    return opacities, torch.from_numpy(folded.slopes_of_sh(colours, slopes[:, 1:], bands))
+    return opacities, torch.from_numpy(scene.compute_sh_gradients(colors, gradients[:, 1:], bands))
 
 
-def folded(
-    view: CpuView, binned: Binned, means: Float32[ndarray, "n 3"], where: Bool[Tensor, "h w"]
-) -> Folded:
+def bake_scene(
+    scene: CpuFrozenScene,
+    binned: BinnedSplats,
+    means: Float32[ndarray, "n 3"],
+    where: Bool[Tensor, "h w"],
+) -> BakedScene:
     """Bake a frozen scene between the fragments of opaque splats in the mask `where`."""
-    viewpoint, context, new = view.viewpoint, view.layer, binned.layer
+    viewpoint, context, new = scene.viewpoint, scene.layer, binned.layer
     tiles = np.flatnonzero(np.diff(new.tile_start))
-    behind = np.zeros_like(view.frame.image)
+    behind = np.zeros_like(scene.frame.image)
     known = (tiles, context, new, binned.slots, where.cpu().numpy(), behind)
-    pieces = [(*piece, *known) for piece in pieces_of(len(tiles), viewpoint.threads)]
+    pieces = [(*piece, *known) for piece in split_into_pieces(len(tiles), viewpoint.threads)]
     fragments = run(kernels.find_fragments, pieces, viewpoint.threads)
-    return Folded(viewpoint, view.frame.image, binned, means, fragments)
+    return BakedScene(viewpoint, scene.frame.image, binned, means, fragments)
 
 
-def float32(values: Tensor) -> Float32[ndarray, "..."]:
+def to_float32(values: Tensor) -> Float32[ndarray, "..."]:
     """Convert a tensor to a contiguous array, without copying if it is one already."""
     return values.detach().to("cpu", torch.float32).contiguous().numpy()

@@ -9,21 +9,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.render import ColourSums, LooksError
+from gscompleter.render import AppearanceError, ColorSums
 from gscompleter.types import Gaussians, sh_from_rgb
 
 
-def painted(gaussians: Gaussians, colours: Float[Tensor, "n 3"]) -> Gaussians:
+def set_colors(gaussians: Gaussians, colors: Float[Tensor, "n 3"]) -> Gaussians:
     """Give Gaussians colours that are the same from every direction."""
-    return replace(gaussians, sh=sh_from_rgb(colours), encoded=None)
+    return replace(gaussians, sh=sh_from_rgb(colors), encoded=None)
 
 
-def grey(values: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+def to_grey(values: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
     """Repeat each value in three channels."""
     return values[:, None].expand(-1, 3)
 
 
-def looking(
+def set_appearance(
     gaussians: Gaussians, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
 ) -> Gaussians:
     """Replace the opacities and spherical harmonics of Gaussians."""
@@ -31,30 +31,32 @@ def looking(
 
 
 @dataclass(frozen=True)
-class DrawnAnew:
+class FullRedraw:
     """An `AppearanceRender` that redraws the whole image at each call."""
 
-    draw: Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, "h w 3"]]
+    render: Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, "h w 3"]]
 
     def __call__(
         self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
     ) -> Float[Tensor, "h w 3"]:
         """Render the image; differentiable."""
-        return self.draw(opacities, sh)
+        return self.render(opacities, sh)
 
-    def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
+    def make_error(
+        self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]
+    ) -> AppearanceError:
         """Make an error function: sum of `weights` (>= 0) times squared errors of all channels."""
 
         def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:
-            return (weights * (self.draw(opacities, sh) - wanted).square().sum(dim=-1)).sum()
+            return (weights * (self.render(opacities, sh) - wanted).square().sum(dim=-1)).sum()
 
         return error
 
 
-def sums_by_slopes(
-    draw: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]],
+def backproject_by_autograd(
+    render: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]],
     gaussians: Gaussians,
-    layers: Float[Tensor, "h w 3"],
+    image: Float[Tensor, "h w 3"],
 ) -> Float[Tensor, "n 3"]:
     """Sum `image` over the compositing weights of `gaussians`, by autograd through `render`.
 
@@ -62,17 +64,17 @@ def sums_by_slopes(
     """
     with torch.enable_grad():
         colors = gaussians.means.new_full((len(gaussians), 3), 0.5).requires_grad_()
-        (gradient,) = torch.autograd.grad((layers * draw(colors)).sum(), colors)
+        (gradient,) = torch.autograd.grad((image * render(colors)).sum(), colors)
     return gradient
 
 
-def errors_by_slopes(
-    draw: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]],
+def backproject_errors_by_autograd(
+    render: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]],
     gaussians: Gaussians,
-    colours: Float[Tensor, "n 3"],
+    colors: Float[Tensor, "n 3"],
     photograph: Float[Tensor, "h w 3"],
-) -> ColourSums:
+) -> ColorSums:
     """Implement `ColorErrors` by autograd; arguments as in `backproject_by_autograd`."""
-    missing = photograph - draw(colours).detach()
-    weights = sums_by_slopes(draw, gaussians, torch.ones_like(missing))[:, 0]
-    return sums_by_slopes(draw, gaussians, missing), weights
+    missing = photograph - render(colors).detach()
+    weights = backproject_by_autograd(render, gaussians, torch.ones_like(missing))[:, 0]
+    return backproject_by_autograd(render, gaussians, missing), weights

@@ -16,39 +16,39 @@ from numpy import ndarray
 from gscompleter.kernels import runs as kernels
 from gscompleter.kernels.rasterizer import GaussianArrays
 from gscompleter.kernels.sharing import share
-from gscompleter.memory import most_that_fit
-from gscompleter.render.cpu import arrays_of
-from gscompleter.render.folded import float32
+from gscompleter.memory import count_fitting_gaussians
+from gscompleter.render.cpu import to_arrays
+from gscompleter.render.folded import to_float32
 from gscompleter.types import Camera, Gaussians, Proxy
 
-WORTH = 500_000
+MIN_PROXY_GAUSSIANS = 500_000
 """Gaussians from which on a proxy saves more time than it takes to build."""
-REACH = 0.5
+MAX_REACH = 0.5
 """Largest distance of a Gaussian from the first of its run, in pixels."""
-LARGEST = 2.0
+MAX_DEVIATION = 2.0
 """Largest standard deviation of a Gaussian that shares a run, in pixels."""
 MAX_GROWTH = 8.0
 """Largest factor on both, if the proxy would be too large otherwise."""
 
 
-def proxy_of(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy | None:
+def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy | None:
     """Build the LOD proxy of a large `scene`, or None if it is small or on a GPU."""
-    if len(scene) < WORTH or scene.means.is_cuda:
+    if len(scene) < MIN_PROXY_GAUSSIANS or scene.means.is_cuda:
         return None
-    return run_by_run(scene, cameras)
+    return simplify_scene(scene, cameras)
 
 
-def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
+def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
     """Merge runs of adjacent, close Gaussians of one provenance to one Gaussian each.
 
     Runs are as few as frozen views of `cameras` can hold. A scene in random order has no runs.
     """
-    given = arrays_of(scene)
+    given = to_arrays(scene)
     given = given._replace(sh=given.sh.reshape(len(scene), -1))
-    start = starts_of_runs(given.means, given.scales, scene.generated.numpy(), cameras)
+    start = find_run_starts(given.means, given.scales, scene.generated.numpy(), cameras)
     found = [np.empty((len(start) - 1, *array.shape[1:]), np.float32) for array in given]
     shares = np.empty(len(scene), np.float32)
-    share(kernels.stand_for, len(start) - 1, start, given, shares, GaussianArrays(*found))
+    share(kernels.merge_runs, len(start) - 1, start, given, shares, GaussianArrays(*found))
     means, quats, scales, opacities, sh = map(torch.from_numpy, found)
     first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
@@ -57,21 +57,21 @@ def run_by_run(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
     return Proxy(merged, run)
 
 
-def starts_of_runs(
+def find_run_starts(
     means: Float32[ndarray, "n 3"],
     scales: Float32[ndarray, "n 3"],
     generated: UInt8[ndarray, "n"],
     cameras: Sequence[Camera],
 ) -> Int64[ndarray, "bounds"]:
     """Find the start of each run, and the end [m + 1]."""
-    centers = float32(torch.stack([camera.center for camera in cameras]))
-    focals = float32(torch.stack([camera.K[0, 0] for camera in cameras]))
+    centers = to_float32(torch.stack([camera.center for camera in cameras]))
+    focals = to_float32(torch.stack([camera.K[0, 0] for camera in cameras]))
     begins = np.empty(len(means), np.bool_)
-    most, growth = most_that_fit(len(cameras)), 1.0
+    most, growth = count_fitting_gaussians(len(cameras)), 1.0
     while True:
-        limits = np.float32(growth * REACH), np.float32(growth * LARGEST)
+        limits = np.float32(growth * MAX_REACH), np.float32(growth * MAX_DEVIATION)
         seen = (means, scales, generated, centers, focals, *limits, begins)
-        share(kernels.begin_runs, -(-len(means) // kernels.BLOCK), *seen)
+        share(kernels.mark_run_starts, -(-len(means) // kernels.BLOCK), *seen)
         if np.count_nonzero(begins) <= most or growth >= MAX_GROWTH:
             return np.append(np.flatnonzero(begins), len(means))
         growth *= 2

@@ -16,15 +16,15 @@ from PIL import Image
 from gscompleter.batch.jobs import JOBS, THUMBNAILS, Job, read_row
 from gscompleter.batch.places import Place
 from gscompleter.errors import InputError
-from gscompleter.io.image import jpeg_of, read_pixels
-from gscompleter.reports.page import NAME, QUALITY, Picture, rendered
-from gscompleter.reports.plain_words import shown
+from gscompleter.io.image import encode_jpeg, read_pixels
+from gscompleter.reports.page import JPEG_QUALITY, REPORT_FILE, Picture, render_template
+from gscompleter.reports.plain_words import format_number
 
-INDEX, TABLE = "index.html", "table.csv"
-HEIGHT = 96
-PICTURES = 1_000
+INDEX_FILE, TABLE_FILE = "index.html", "table.csv"
+THUMBNAIL_HEIGHT = 96
+MAX_THUMBNAILS = 1_000
 """Largest number of jobs with thumbnails on the page (about 5 MB)."""
-COLUMNS = (
+TABLE_COLUMNS = (
     "job",
     "state",
     "reason",
@@ -43,12 +43,12 @@ COLUMNS = (
     "result_bytes",
     "peak_bytes",
 )
-HEAD = ("PSNR before", "PSNR after", "covered before", "covered after", "added", "seconds")
-WHEN = ("before", "after")
+PAGE_COLUMNS = ("PSNR before", "PSNR after", "covered before", "covered after", "added", "seconds")
+IMAGE_ENDINGS = ("before", "after")
 
 
 @dataclass(frozen=True)
-class Shown:
+class JobRow:
     """A finished job on the page."""
 
     name: str
@@ -58,7 +58,7 @@ class Shown:
     picture: Picture | None
 
 
-def scores_of(summary: Mapping[str, Any]) -> dict[str, Any]:
+def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Average the scores of a completion over its targets."""
     targets = summary["targets"]
 
@@ -77,91 +77,95 @@ def scores_of(summary: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def thumbnail_of(folder: Path) -> bytes | None:
+def make_batch_thumbnail(folder: Path) -> bytes | None:
     """Join the first target before and after as a JPEG, or return None without images."""
     try:
-        pair = [read_pixels(folder / "images" / f"target1_{when}.png") for when in WHEN]
+        pair = [read_pixels(folder / "images" / f"target1_{when}.png") for when in IMAGE_ENDINGS]
     except InputError:
         return None
-    small = [sized(Image.fromarray(pixels)) for pixels in pair]
-    both = Image.new("RGB", (sum(image.width for image in small) + 4, HEIGHT), "white")
+    small = [resize_thumbnail(Image.fromarray(pixels)) for pixels in pair]
+    both = Image.new("RGB", (sum(image.width for image in small) + 4, THUMBNAIL_HEIGHT), "white")
     both.paste(small[0], (0, 0))
     both.paste(small[1], (small[0].width + 4, 0))
-    return jpeg_of(both, QUALITY)
+    return encode_jpeg(both, JPEG_QUALITY)
 
 
-def sized(image: Image.Image) -> Image.Image:
+def resize_thumbnail(image: Image.Image) -> Image.Image:
     """Resize an image to the height of a thumbnail."""
-    width = max(1, round(image.width * HEIGHT / image.height))
-    return image.resize((width, HEIGHT), Image.Resampling.LANCZOS)
+    width = max(1, round(image.width * THUMBNAIL_HEIGHT / image.height))
+    return image.resize((width, THUMBNAIL_HEIGHT), Image.Resampling.LANCZOS)
 
 
 def write_overview(place: Place, jobs: Sequence[Job]) -> None:
     """Write the table and the page of `jobs`."""
     rows = [row for job in jobs if (row := read_row(place, job.name)) is not None]
-    place.write(TABLE, table_of(rows).encode())
-    place.write(INDEX, page_of(rows, lambda name: picture_of(place, name)).encode())
+    place.write(TABLE_FILE, format_csv(rows).encode())
+    place.write(
+        INDEX_FILE, render_batch_page(rows, lambda name: read_thumbnail(place, name)).encode()
+    )
 
 
-def table_of(rows: Iterable[Mapping[str, Any]]) -> str:
+def format_csv(rows: Iterable[Mapping[str, Any]]) -> str:
     """Format rows as CSV."""
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(text, TABLE_COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
 
 
-def page_of(rows: Sequence[Mapping[str, Any]], picture: Callable[[str], Picture | None]) -> str:
+def render_batch_page(
+    rows: Sequence[Mapping[str, Any]], find_picture: Callable[[str], Picture | None]
+) -> str:
     """Render the page of a batch."""
     good = [row for row in rows if row["state"] == "done"]
     bad = [f"{row['job']}: {row['reason']}" for row in rows if row["state"] == "failed"]
-    return rendered(
+    return render_template(
         "batch.html",
         {
-            "facts": facts_of(good, len(bad)),
+            "facts": list_batch_facts(good, len(bad)),
             "failures": bad,
             "jobs": [
-                shown_job(row, picture(row["job"]) if number < PICTURES else None)
+                make_page_row(row, find_picture(row["job"]) if number < MAX_THUMBNAILS else None)
                 for number, row in enumerate(good)
             ],
-            "head": HEAD,
-            "table": TABLE,
+            "head": PAGE_COLUMNS,
+            "table": TABLE_FILE,
         },
     )
 
 
-def facts_of(good: Sequence[Mapping[str, Any]], failed: int) -> list[tuple[str, str]]:
+def list_batch_facts(good: Sequence[Mapping[str, Any]], failed: int) -> list[tuple[str, str]]:
     """List the numbers at the head of the page."""
     gains = [r["psnr_after"] - r["psnr_before"] for r in good if r["psnr_after"] is not None]
     seconds = [row["seconds"] for row in good]
     return [
         ("done", str(len(good))),
         ("failed", str(failed)),
-        ("median ΔPSNR", f"{shown(median(gains))} dB" if gains else "–"),
-        ("median time", f"{shown(median(seconds))} s" if seconds else "–"),
-        ("total time", f"{shown(sum(seconds) / 3600)} h" if seconds else "–"),
+        ("median ΔPSNR", f"{format_number(median(gains))} dB" if gains else "–"),
+        ("median time", f"{format_number(median(seconds))} s" if seconds else "–"),
+        ("total time", f"{format_number(sum(seconds) / 3600)} h" if seconds else "–"),
     ]
 
 
-def shown_job(row: Mapping[str, Any], picture: Picture | None) -> Shown:
+def make_page_row(row: Mapping[str, Any], picture: Picture | None) -> JobRow:
     """Format the row of a finished job."""
 
     def share(key: str) -> str:
         return "–" if row.get(key) is None else f"{100 * row[key]:.1f} %"
 
     cells = (
-        shown(row.get("psnr_before")),
-        shown(row.get("psnr_after")),
+        format_number(row.get("psnr_before")),
+        format_number(row.get("psnr_after")),
         share("coverage_before"),
         share("coverage_after"),
         f"{row['added']:,}" if row.get("added") is not None else "–",
-        shown(row.get("seconds")),
+        format_number(row.get("seconds")),
     )
-    return Shown(row["job"], cells, f"{JOBS}/{row['job']}/{NAME}", picture)
+    return JobRow(row["job"], cells, f"{JOBS}/{row['job']}/{REPORT_FILE}", picture)
 
 
-def picture_of(place: Place, name: str) -> Picture | None:
+def read_thumbnail(place: Place, name: str) -> Picture | None:
     """Read the thumbnail of a job as a data URI, or return None."""
     content = place.read(f"{THUMBNAILS}/{name}.jpg")
     if content is None:

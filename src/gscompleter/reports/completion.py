@@ -14,24 +14,24 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter import __version__
-from gscompleter.completer import GSCompleter, contexts_of
-from gscompleter.io.files import COMPLETED, CONTEXT
+from gscompleter.completer import GSCompleter, get_renders
+from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE
 from gscompleter.io.image import write_image
 from gscompleter.io.ply import save_ply
-from gscompleter.kernels.sharing import side_by_side
-from gscompleter.metrics.coverage import Look, coverage_of
-from gscompleter.metrics.image import masked_psnr, ssim
-from gscompleter.render import Renderer, each_view
-from gscompleter.reports.depth_picture import limits_of, write_depth
-from gscompleter.reports.record import Limits, most_changed, record_of, write_record
+from gscompleter.kernels.sharing import map_in_parallel
+from gscompleter.metrics.coverage import RenderPair, compute_coverage
+from gscompleter.metrics.image import compute_masked_psnr, ssim
+from gscompleter.render import Renderer, get_view_map
+from gscompleter.reports.depth_picture import compute_depth_limits, write_depth_image
+from gscompleter.reports.record import Limits, make_record, select_most_changed, write_record
 from gscompleter.splats.layout import save_like
-from gscompleter.splats.removed import NAME as REMOVED
+from gscompleter.splats.removed import REMOVED_FILE as REMOVED
 from gscompleter.splats.removed import save_removed
-from gscompleter.types import Camera, Completion, Gaussians, Render, TargetCompletion, View
+from gscompleter.types import Camera, Completion, Gaussians, Render, TargetResult, View
 
-GENERATED = "generated.ply"
+GENERATED_FILE = "generated.ply"
 
-IGNORED = (1.0, 0.0, 1.0)
+IGNORED_COLOR = (1.0, 0.0, 1.0)
 
 Scores = dict[str, float | None]
 
@@ -45,9 +45,9 @@ class Target:
     """Frame number in the scene; None for a camera from elsewhere."""
     photograph: Float[Tensor, "h w 3"] | None = None
     """Photograph at the target, if there is one. Only the generator `oracle` uses it."""
-    ignored: Bool[Tensor, "h w"] | None = None
+    ignore_mask: Bool[Tensor, "h w"] | None = None
     """True for pixels that are not scored; None if all are."""
-    near: int | None = None
+    derived_from: int | None = None
     """Frame number that a planned camera was derived from; None if the user gave the camera."""
 
     @property
@@ -55,7 +55,7 @@ class Target:
         """The photograph with its camera, or None."""
         if self.photograph is None:
             return None
-        return View(self.photograph, self.camera, self.frame, ignored=self.ignored)
+        return View(self.photograph, self.camera, self.frame, ignore_mask=self.ignore_mask)
 
 
 @dataclass(frozen=True)
@@ -69,65 +69,68 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class Brought:
+class InputSplatFile:
     """The file of the input splat."""
 
     path: Path
-    kept: Bool[Tensor, "n"] | None = None
+    context_mask: Bool[Tensor, "n"] | None = None
     """Mask of the Gaussians in the file that form the context; None for all."""
-    order: Int64[Tensor, "n"] | None = None
+    file_order: Int64[Tensor, "n"] | None = None
     """Index among these of each Gaussian of the context; None for the order of the file."""
 
 
 @dataclass(frozen=True)
-class Around:
+class Surroundings:
     """Views around the photographs, for the report."""
 
-    looks: tuple[Look, ...] = ()
+    views: tuple[RenderPair, ...] = ()
     photographs: tuple[Camera, ...] = ()
     """Cameras of all photographs, in the frame of the result."""
 
 
 @dataclass(frozen=True)
-class Images:
+class BeforeAfter:
     """Renders of one camera before and after the completion."""
 
     before: Render
     after: Render
-    truth: View | None
+    photograph: View | None
 
-    def scores(self) -> Scores:
+    def compute_scores(self) -> Scores:
         """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
-        images, truth = {"before": self.before.image, "after": self.after.image}, self.truth
+        images, truth = {"before": self.before.image, "after": self.after.image}, self.photograph
         if truth is None:
             return {f"{name}_{when}": None for name in ("psnr", "ssim") for when in images}
         return {
-            **{f"psnr_{w}": masked_psnr(i, truth.image, truth.counted) for w, i in images.items()},
-            **{f"ssim_{w}": ssim(truth.compared(i), truth.image) for w, i in images.items()},
+            **{
+                f"psnr_{w}": compute_masked_psnr(i, truth.image, truth.valid_mask)
+                for w, i in images.items()
+            },
+            **{f"ssim_{w}": ssim(truth.fill_ignored(i), truth.image) for w, i in images.items()},
         }
 
 
-def compare(
-    completion: Completion, camera: Camera, truth: View | None, renderer: Renderer
-) -> Images:
+def render_before_after(
+    completion: Completion, camera: Camera, photograph: View | None, renderer: Renderer
+) -> BeforeAfter:
     """Render the context and the completed scene."""
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
-        if completion.set_aside is None:
+        if completion.pruned is None:
             after = frozen.composite(completion.added)
         else:  # some of the context was pruned
             after = renderer.render(completion.scene, camera)
-    return Images(frozen.context, after, truth)
+    return BeforeAfter(frozen.render, after, photograph)
 
 
-def at_photographs(completion: Completion, completer: GSCompleter) -> list[Images]:
+def render_context_views(completion: Completion, completer: GSCompleter) -> list[BeforeAfter]:
     """Render the context views, from the cache of `completer` unless it used an LOD proxy."""
     views = completion.views
     if completion.proxy is not None:
-        return [compare(completion, v.camera, v, completer.renderer) for v in views]
-    after = contexts_of(completer.at(completion, views))
-    seen = zip(completion.begun, after, views, strict=True)
-    return [Images(first, last, view) for first, last, view in seen]
+        return [render_before_after(completion, v.camera, v, completer.renderer) for v in views]
+    after = get_renders(completer.freeze_at(completion, views))
+    seen = zip(completion.context_renders, after, views, strict=True)
+    return [BeforeAfter(first, last, view) for first, last, view in seen]
 
 
 def score_held_out(
@@ -137,39 +140,39 @@ def score_held_out(
 
     def score(held_out: HeldOut) -> dict[str, Any]:
         view = held_out.view
-        scores = compare(completion, view.camera, view, renderer).scores()
+        scores = render_before_after(completion, view.camera, view, renderer).compute_scores()
         return {"frame": view.frame, **scores, "is_check": held_out.is_check}
 
-    return list(each_view(completion.added)(score, photographs))
+    return list(get_view_map(completion.added)(score, photographs))
 
 
-def summarize(
+def build_summary(
     completion: Completion,
     targets: Sequence[Target],
     scores: Sequence[Scores],
-    said: Mapping[str, Any],
+    run_info: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Build summary.json from the facts of the run and the scores of context and targets."""
     count = len(completion.views)
     return {
         "version": __version__,
-        **said,
+        **run_info,
         "context": [
             {
                 "frame": view.frame,
                 **scored,
                 "exposure_gain": gain,
-                "dynamic_fraction": share_of(view.contradicted),
-                "ignored": share_of(view.ignored),
+                "dynamic_fraction": compute_mask_fraction(view.dynamic_mask),
+                "ignored": compute_mask_fraction(view.ignore_mask),
             }
             for view, scored, gain in zip(
-                completion.views, scores[:count], gains_of(completion), strict=True
+                completion.views, scores[:count], list_exposure_gains(completion), strict=True
             )
         ],
         "targets": [
             {
                 "frame": target.frame,
-                "derived_from": target.near,
+                "derived_from": target.derived_from,
                 "anchor": completion.views[result.anchor].frame,
                 "anchor_fallback": result.anchor_fallback,
                 "hole_fraction": result.hole_fraction,
@@ -182,40 +185,40 @@ def summarize(
                 "target_id": int(result.added.generated[0]) if len(result.added) else None,
                 "added": len(result.added),
                 "notes": list(result.notes),
-                "refused": result.refused,
+                "refused": result.refusal,
             }
             for target, result, scored in zip(
                 targets, completion.targets, scores[count:], strict=True
             )
         ],
-        "gaussians": counts(completion),
+        "gaussians": count_gaussians(completion),
         "seconds": dict(completion.seconds),
     }
 
 
-def gains_of(completion: Completion) -> list[list[float] | None]:
+def list_exposure_gains(completion: Completion) -> list[list[float] | None]:
     """List the exposure gains per photograph and channel; None if they were not normalized."""
-    if completion.gains is None:
+    if completion.exposure_gains is None:
         return [None] * len(completion.views)
-    return completion.gains.tolist()
+    return completion.exposure_gains.tolist()
 
 
-def covered_by(around: Around) -> dict[str, Any]:
+def summarize_coverage(measured: Surroundings) -> dict[str, Any]:
     """Summarize the coverage of the surrounding views, if there are any."""
-    return {"coverage": coverage_of(around.looks).as_summary()} if around.looks else {}
+    return {"coverage": compute_coverage(measured.views).as_summary()} if measured.views else {}
 
 
-def share_of(mask: Bool[Tensor, "h w"] | None) -> float:
+def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
     """Compute the fraction of True pixels; 0 without a mask."""
     return 0.0 if mask is None else mask.float().mean().item()
 
 
-def counts(completion: Completion) -> dict[str, int]:
+def count_gaussians(completion: Completion) -> dict[str, int]:
     """Count the Gaussians of the context, the added and, of an input splat, the pruned ones."""
     found = {"context": len(completion.context), "added": len(completion.added)}
-    if completion.evidence is None:
+    if completion.observations is None:
         return found
-    removed = completion.removed
+    removed = completion.pruned_mask
     return found | {"removed": 0 if removed is None else int(removed.sum())}
 
 
@@ -224,9 +227,9 @@ def write_report(
     completion: Completion,
     targets: Sequence[Target],
     completer: GSCompleter,
-    said: Mapping[str, Any],
-    brought: Brought | None = None,
-    around: Callable[[], Around] = Around,
+    run_info: Mapping[str, Any],
+    input_splat: InputSplatFile | None = None,
+    render_surroundings: Callable[[], Surroundings] = Surroundings,
     held_out: Sequence[HeldOut] = (),
 ) -> dict[str, Any]:
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
@@ -237,54 +240,54 @@ def write_report(
     Raises:
         InputError: if a file cannot be written.
     """
-    context_images = at_photographs(completion, completer)
+    context_images = render_context_views(completion, completer)
     target_images = [
-        compare(completion, result.target, target.view, completer.renderer)
+        render_before_after(completion, result.target, target.view, completer.renderer)
         for target, result in zip(targets, completion.targets, strict=True)
     ]
-    scores = side_by_side(Images.scores, [*context_images, *target_images])
+    scores = map_in_parallel(BeforeAfter.compute_scores, [*context_images, *target_images])
     unused = score_held_out(completion, held_out, completer.renderer)
-    write_scenes(folder, completion, brought)
+    write_scenes(folder, completion, input_splat)
     pictured = folder / "images"
     pictured.mkdir()
     results = zip(completion.targets, target_images, strict=True)
     write_ignored(pictured, completion.views)
     limits = [write_pictures(pictured, n, *pair) for n, pair in enumerate(results, start=1)]
-    surroundings = around()
-    shown = most_changed(surroundings.looks)
-    write_looks(pictured, shown)
-    write_record(folder, record_of(completion, limits, shown, surroundings.photographs))
-    facts = {**said, **covered_by(surroundings), "held_out": unused}
-    summary = summarize(completion, targets, scores, facts)
+    surroundings = render_surroundings()
+    shown = select_most_changed(surroundings.views)
+    write_surrounding_views(pictured, shown)
+    write_record(folder, make_record(completion, limits, shown, surroundings.photographs))
+    facts = {**run_info, **summarize_coverage(surroundings), "held_out": unused}
+    summary = build_summary(completion, targets, scores, facts)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     return summary
 
 
-def write_scenes(folder: Path, completion: Completion, brought: Brought | None) -> None:
+def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFile | None) -> None:
     """Write the three scenes, and the pruned Gaussians of an input splat."""
-    if brought is None:
-        save_own(folder, completion)
+    if input_splat is None:
+        save_reconstructed_scenes(folder, completion)
         return
-    context, aside = as_in_file(completion, brought)
+    context, aside = restore_file_order(completion, input_splat)
     writing = (
-        partial(save_ply, folder / CONTEXT, context),
-        partial(save_brought, folder, context, aside, completion.added, brought),
-        partial(save_ply, folder / GENERATED, completion.added, provenance=True),
+        partial(save_ply, folder / CONTEXT_FILE, context),
+        partial(save_completed_splat, folder, context, aside, completion.added, input_splat),
+        partial(save_ply, folder / GENERATED_FILE, completion.added, provenance=True),
     )
-    side_by_side(lambda write: write(), writing)
+    map_in_parallel(lambda write: write(), writing)
 
 
 def write_pictures(
-    folder: Path, number: int, result: TargetCompletion, images: Images
+    folder: Path, number: int, result: TargetResult, images: BeforeAfter
 ) -> Limits | None:
     """Write the images of a target; return the limits of its depth colours."""
-    named = pictures(result, images)
+    named = collect_images(result, images)
     write_images({folder / f"target{number}_{name}.png": named[name] for name in named})
     depths = {"before": images.before.depth_map(), "after": images.after.depth_map()}
-    limits = limits_of(list(depths.values()))
+    limits = compute_depth_limits(list(depths.values()))
     if limits is not None:
         for when, depth in depths.items():
-            write_depth(folder / f"target{number}_depth_{when}.png", depth, limits)
+            write_depth_image(folder / f"target{number}_depth_{when}.png", depth, limits)
     return limits
 
 
@@ -292,17 +295,17 @@ def write_ignored(folder: Path, views: Sequence[View]) -> None:
     """Write each photograph that has ignored pixels, with these painted over."""
     painted = {}
     for number, view in enumerate(views, start=1):
-        if view.ignored is not None:
-            colour = view.image.new_tensor(IGNORED)
-            image = torch.where(view.ignored[..., None], colour, view.image)
+        if view.ignore_mask is not None:
+            colour = view.image.new_tensor(IGNORED_COLOR)
+            image = torch.where(view.ignore_mask[..., None], colour, view.image)
             painted[folder / f"context{number}_ignored.png"] = image
     write_images(painted)
 
 
-def write_looks(folder: Path, looks: Sequence[Look]) -> None:
+def write_surrounding_views(folder: Path, views: Sequence[RenderPair]) -> None:
     """Write the surrounding views before and after."""
     seen = {}
-    for number, look in enumerate(looks, start=1):
+    for number, look in enumerate(views, start=1):
         seen[folder / f"around{number}_before.png"] = look.before.image
         seen[folder / f"around{number}_after.png"] = look.after.image
     write_images(seen)
@@ -310,65 +313,67 @@ def write_looks(folder: Path, looks: Sequence[Look]) -> None:
 
 def write_images(images: Mapping[Path, Tensor]) -> None:
     """Write images in parallel: colour [h, w, 3], grey or masks [h, w]."""
-    side_by_side(write_image, images.keys(), images.values())
+    map_in_parallel(write_image, images.keys(), images.values())
 
 
-def save_own(folder: Path, completion: Completion) -> None:
+def save_reconstructed_scenes(folder: Path, completion: Completion) -> None:
     """Write the three scenes of a reconstructed context in parallel; they fit into memory."""
-    paths = [folder / name for name in (CONTEXT, COMPLETED, GENERATED)]
+    paths = [folder / name for name in (CONTEXT_FILE, COMPLETED_FILE, GENERATED_FILE)]
     scenes = completion.context, completion.scene, completion.added
-    side_by_side(save_ply, paths, scenes, (None, True, True))
+    map_in_parallel(save_ply, paths, scenes, (None, True, True))
 
 
-def as_in_file(
-    completion: Completion, brought: Brought
+def restore_file_order(
+    completion: Completion, input_splat: InputSplatFile
 ) -> tuple[Gaussians, Bool[Tensor, "n"] | None]:
     """Sort the context and its pruned mask in the order of the input file."""
-    context, aside = completion.context, completion.removed
-    if brought.order is None:
+    context, aside = completion.context, completion.pruned_mask
+    if input_splat.file_order is None:
         return context, aside
-    places = brought.order.argsort().to(context.means.device)
+    places = input_splat.file_order.argsort().to(context.means.device)
     return context[places], None if aside is None else aside[places]
 
 
-def save_brought(
+def save_completed_splat(
     folder: Path,
     context: Gaussians,
-    aside: Bool[Tensor, "n"] | None,
+    pruned: Bool[Tensor, "n"] | None,
     added: Gaussians,
-    brought: Brought,
+    input_splat: InputSplatFile,
 ) -> None:
-    """Write `completed.ply` in the layout of the input splat, and `removed.ply`."""
-    kept = brought.kept
-    if aside is None or not aside.any():
-        save_like(folder / COMPLETED, context, added, brought.path, kept)
+    """Write `completed.ply` in the layout of the input splat, and `pruned_mask.ply`."""
+    kept = input_splat.context_mask
+    if pruned is None or not pruned.any():
+        save_like(folder / COMPLETED_FILE, context, added, input_splat.path, kept)
         return
-    rows = torch.nonzero(aside.cpu())[:, 0]
-    removed = context[aside].to("cpu")
-    save_removed(folder / REMOVED, removed, rows, brought.path, kept)
-    stays, left = ~aside.cpu(), context[~aside]
+    rows = torch.nonzero(pruned.cpu())[:, 0]
+    removed = context[pruned].to("cpu")
+    save_removed(folder / REMOVED, removed, rows, input_splat.path, kept)
+    stays, left = ~pruned.cpu(), context[~pruned]
     if kept is not None:
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
-    save_like(folder / COMPLETED, left, added, brought.path, stays)
+    save_like(folder / COMPLETED_FILE, left, added, input_splat.path, stays)
 
 
-def pictures(result: TargetCompletion, images: Images) -> dict[str, Tensor]:
+def collect_images(result: TargetResult, images: BeforeAfter) -> dict[str, Tensor]:
     """Collect the images of a target by name: colour [h, w, 3] or masks [h, w]."""
     found = {
         "before": images.before.image,
         "after": images.after.image,
         "hole_mask": result.hole_mask.float(),
     }
-    if result.support is not None:
-        found["support"] = result.support
+    if result.trusted_alpha is not None:
+        found["support"] = result.trusted_alpha
     if result.reference is not None:
         found["reference"] = result.reference.image
-    if images.truth is not None:
-        found["truth"] = images.truth.image
+    if images.photograph is not None:
+        found["truth"] = images.photograph.image
     return found
 
 
-def strip(pictures: Sequence[Float[Tensor, "h _w 3"]], gap: int = 4) -> Float[Tensor, "h wide 3"]:
+def join_images(
+    pictures: Sequence[Float[Tensor, "h _w 3"]], gap: int = 4
+) -> Float[Tensor, "h wide 3"]:
     """Join images of one height side by side on white."""
     white = torch.ones((pictures[0].shape[0], gap, 3))
     parts = [part for picture in pictures for part in (white, picture.cpu().clamp(0, 1))]

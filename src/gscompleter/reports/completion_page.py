@@ -14,37 +14,63 @@ from typing import Any
 from markupsafe import Markup
 
 from gscompleter.data.formats import FORMATS
-from gscompleter.kernels.sharing import side_by_side
-from gscompleter.reports.camera_figure import PITCH, YAW, camera_figure, placed_cameras
-from gscompleter.reports.figures import affine_scatter, colour_scale, loss_curve, time_bars
-from gscompleter.reports.finished import Affine, Finished, Scores, Summary, TargetRow, read_finished
-from gscompleter.reports.page import Gallery, Picture, Slider, Table, gallery_of, rendered
-from gscompleter.reports.plain_words import about_scene, about_target, gain, percent, shown
+from gscompleter.kernels.sharing import map_in_parallel
+from gscompleter.reports.camera_figure import PITCH, YAW, draw_cameras, label_cameras
+from gscompleter.reports.figures import (
+    draw_color_scale,
+    draw_time_bars,
+    plot_depth_scatter,
+    plot_loss,
+)
+from gscompleter.reports.finished import (
+    AlignmentRow,
+    CompletionSummary,
+    FinishedCompletion,
+    ScoreRow,
+    TargetRow,
+    read_completion_folder,
+)
+from gscompleter.reports.page import Gallery, Picture, Slider, Table, open_gallery, render_template
+from gscompleter.reports.plain_words import (
+    format_change,
+    format_number,
+    format_percent,
+    list_scene_notes,
+    list_target_notes,
+)
 from gscompleter.reports.record import TargetRecord
 
-VIEWER = "view.html"
-PICTURES = {
+VIEWER_FILE = "view.html"
+IMAGE_CAPTIONS = {
     "reference": "Reference: the synthesized image",
     "hole_mask": "Hole mask (white: hole)",
     "support": "Trust: agreement of the scene with the photographs (white: full)",
     "truth": "Photograph, used for scores only",
 }
-CURVES = {
+CURVE_CAPTIONS = {
     "register": "Loss of the registration along the rays",
     "refine": "Loss of the refinement",
 }
-METHODS = {
+ALIGNMENT_SENTENCES = {
     "ransac": "RANSAC fits scene depth = {scale} × lifted depth {shift}; {inliers} of the pixels "
     "agree",
     "median": "The median depth ratio is used: scene depth = {scale} × lifted depth; "
     "{inliers} of the pixels agree",
     "identity": "The lifted depths are used unchanged",
 }
-SCORES = ("camera", "PSNR before", "PSNR after", "change", "SSIM before", "SSIM after", "change")
+SCORE_COLUMNS = (
+    "camera",
+    "PSNR before",
+    "PSNR after",
+    "change",
+    "SSIM before",
+    "SSIM after",
+    "change",
+)
 
 
 @dataclass(frozen=True)
-class Section:
+class TargetSection:
     """Content of the page about one target."""
 
     number: int
@@ -62,189 +88,202 @@ class Section:
     curves: Sequence[tuple[Markup, str]]
 
 
-def completion_page(folder: Path) -> str:
+def render_completion_page(folder: Path) -> str:
     """Render the page of the completion in `folder`.
 
     Raises:
         InputError: if the folder has no completion, a damaged one, or one of another version.
     """
-    found = read_finished(folder)
+    found = read_completion_folder(folder)
     summary, record = found.summary, found.record
-    gallery, viewer = gallery_of(folder / "images"), viewer_of(folder)
-    each = partial(section, gallery=gallery, unit=unit_of(summary), viewer=viewer)
+    gallery, viewer = open_gallery(folder / "images"), find_viewer(folder)
+    each = partial(build_section, gallery=gallery, unit=find_length_unit(summary), viewer=viewer)
     rows = list(enumerate(zip(summary.targets, record.targets, strict=True), start=1))
-    return rendered(
+    return render_template(
         "completion.html",
         {
-            "title": title_of(summary),
-            "facts": facts_of(summary),
-            "notes": about_scene(summary),
-            "targets": side_by_side(lambda row: each(row[0], *row[1]), rows),
-            "coverage": coverage_sentence(summary),
-            "around": list(around(found, gallery)),
-            "ignored": list(ignored_pictures(summary, gallery)),
-            "cameras": cameras_of(found),
-            "cameras_caption": cameras_caption(found),
+            "title": choose_title(summary),
+            "facts": list_completion_facts(summary),
+            "notes": list_scene_notes(summary),
+            "targets": map_in_parallel(lambda row: each(row[0], *row[1]), rows),
+            "coverage": describe_coverage(summary),
+            "around": list(embed_surrounding_views(found, gallery)),
+            "ignored": list(embed_ignored_images(summary, gallery)),
+            "cameras": draw_completion_cameras(found),
+            "cameras_caption": describe_cameras(found),
             "yaw": YAW,
             "pitch": PITCH,
-            "scores": score_tables(summary),
-            "bars": time_bars("Seconds by stage", stages_of(summary)),
-            "total": f"{shown(summary.seconds.get('total'), 1)} s in total on {summary.device}.",
-            "settings": settings_table(summary),
+            "scores": make_score_tables(summary),
+            "bars": draw_time_bars("Seconds by stage", get_stage_seconds(summary)),
+            "total": f"{format_number(summary.seconds.get('total'), 1)} s in total on {summary.device}.",
+            "settings": make_settings_table(summary),
             "viewer": viewer,
         },
     )
 
 
-def viewer_of(folder: Path) -> str | None:
+def find_viewer(folder: Path) -> str | None:
     """Return the address of the viewer's page if it exists."""
-    return VIEWER if os.path.isfile(folder / VIEWER) else None
+    return VIEWER_FILE if os.path.isfile(folder / VIEWER_FILE) else None
 
 
-def title_of(summary: Summary) -> str:
+def choose_title(summary: CompletionSummary) -> str:
     """Choose the title: the name of the scene folder or of the input splat."""
     path = summary.scene.splat or str(summary.settings.get("folder") or "")
     return Path(path).name or "Scene"
 
 
-def unit_of(summary: Summary) -> str:
+def find_length_unit(summary: CompletionSummary) -> str:
     """Return metres if the format defines them and the splat has no frame of its own."""
     format = FORMATS.get(summary.scene.format)
     known = format is not None and format.unit is not None and summary.frame.method == "given"
     return str(format.unit) if format is not None and known else "scene units"
 
 
-def facts_of(summary: Summary) -> list[tuple[str, str]]:
+def list_completion_facts(summary: CompletionSummary) -> list[tuple[str, str]]:
     """List the numbers at the head of the page."""
     covered = summary.coverage
     facts = [
-        ("covered around the photographs", f"{percent(covered.before)} → {percent(covered.after)}"),
+        (
+            "covered around the photographs",
+            f"{format_percent(covered.before)} → {format_percent(covered.after)}",
+        ),
         ("Gaussians added", f"{summary.gaussians.get('added', 0):,}"),
         ("targets", str(len(summary.targets))),
-        ("time", f"{shown(summary.seconds.get('total'), 1)} s"),
+        ("time", f"{format_number(summary.seconds.get('total'), 1)} s"),
     ]
     removed = summary.gaussians.get("removed")
     return facts if not removed else [*facts, ("Gaussians pruned", f"{removed:,}")]
 
 
-def section(
+def build_section(
     number: int, row: TargetRow, kept: TargetRecord, gallery: Gallery, unit: str, viewer: str | None
-) -> Section:
+) -> TargetSection:
     """Build the section of a target."""
     name = f"target{number}"
     limits = kept.depth_limits
-    return Section(
+    return TargetSection(
         number=number,
         name=row.name,
-        images=gallery.slider(name, f"Target {number}, {row.name}"),
-        facts=target_facts(row),
-        notes=about_target(row),
+        images=gallery.embed_slider(name, f"Target {number}, {row.name}"),
+        facts=list_target_facts(row),
+        notes=list_target_notes(row),
         link=None if viewer is None else f"{viewer}#camera=target-{number}",
-        pictures=list(pictures_of(number, row, gallery)),
+        pictures=list(embed_target_images(number, row, gallery)),
         depths=None
         if limits is None
-        else gallery.slider(f"{name}_depth", f"Depth at target {number}", True),
-        scale=None if limits is None else colour_scale(limits, unit),
-        fit=fit_sentence(row.affine, unit),
-        scatter=scatter_of(row.affine, kept, unit),
+        else gallery.embed_slider(f"{name}_depth", f"Depth at target {number}", True),
+        scale=None if limits is None else draw_color_scale(limits, unit),
+        fit=describe_alignment(row.affine, unit),
+        scatter=plot_depth_pairs(row.affine, kept, unit),
         seen_from="the anchor"
         if kept.pairs is None or kept.pairs.seen_from == "anchor"
         else "the target",
-        curves=list(curves_of(kept)),
+        curves=list(plot_losses(kept)),
     )
 
 
-def target_facts(row: TargetRow) -> list[tuple[str, str]]:
+def list_target_facts(row: TargetRow) -> list[tuple[str, str]]:
     """List the numbers below the images of a target."""
-    facts = [("hole", percent(row.hole_fraction)), ("Gaussians added", f"{row.added:,}")]
+    facts = [("hole", format_percent(row.hole_fraction)), ("Gaussians added", f"{row.added:,}")]
     if row.anchor is not None:
         facts.append(("anchor", f"photograph {row.anchor}"))
     if row.psnr_after is not None:
-        facts.append(("PSNR", f"{shown(row.psnr_before)} → {shown(row.psnr_after)} dB"))
-        facts.append(("SSIM", f"{shown(row.ssim_before, 3)} → {shown(row.ssim_after, 3)}"))
+        facts.append(
+            ("PSNR", f"{format_number(row.psnr_before)} → {format_number(row.psnr_after)} dB")
+        )
+        facts.append(
+            ("SSIM", f"{format_number(row.ssim_before, 3)} → {format_number(row.ssim_after, 3)}")
+        )
     return facts
 
 
-def pictures_of(number: int, row: TargetRow, gallery: Gallery) -> Iterator[tuple[Picture, str]]:
+def embed_target_images(
+    number: int, row: TargetRow, gallery: Gallery
+) -> Iterator[tuple[Picture, str]]:
     """Embed the images of a target other than before and after."""
-    for name, caption in PICTURES.items():
+    for name, caption in IMAGE_CAPTIONS.items():
         file = f"target{number}_{name}.png"
         expected = name == "hole_mask" or (name == "truth" and row.psnr_after is not None)
         if expected or (gallery.folder / file).is_file():
-            embed = gallery.exact if name in ("hole_mask", "support") else gallery.photo
+            embed = gallery.embed_exact if name in ("hole_mask", "support") else gallery.embed_photo
             yield embed(file, f"{caption}, at target {number}"), caption
 
 
-def fit_sentence(affine: Affine, unit: str) -> str:
+def describe_alignment(affine: AlignmentRow, unit: str) -> str:
     """Describe the depth alignment of a target."""
     sign = "−" if affine.shift < 0 else "+"
-    shift = f"{sign} {shown(abs(affine.shift), 3)} {unit}"
-    words = METHODS.get(affine.method, "The depths are aligned by an unknown method")
+    shift = f"{sign} {format_number(abs(affine.shift), 3)} {unit}"
+    words = ALIGNMENT_SENTENCES.get(affine.method, "The depths are aligned by an unknown method")
     text = words.format(
-        scale=shown(affine.scale, 3), shift=shift, inliers=percent(affine.inliers, 0)
+        scale=format_number(affine.scale, 3), shift=shift, inliers=format_percent(affine.inliers, 0)
     )
     if affine.agreement is None:
         return f"{text}."
-    return f"{text}. At the target, {percent(affine.agreement, 0)} of the visible scene agree."
+    return (
+        f"{text}. At the target, {format_percent(affine.agreement, 0)} of the visible scene agree."
+    )
 
 
-def scatter_of(affine: Affine, kept: TargetRecord, unit: str) -> Markup | None:
+def plot_depth_pairs(affine: AlignmentRow, kept: TargetRecord, unit: str) -> Markup | None:
     """Plot the depths that the alignment was fitted to, or return None without any."""
     if kept.pairs is None:
         return None
     pairs = zip(kept.pairs.predicted, kept.pairs.context, kept.pairs.agrees, strict=False)
-    return affine_scatter(list(pairs), affine.scale, affine.shift, unit)
+    return plot_depth_scatter(list(pairs), affine.scale, affine.shift, unit)
 
 
-def curves_of(kept: TargetRecord) -> Iterator[tuple[Markup, str]]:
+def plot_losses(kept: TargetRecord) -> Iterator[tuple[Markup, str]]:
     """Plot the recorded losses of a target."""
-    for name, caption in CURVES.items():
-        curve = loss_curve(caption, kept.losses.get(name, ()))
+    for name, caption in CURVE_CAPTIONS.items():
+        curve = plot_loss(caption, kept.losses.get(name, ()))
         if curve is not None:
             yield curve, caption
 
 
-def coverage_sentence(summary: Summary) -> str:
+def describe_coverage(summary: CompletionSummary) -> str:
     """Describe the coverage around the photographs."""
     covered = summary.coverage
     return (
         f"{covered.cameras} cameras around the photographs, none of them a target, test the "
-        f"result: the scene covers {percent(covered.before)} of their images before and "
-        f"{percent(covered.after)} after the completion."
+        f"result: the scene covers {format_percent(covered.before)} of their images before and "
+        f"{format_percent(covered.after)} after the completion."
     )
 
 
-def around(found: Finished, gallery: Gallery) -> Iterator[tuple[Slider, str]]:
+def embed_surrounding_views(
+    found: FinishedCompletion, gallery: Gallery
+) -> Iterator[tuple[Slider, str]]:
     """Embed the surrounding views that changed most."""
     for number, look in enumerate(found.record.around, start=1):
-        slider = gallery.slider(f"around{number}", f"Camera {number} around the photographs")
-        yield slider, f"{percent(look.before, 0)} → {percent(look.after, 0)} covered"
+        slider = gallery.embed_slider(f"around{number}", f"Camera {number} around the photographs")
+        yield slider, f"{format_percent(look.before, 0)} → {format_percent(look.after, 0)} covered"
 
 
-def ignored_pictures(summary: Summary, gallery: Gallery) -> Iterator[tuple[Picture, str]]:
+def embed_ignored_images(
+    summary: CompletionSummary, gallery: Gallery
+) -> Iterator[tuple[Picture, str]]:
     """Embed the photographs that have ignored pixels."""
     for number, row in enumerate(summary.context, start=1):
         if row.ignored > 0:
-            caption = (
-                f"Photograph {row.frame}: {percent(row.ignored)} of the image is ignored (magenta)"
-            )
-            yield gallery.photo(f"context{number}_ignored.png", caption), caption
+            caption = f"Photograph {row.frame}: {format_percent(row.ignored)} of the image is ignored (magenta)"
+            yield gallery.embed_photo(f"context{number}_ignored.png", caption), caption
 
 
-def cameras_of(found: Finished) -> Markup | None:
+def draw_completion_cameras(found: FinishedCompletion) -> Markup | None:
     """Draw the cameras of the completion."""
     summary, record = found.summary, found.record
     frames = [row.frame for row in summary.context]
-    cameras = placed_cameras(
+    cameras = label_cameras(
         list(zip(record.context, frames, strict=True)),
         [row.anchor for row in summary.targets if row.anchor is not None],
         [kept.camera for kept in record.targets],
         record.photographs,
     )
-    return camera_figure(list(cameras), record.points)
+    return draw_cameras(list(cameras), record.points)
 
 
-def cameras_caption(found: Finished) -> str:
+def describe_cameras(found: FinishedCompletion) -> str:
     """Describe how many cameras the drawing shows."""
     record = found.record
     kept, count = len(record.photographs), record.num_photographs
@@ -252,46 +291,48 @@ def cameras_caption(found: Finished) -> str:
     return f"{text}, {len(record.context)} in the context. Drag the drawing to rotate it."
 
 
-def score_tables(summary: Summary) -> list[Table]:
+def make_score_tables(summary: CompletionSummary) -> list[Table]:
     """Make the tables of scores: targets, held-out photographs, context."""
-    targets = [score_row(f"{n}: {row.name}", row) for n, row in enumerate(summary.targets, start=1)]
-    context = [score_row(f"photograph {row.frame}", row) for row in summary.context]
-    unused = [score_row(f"photograph {row.frame}", row) for row in summary.held_out]
+    targets = [
+        format_score_row(f"{n}: {row.name}", row) for n, row in enumerate(summary.targets, start=1)
+    ]
+    context = [format_score_row(f"photograph {row.frame}", row) for row in summary.context]
+    unused = [format_score_row(f"photograph {row.frame}", row) for row in summary.held_out]
     if unused:
-        unused.append(score_row("mean", mean_of(summary.held_out)))
+        unused.append(format_score_row("mean", average_score_rows(summary.held_out)))
     tables = [
-        Table("At the targets", SCORES, targets),
-        Table("At held-out photographs", SCORES, unused),
-        Table("At the context photographs", SCORES, context),
+        Table("At the targets", SCORE_COLUMNS, targets),
+        Table("At held-out photographs", SCORE_COLUMNS, unused),
+        Table("At the context photographs", SCORE_COLUMNS, context),
     ]
     return [table for table in tables if table.rows]
 
 
-def mean_of(rows: Sequence[Scores]) -> Scores:
+def average_score_rows(rows: Sequence[ScoreRow]) -> ScoreRow:
     """Average each score over the rows that have it."""
     names = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
     known = {name: [v for row in rows if (v := getattr(row, name)) is not None] for name in names}
-    return Scores(None, **{name: fmean(v) if v else None for name, v in known.items()})
+    return ScoreRow(None, **{name: fmean(v) if v else None for name, v in known.items()})
 
 
-def score_row(name: str, row: Scores) -> list[str]:
+def format_score_row(name: str, row: ScoreRow) -> list[str]:
     """Format a row of a table of scores."""
     psnr, ssim = (row.psnr_before, row.psnr_after), (row.ssim_before, row.ssim_after)
     return [
         name,
-        *(shown(value) for value in psnr),
-        gain(*psnr),
-        *(shown(value, 3) for value in ssim),
-        gain(*ssim, 3),
+        *(format_number(value) for value in psnr),
+        format_change(*psnr),
+        *(format_number(value, 3) for value in ssim),
+        format_change(*ssim, 3),
     ]
 
 
-def stages_of(summary: Summary) -> dict[str, float]:
+def get_stage_seconds(summary: CompletionSummary) -> dict[str, float]:
     """Return the seconds of each stage without the total."""
     return {name: seconds for name, seconds in summary.seconds.items() if name != "total"}
 
 
-def settings_table(summary: Summary) -> Table:
+def make_settings_table(summary: CompletionSummary) -> Table:
     """Make the table of all settings."""
     facts = {
         "version": summary.version,
@@ -301,15 +342,15 @@ def settings_table(summary: Summary) -> Table:
         "seed": summary.seed,
         "device": summary.device,
     }
-    rows = [*flat({"settings": summary.settings}), *flat({"found": facts})]
+    rows = [*flatten_settings({"settings": summary.settings}), *flatten_settings({"found": facts})]
     return Table("All settings", ("setting", "value"), rows)
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+def flatten_settings(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Flatten nested settings to dotted names with values as JSON."""
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{name}.")
+            yield from flatten_settings(value, f"{prefix}{name}.")
         else:
             text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
             yield f"{prefix}{name}", "–" if value is None else text

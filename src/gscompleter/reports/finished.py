@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gscompleter import __version__
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.files import SUMMARY
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.io.json_file import read_json
-from gscompleter.reports.record import NAME, Record
+from gscompleter.reports.record import RECORD_FILE, ReportRecord
 
-ADVICE = "complete the scene again"
+COMPLETION_ADVICE = "complete the scene again"
 
 RENAMED = {
     "context": {"gain": "exposure_gain", "contradicted": "dynamic_fraction"},
@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Affine:
+class AlignmentRow:
     """Depth alignment of a target."""
 
     scale: float
@@ -37,7 +37,7 @@ class Affine:
 
 
 @dataclass(frozen=True)
-class Scores:
+class ScoreRow:
     """Scores of a camera against its photograph; None without one."""
 
     frame: int | None
@@ -48,7 +48,7 @@ class Scores:
 
 
 @dataclass(frozen=True)
-class ContextRow(Scores):
+class ContextRow(ScoreRow):
     """A photograph of the context."""
 
     exposure_gain: tuple[float, ...] | None = None
@@ -60,20 +60,20 @@ class ContextRow(Scores):
 
 
 @dataclass(frozen=True)
-class HeldOutRow(Scores):
+class HeldOutRow(ScoreRow):
     """A photograph that only scores the result."""
 
     is_check: bool = False
 
 
 @dataclass(frozen=True)
-class TargetRow(Scores):
+class TargetRow(ScoreRow):
     """Result at a target."""
 
     anchor: int | None
     anchor_fallback: bool
     hole_fraction: float
-    affine: Affine
+    affine: AlignmentRow
     added: int
     derived_from: int | None = None
     notes: tuple[str, ...] = ()
@@ -87,7 +87,7 @@ class TargetRow(Scores):
 
 
 @dataclass(frozen=True)
-class Covered:
+class CoverageRow:
     """Covered fractions of the surrounding views."""
 
     before: float
@@ -96,7 +96,7 @@ class Covered:
 
 
 @dataclass(frozen=True)
-class Placing:
+class ResultFrame:
     """Transform from the photographs to the .ply."""
 
     method: str
@@ -105,7 +105,7 @@ class Placing:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneRow:
     """The opened scene."""
 
     format: str
@@ -115,7 +115,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class DepthRange:
+class DepthRangeRow:
     """Near and far plane in scene units."""
 
     near: float | None = None
@@ -123,17 +123,17 @@ class DepthRange:
 
 
 @dataclass(frozen=True)
-class Summary:
+class CompletionSummary:
     """The parts of `summary.json` that a report shows."""
 
     version: str
     settings: Mapping[str, Any]
     seed: int
     device: str
-    scene: Scene
-    frame: Placing
-    depth_range: DepthRange
-    coverage: Covered
+    scene: SceneRow
+    frame: ResultFrame
+    depth_range: DepthRangeRow
+    coverage: CoverageRow
     context: tuple[ContextRow, ...]
     targets: tuple[TargetRow, ...]
     gaussians: Mapping[str, int]
@@ -142,33 +142,39 @@ class Summary:
 
 
 @dataclass(frozen=True)
-class Finished:
+class FinishedCompletion:
     """All data of a completion report."""
 
     folder: Path
-    summary: Summary
-    record: Record
+    summary: CompletionSummary
+    record: ReportRecord
 
 
-def read_finished(folder: Path) -> Finished:
+def read_completion_folder(folder: Path) -> FinishedCompletion:
     """Read an output folder.
 
     Raises:
         InputError: if it has no completion, a damaged one, or one of another version.
     """
-    check_results(folder, SUMMARY)
-    content = read_json(folder / SUMMARY, ADVICE)
+    check_results(folder, SUMMARY_FILE)
+    content = read_json(folder / SUMMARY_FILE, COMPLETION_ADVICE)
     check_version(folder, content)
-    summary = as_written(Summary, with_new_keys(content), folder / SUMMARY)
-    if not os.path.isfile(folder / NAME):
-        raise InputError(f"{quoted(folder)} has no {NAME}, which the report needs; {ADVICE}.")
-    record = as_written(Record, read_json(folder / NAME, ADVICE), folder / NAME)
+    summary = parse_content(CompletionSummary, with_new_keys(content), folder / SUMMARY_FILE)
+    if not os.path.isfile(folder / RECORD_FILE):
+        raise InputError(
+            f"{quote_value(folder)} has no {RECORD_FILE}, which the report needs; "
+            f"{COMPLETION_ADVICE}."
+        )
+    record = parse_content(
+        ReportRecord, read_json(folder / RECORD_FILE, COMPLETION_ADVICE), folder / RECORD_FILE
+    )
     sizes = (len(summary.targets), len(summary.context))
     if sizes != (len(record.targets), len(record.context)):
         raise InputError(
-            f"{SUMMARY} and {NAME} in {quoted(folder)} list different numbers of cameras; {ADVICE}."
+            f"{SUMMARY_FILE} and {RECORD_FILE} in {quote_value(folder)} list different numbers of "
+            f"cameras; {COMPLETION_ADVICE}."
         )
-    return Finished(folder, summary, record)
+    return FinishedCompletion(folder, summary, record)
 
 
 def with_new_keys(content: Any) -> Any:
@@ -188,10 +194,10 @@ def with_new_keys(content: Any) -> Any:
 def check_results(folder: Path, name: str) -> None:
     """Raise an InputError unless `folder` holds the file `name`."""
     if not os.path.isdir(folder):
-        raise InputError(f"There is no folder {quoted(folder)}; name one with results.")
+        raise InputError(f"There is no folder {quote_value(folder)}; name one with results.")
     if not os.path.isfile(folder / name):
         raise InputError(
-            f"{quoted(folder)} has no {name}; name the output folder of a completion or an "
+            f"{quote_value(folder)} has no {name}; name the output folder of a completion or an "
             "evaluation."
         )
 
@@ -201,12 +207,13 @@ def check_version(folder: Path, content: Any) -> None:
     version = content.get("version") if isinstance(content, Mapping) else None
     if isinstance(version, str) and version != __version__:
         raise InputError(
-            f"{quoted(folder / SUMMARY)} was written by version {quoted(version)}, and this is "
-            f"{__version__}; use that version, or {ADVICE}."
+            f"{quote_value(folder / SUMMARY_FILE)} was written by version {quote_value(version)}, "
+            "and this is "
+            f"{__version__}; use that version, or {COMPLETION_ADVICE}."
         )
 
 
-def as_written(kind: type[T], content: Any, path: Path, advice: str = ADVICE) -> T:
+def parse_content(kind: type[T], content: Any, path: Path, advice: str = COMPLETION_ADVICE) -> T:
     """Validate the content of a JSON file; raise an InputError with `advice` if it does not fit."""
     from pydantic import TypeAdapter, ValidationError
 
@@ -216,5 +223,6 @@ def as_written(kind: type[T], content: Any, path: Path, advice: str = ADVICE) ->
         wrong = error.errors(include_url=False)[0]
         place = ".".join(map(str, wrong["loc"])) or "its content"
         raise InputError(
-            f"{quoted(path)} is damaged ({quoted(place)}: {quoted(wrong['msg'])}); {advice}."
+            f"{quote_value(path)} is damaged ({quote_value(place)}: {quote_value(wrong['msg'])}); "
+            f"{advice}."
         ) from None

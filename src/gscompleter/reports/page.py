@@ -20,12 +20,12 @@ from PIL import Image
 
 from gscompleter import __version__
 from gscompleter.errors import InputError
-from gscompleter.io.files import replacing
-from gscompleter.io.image import image_size, jpeg_of, read_pixels
+from gscompleter.io.files import replace_file
+from gscompleter.io.image import encode_jpeg, read_image_size, read_pixels
 
-NAME = "report.html"
-QUALITY = 85
-MAX_PIXELS = 12_000_000
+REPORT_FILE = "report.html"
+JPEG_QUALITY = 85
+MAX_PAGE_PIXELS = 12_000_000
 """Largest sum of image pixels in a page (about 5 MB); more are scaled down."""
 
 
@@ -65,44 +65,44 @@ class Gallery:
     folder: Path
     scale: float = 1.0
 
-    def photo(self, name: str, alt: str) -> Picture:
+    def embed_photo(self, name: str, alt: str) -> Picture:
         """Embed an image in full colour as a JPEG."""
-        return self._embedded(name, alt, exact=False)
+        return self._embed(name, alt, exact=False)
 
-    def exact(self, name: str, alt: str) -> Picture:
+    def embed_exact(self, name: str, alt: str) -> Picture:
         """Embed a mask, depth image or plot as a PNG."""
-        return self._embedded(name, alt, exact=True)
+        return self._embed(name, alt, exact=True)
 
-    def slider(self, name: str, label: str, exact: bool = False) -> Slider:
+    def embed_slider(self, name: str, label: str, exact: bool = False) -> Slider:
         """Embed an image before and after."""
         before, after = (
-            self._embedded(f"{name}_{when}.png", f"{label}, {when}", exact)
+            self._embed(f"{name}_{when}.png", f"{label}, {when}", exact)
             for when in ("before", "after")
         )
         return Slider(before, after, label)
 
-    def _embedded(self, name: str, alt: str, exact: bool) -> Picture:
+    def _embed(self, name: str, alt: str, exact: bool) -> Picture:
         try:
             image = Image.fromarray(read_pixels(self.folder / name))
         except InputError:
             return Picture(alt, missing=f"{name} is missing or damaged.")
-        image = shrunk(image, self.scale, exact)
-        return Picture(alt, *image.size, uri=data_uri(image, exact))
+        image = scale_image(image, self.scale, exact)
+        return Picture(alt, *image.size, uri=encode_data_uri(image, exact))
 
 
-def gallery_of(folder: Path) -> Gallery:
+def open_gallery(folder: Path) -> Gallery:
     """Choose a scale at which all images of `folder` fit into a page."""
     pixels = 0
     for path in sorted(folder.glob("*.png")):
         try:
-            width, height = image_size(path)
+            width, height = read_image_size(path)
         except InputError:
             continue
         pixels += width * height
-    return Gallery(folder, min(1.0, (MAX_PIXELS / max(pixels, 1)) ** 0.5))
+    return Gallery(folder, min(1.0, (MAX_PAGE_PIXELS / max(pixels, 1)) ** 0.5))
 
 
-def shrunk(image: Image.Image, scale: float, exact: bool) -> Image.Image:
+def scale_image(image: Image.Image, scale: float, exact: bool) -> Image.Image:
     """Scale an image, without interpolation if `exact`."""
     if scale == 1:
         return image
@@ -110,13 +110,15 @@ def shrunk(image: Image.Image, scale: float, exact: bool) -> Image.Image:
     return image.resize(size, Image.Resampling.NEAREST if exact else Image.Resampling.LANCZOS)
 
 
-def data_uri(image: Image.Image, exact: bool) -> str:
+def encode_data_uri(image: Image.Image, exact: bool) -> str:
     """Encode an image as a data URI: PNG if `exact`, else JPEG."""
-    kind, content = ("png", png_of(image)) if exact else ("jpeg", jpeg_of(image, QUALITY))
+    kind, content = (
+        ("png", encode_png(image)) if exact else ("jpeg", encode_jpeg(image, JPEG_QUALITY))
+    )
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def png_of(image: Image.Image) -> bytes:
+def encode_png(image: Image.Image) -> bytes:
     """Encode an image as PNG, with a palette for up to 256 colours."""
     file = io.BytesIO()
     colours = image.getcolors(256)
@@ -124,25 +126,27 @@ def png_of(image: Image.Image) -> bytes:
     return file.getvalue()
 
 
-def rendered(template: str, values: Mapping[str, object]) -> str:
+def render_template(template: str, values: Mapping[str, object]) -> str:
     """Render a template with style and script."""
-    style, script = part("style.css"), part("script.js")
+    style, script = read_template("style.css"), read_template("script.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     shared = {"style": Markup(style), "script": Markup(script), "digest": digest}
-    return environment().get_template(template).render(version=__version__, **shared, **values)
+    return (
+        create_environment().get_template(template).render(version=__version__, **shared, **values)
+    )
 
 
 def write_page(folder: Path, page: str) -> None:
     """Write `report.html`."""
-    with replacing(folder / NAME) as file:
+    with replace_file(folder / REPORT_FILE) as file:
         file.write(page.encode())
 
 
 @cache
-def environment() -> Environment:
+def create_environment() -> Environment:
     """Create the template environment: escapes all text, refuses unknown names."""
     return Environment(
-        loader=FunctionLoader(part),
+        loader=FunctionLoader(read_template),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -150,6 +154,6 @@ def environment() -> Environment:
     )
 
 
-def part(name: str) -> str:
+def read_template(name: str) -> str:
     """Read a file of the folder `templates`."""
     return files(__package__).joinpath("templates").joinpath(name).read_text(encoding="utf-8")

@@ -5,21 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from gscompleter.reports.finished import Summary, TargetRow
+from gscompleter.reports.finished import CompletionSummary, TargetRow
 
-PLACED = {
+FRAME_NOTES = {
     "given": None,
     "cameras": "The splat is in the frame of its cameras.json, not in that of the photographs.",
     "dataparser": "The splat is in the frame of its trainer's dataparser.",
     "normalised": "The splat is in a frame that its trainer normalised.",
     "similarity": "The splat is in a frame of its own, aligned by matching features.",
 }
-NO_TARGET = "No large hole was found around the photographs; nothing was completed."
+NO_TARGET_NOTE = "No large hole was found around the photographs; nothing was completed."
 
 
-def moved(shares: Mapping[int | None, float]) -> str | None:
+def describe_motion(shares: Mapping[int | None, float]) -> str | None:
     """Describe the dynamic fractions of photographs by frame, or return None if all are 0."""
-    parts = [f"{percent(share)} of frame {frame}" for frame, share in shares.items() if share > 0]
+    parts = [
+        f"{format_percent(share)} of frame {frame}" for frame, share in shares.items() if share > 0
+    ]
     if not parts:
         return None
     return (
@@ -27,18 +29,19 @@ def moved(shares: Mapping[int | None, float]) -> str | None:
     )
 
 
-def left_out(shares: Iterable[float]) -> str | None:
+def describe_ignored(shares: Iterable[float]) -> str | None:
     """Describe the ignored fractions of photographs, or return None if all are 0."""
     most = max(shares, default=0.0)
     if most == 0:
         return None
     return (
-        f"Up to {percent(most)} of a photograph stays the same while the camera moves, like the "
+        f"Up to {format_percent(most)} of a photograph stays the same while the camera moves, "
+        "like the "
         "bonnet of a vehicle; it is ignored, also in scores (images/context*_ignored.png)."
     )
 
 
-def exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
+def describe_exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
     """Describe the exposure gains of photographs, or return None without any."""
     factors = [factor for gain in gains for factor in gain or ()]
     if not factors or min(factors) <= 0:
@@ -50,7 +53,7 @@ def exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
     )
 
 
-def about_target(row: TargetRow) -> list[str]:
+def list_target_notes(row: TargetRow) -> list[str]:
     """List the notes of a target, with fallbacks that no note mentions."""
     text = " ".join(row.notes)
     found = list(row.notes)
@@ -65,14 +68,14 @@ def about_target(row: TargetRow) -> list[str]:
     return found
 
 
-def about_scene(summary: Summary) -> list[str]:
+def list_scene_notes(summary: CompletionSummary) -> list[str]:
     """List the notes on the whole completion."""
-    return [*opened(summary), *compared(summary), *came_of_it(summary)]
+    return [*describe_input(summary), *describe_scoring(summary), *describe_result(summary)]
 
 
-def opened(summary: Summary) -> Iterator[str]:
+def describe_input(summary: CompletionSummary) -> Iterator[str]:
     """Describe the photographs and the frame of the result."""
-    placed = PLACED.get(summary.frame.method, "The splat is in a frame of its own.")
+    placed = FRAME_NOTES.get(summary.frame.method, "The splat is in a frame of its own.")
     if placed is not None:
         yield f"{placed} summary.json lists the transform from the photographs to the result."
     if any(summary.frame.origin):
@@ -80,10 +83,10 @@ def opened(summary: Summary) -> Iterator[str]:
             "The coordinates are much larger than the distances between the cameras, so the result "
             "is relative to a local origin, which summary.json lists."
         )
-    motion = moved({row.frame: row.dynamic_fraction for row in summary.context})
+    motion = describe_motion({row.frame: row.dynamic_fraction for row in summary.context})
     if motion is not None:
         yield motion
-    static = left_out(row.ignored for row in summary.context)
+    static = describe_ignored(row.ignored for row in summary.context)
     if static is not None:
         yield static
     if summary.settings.get("context") is None:
@@ -93,9 +96,9 @@ def opened(summary: Summary) -> Iterator[str]:
         )
 
 
-def compared(summary: Summary) -> Iterator[str]:
+def describe_scoring(summary: CompletionSummary) -> Iterator[str]:
     """Describe how the images are scored."""
-    exposure = exposures([row.exposure_gain for row in summary.context])
+    exposure = describe_exposures([row.exposure_gain for row in summary.context])
     if exposure is not None:
         yield exposure
     if summary.settings.get("uses_target_photographs"):
@@ -107,7 +110,7 @@ def compared(summary: Summary) -> Iterator[str]:
         yield "No target has a photograph, so there are no scores at targets."
 
 
-def came_of_it(summary: Summary) -> Iterator[str]:
+def describe_result(summary: CompletionSummary) -> Iterator[str]:
     """Describe the completed scene."""
     removed = summary.gaussians.get("removed")
     if removed is not None:
@@ -116,20 +119,20 @@ def came_of_it(summary: Summary) -> Iterator[str]:
             "regions that no photograph confirms count as holes."
         )
     if not summary.targets:
-        yield NO_TARGET
+        yield NO_TARGET_NOTE
 
 
-def shown(value: float | None, digits: int = 2) -> str:
+def format_number(value: float | None, digits: int = 2) -> str:
     """Format a number, with a dash for None or an infinite one."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
-def percent(share: float | None, digits: int = 1) -> str:
+def format_percent(share: float | None, digits: int = 1) -> str:
     """Format a fraction as a percentage."""
     return "–" if share is None or not math.isfinite(share) else f"{100 * share:.{digits}f} %"
 
 
-def gain(before: float | None, after: float | None, digits: int = 2) -> str:
+def format_change(before: float | None, after: float | None, digits: int = 2) -> str:
     """Format the change of a score with its sign."""
     if before is None or after is None or not math.isfinite(after - before):
         return "–"

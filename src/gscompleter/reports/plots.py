@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 from gscompleter.config import ABLATIONS
 from gscompleter.errors import InputError
-from gscompleter.io.files import replacing
-from gscompleter.reports.summary import Step, Summary, gain_of, psnr_after, stage_place
-from gscompleter.runs.store import slug
+from gscompleter.io.files import replace_file
+from gscompleter.reports.summary import (
+    RunSummary,
+    StepRow,
+    compute_psnr_gain,
+    get_psnr_after,
+    rank_stage,
+)
+from gscompleter.runs.store import make_file_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,17 +29,17 @@ class PlotsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in
     """Error for a missing matplotlib."""
 
 
-def plots(summary: Summary, out: Path) -> list[Path]:
+def draw_plots(summary: RunSummary, out: Path) -> list[Path]:
     """Draw the plots of a run that have data into `out`.
 
     Writes `gain_by_hole.png`, `gain_by_distance.png`, `seconds.png`, and `sequence_TASK.png` for
     each sequence. The first two omit ablations if other methods are compared.
     """
     paths = [
-        save_curves(out / f"sequence_{slug(name)}.png", steps)
+        save_curves(out / f"sequence_{make_file_name(name)}.png", steps)
         for name, steps in summary.sequences.items()
     ]
-    if not summary.common:
+    if not summary.common_tasks:
         return paths
     paths.append(save_plot(out / "gain_by_hole.png", draw_gain_by_hole, summary))
     if len(summary.gains) > 1:
@@ -42,22 +48,24 @@ def plots(summary: Summary, out: Path) -> list[Path]:
     return [*paths, save_plot(out / "seconds.png", draw_seconds, summary, height)]
 
 
-CURVES: tuple[tuple[str, Callable[[Step], float | None]], ...] = (
-    ("PSNR after the step (dB)", psnr_after),
+STEP_CURVES: tuple[tuple[str, Callable[[StepRow], float | None]], ...] = (
+    ("PSNR after the step (dB)", get_psnr_after),
     ("depth scale", lambda step: step["depth_scale"]),
     ("seconds", lambda step: step["seconds"]["total"]),
 )
 
 
-def save_curves(path: Path, steps: Mapping[str, Sequence[Step]]) -> Path:
+def save_curves(path: Path, steps: Mapping[str, Sequence[StepRow]]) -> Path:
     """Plot the steps of each method in one sequence."""
-    figure = new_figure(7.0)
-    panels = figure.subplots(len(CURVES), sharex=True)
-    for axes, (title, of) in zip(panels, CURVES, strict=True):
+    figure = create_plot_figure(7.0)
+    panels = figure.subplots(len(STEP_CURVES), sharex=True)
+    for axes, (title, of) in zip(panels, STEP_CURVES, strict=True):
         for number, (method, found) in enumerate(steps.items()):
             known = [(s["frame"], v) for s in found if (v := of(s)) is not None]
             if known:
-                axes.plot(*zip(*known, strict=True), label=method, linewidth=1, **style_of(number))
+                axes.plot(
+                    *zip(*known, strict=True), label=method, linewidth=1, **get_curve_style(number)
+                )
         axes.set_ylabel(title)
         axes.grid(alpha=0.3)
     if any(step["seconds"]["total"] > 0 for found in steps.values() for step in found):
@@ -68,10 +76,10 @@ def save_curves(path: Path, steps: Mapping[str, Sequence[Step]]) -> Path:
 
 
 def save_plot(
-    path: Path, draw: Callable[[Axes, Summary], None], summary: Summary, height: float = 4.5
+    path: Path, draw: Callable[[Axes, RunSummary], None], summary: RunSummary, height: float = 4.5
 ) -> Path:
     """Write a plot 8 inches wide as a PNG."""
-    figure = new_figure(height)
+    figure = create_plot_figure(height)
     draw(figure.add_subplot(), summary)
     figure.legend(loc="outside right upper", fontsize="small")
     return write_figure(figure, path)
@@ -79,12 +87,12 @@ def save_plot(
 
 def write_figure(figure: Figure, path: Path) -> Path:
     """Write a figure as a PNG; equal values give equal bytes."""
-    with replacing(path) as file:
+    with replace_file(path) as file:
         figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
     return path
 
 
-def new_figure(height: float) -> Figure:
+def create_plot_figure(height: float) -> Figure:
     """Create an empty figure; raise `PlotsNotAvailable` without matplotlib."""
     try:
         from matplotlib.figure import Figure
@@ -95,45 +103,47 @@ def new_figure(height: float) -> Figure:
     return Figure(figsize=(8, height), layout="constrained")
 
 
-def compared(methods: Sequence[str]) -> list[str]:
+def select_plot_methods(methods: Sequence[str]) -> list[str]:
     """Select the methods for the plots: not the context, and no ablations beside other methods."""
     ablations = {*ABLATIONS, "unconstrained", *(f"paper/{name}" for name in ABLATIONS)}
     others = [name for name in methods if name != "context" and name not in ablations]
     return others or [name for name in methods if name != "context"] or list(methods)
 
 
-def draw_gain_by_hole(axes: Axes, summary: Summary) -> None:
+def draw_gain_by_hole(axes: Axes, summary: RunSummary) -> None:
     """Plot the ΔPSNR of each step against the hole fraction."""
-    for number, method in enumerate(compared(summary.methods)):
+    for number, method in enumerate(select_plot_methods(summary.methods)):
         steps = [step for row in summary.rows[method] for step in row["steps"]]
         axes.plot(
             [100 * step["scores"]["hole_fraction"] for step in steps],
-            [gain_of(step) for step in steps],
+            [compute_psnr_gain(step) for step in steps],
             linestyle="none",
             label=method,
-            **style_of(number),
+            **get_curve_style(number),
         )
     _finish_gain(axes, "hole at the target (% of its pixels)")
 
 
-def draw_gain_by_distance(axes: Axes, summary: Summary) -> None:
+def draw_gain_by_distance(axes: Axes, summary: RunSummary) -> None:
     """Plot the mean ΔPSNR against the frames to the nearest context frame."""
-    for number, method in enumerate(compared(summary.methods)):
+    for number, method in enumerate(select_plot_methods(summary.methods)):
         gains = {
             gap: value
             for gap, cells in summary.gains.items()
             if (value := cells[method].value) is not None
         }
-        axes.plot(list(gains), list(gains.values()), linewidth=1, label=method, **style_of(number))
+        axes.plot(
+            list(gains), list(gains.values()), linewidth=1, label=method, **get_curve_style(number)
+        )
     axes.set_xticks(list(summary.gains))
     _finish_gain(axes, "frames from the target to the nearest context frame")
 
 
-def draw_seconds(axes: Axes, summary: Summary) -> None:
+def draw_seconds(axes: Axes, summary: RunSummary) -> None:
     """Draw one bar per method with the median seconds of each stage."""
-    seconds = {method: summary.seconds(method) for method in summary.methods}
+    seconds = {method: summary.compute_seconds(method) for method in summary.methods}
     stages = sorted(
-        {s for found in seconds.values() for s in found if s != "total"}, key=stage_place
+        {s for found in seconds.values() for s in found if s != "total"}, key=rank_stage
     )
     left = [0.0] * len(summary.methods)
     places = range(len(summary.methods))
@@ -146,7 +156,7 @@ def draw_seconds(axes: Axes, summary: Summary) -> None:
     axes.set_xlabel("median seconds per step")
 
 
-def style_of(number: int) -> dict[str, Any]:
+def get_curve_style(number: int) -> dict[str, Any]:
     """Return the style of a curve by its number."""
     marker = MARKERS[number % len(MARKERS)]
     return {"color": f"C{number % 10}", "marker": marker, "markersize": 5, "alpha": 0.8}

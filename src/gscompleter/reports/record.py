@@ -11,16 +11,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gscompleter.metrics.coverage import Look, covered
-from gscompleter.types import Camera, Completion, DepthPairs, Gaussians, TargetCompletion
+from gscompleter.metrics.coverage import RenderPair, compute_covered_share
+from gscompleter.types import Camera, Completion, DepthPairs, Gaussians, TargetResult
 
-NAME = "report.json"
+RECORD_FILE = "report.json"
 MAX_PHOTOGRAPHS = 200
 MAX_POINTS = 600
 """Largest number of points to keep, of the context and of the added Gaussians each."""
-MAX_LOOKS = 6
-OPAQUE = 0.3
-NOTICEABLE = 0.002
+MAX_SURROUNDING_VIEWS = 6
+MIN_SURFACE_OPACITY = 0.3
+MIN_COLOR_CHANGE = 0.002
 """Smallest mean colour difference, in [0, 1], of a changed image."""
 
 Limits = tuple[float, float]
@@ -28,7 +28,7 @@ Limits = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Pose:
+class ReportPose:
     """Pose and field of view of a camera, in the frame of the .ply."""
 
     c2w: tuple[tuple[float, ...], ...]
@@ -37,7 +37,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class DepthPairRecord:
     """Depth pairs of the alignment, in scene units."""
 
     seen_from: Literal["anchor", "target"]
@@ -50,14 +50,14 @@ class Pairs:
 class TargetRecord:
     """Data of a target."""
 
-    camera: Pose
+    camera: ReportPose
     depth_limits: Limits | None
     losses: Mapping[str, tuple[float, ...]]
-    pairs: Pairs | None
+    pairs: DepthPairRecord | None
 
 
 @dataclass(frozen=True)
-class LookRecord:
+class ViewCoverage:
     """Covered fractions of a surrounding view."""
 
     before: float
@@ -65,7 +65,7 @@ class LookRecord:
 
 
 @dataclass(frozen=True)
-class Points:
+class PointRecord:
     """Surface points of the scene, in the frame of the .ply."""
 
     means: tuple[tuple[float, float, float], ...]
@@ -73,95 +73,102 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Record:
+class ReportRecord:
     """All of `report.json`."""
 
-    context: tuple[Pose, ...]
-    photographs: tuple[Pose, ...]
+    context: tuple[ReportPose, ...]
+    photographs: tuple[ReportPose, ...]
     num_photographs: int
     targets: tuple[TargetRecord, ...]
-    around: tuple[LookRecord, ...]
-    points: Points
+    around: tuple[ViewCoverage, ...]
+    points: PointRecord
 
 
-def record_of(
+def make_record(
     completion: Completion,
     limits: Sequence[Limits | None],
-    around: Sequence[Look],
+    around: Sequence[RenderPair],
     photographs: Sequence[Camera],
-) -> Record:
+) -> ReportRecord:
     """Collect the data of a completion."""
     targets = zip(completion.targets, limits, strict=True)
-    return Record(
-        context=tuple(pose_of(view.camera) for view in completion.views),
-        photographs=tuple(pose_of(camera) for camera in spread(photographs, MAX_PHOTOGRAPHS)),
+    return ReportRecord(
+        context=tuple(make_camera_pose(view.camera) for view in completion.views),
+        photographs=tuple(
+            make_camera_pose(camera) for camera in thin_evenly(photographs, MAX_PHOTOGRAPHS)
+        ),
         num_photographs=len(photographs),
-        targets=tuple(target_record(result, ends) for result, ends in targets),
-        around=tuple(LookRecord(covered([k.before]), covered([k.after])) for k in around),
-        points=points_of(completion),
+        targets=tuple(make_target_record(result, ends) for result, ends in targets),
+        around=tuple(
+            ViewCoverage(compute_covered_share([k.before]), compute_covered_share([k.after]))
+            for k in around
+        ),
+        points=sample_points(completion),
     )
 
 
-def target_record(result: TargetCompletion, limits: Limits | None) -> TargetRecord:
+def make_target_record(result: TargetResult, limits: Limits | None) -> TargetRecord:
     """Collect the data of a target."""
-    losses = {name: rounded(torch.tensor(values)) for name, values in result.losses.items()}
-    pairs = None if result.pairs is None else pairs_record(result.pairs)
-    return TargetRecord(pose_of(result.target), limits, losses, pairs)
+    losses = {name: round_values(torch.tensor(values)) for name, values in result.losses.items()}
+    pairs = None if result.pairs is None else make_pairs_record(result.pairs)
+    return TargetRecord(make_camera_pose(result.target), limits, losses, pairs)
 
 
-def pairs_record(pairs: DepthPairs) -> Pairs:
+def make_pairs_record(pairs: DepthPairs) -> DepthPairRecord:
     """Round the depth pairs to six digits."""
-    agrees = tuple(pairs.agrees.tolist())
-    return Pairs(pairs.seen_from, rounded(pairs.predicted), rounded(pairs.context), agrees)
+    agrees = tuple(pairs.inlier_mask.tolist())
+    return DepthPairRecord(
+        pairs.fit_view, round_values(pairs.predicted), round_values(pairs.context), agrees
+    )
 
 
-def pose_of(camera: Camera) -> Pose:
+def make_camera_pose(camera: Camera) -> ReportPose:
     """Convert a camera to its pose and field of view."""
     focal_x, focal_y = camera.K[0, 0].item(), camera.K[1, 1].item()
-    values = rounded(camera.c2w[:3].flatten())
+    values = round_values(camera.c2w[:3].flatten())
     rows = tuple(values[k : k + 4] for k in (0, 4, 8))
-    return Pose(rows, (camera.width / focal_x / 2, camera.height / focal_y / 2))
+    return ReportPose(rows, (camera.width / focal_x / 2, camera.height / focal_y / 2))
 
 
-def points_of(completion: Completion) -> Points:
+def sample_points(completion: Completion) -> PointRecord:
     """Sample surface points of the context and of the added Gaussians."""
-    parts = [places(completion.context), places(completion.added)]
+    parts = [sample_means(completion.context), sample_means(completion.added)]
     means = tuple((x, y, z) for part in parts for x, y, z in part)
     added = tuple(number == 1 for number, part in enumerate(parts) for _ in part)
-    return Points(means, added)
+    return PointRecord(means, added)
 
 
-def places(gaussians: Gaussians) -> list[tuple[float, ...]]:
+def sample_means(gaussians: Gaussians) -> list[tuple[float, ...]]:
     """Sample means of opaque Gaussians."""
-    opaque = gaussians.means[gaussians.opacities >= OPAQUE]
+    opaque = gaussians.means[gaussians.opacities >= MIN_SURFACE_OPACITY]
     order = torch.randperm(len(opaque), generator=torch.Generator().manual_seed(0))
     chosen = opaque[order[:MAX_POINTS].to(opaque.device)]
-    values = rounded(chosen.flatten())
+    values = round_values(chosen.flatten())
     return [values[k : k + 3] for k in range(0, len(values), 3)]
 
 
-def most_changed(looks: Sequence[Look]) -> list[Look]:
+def select_most_changed(looks: Sequence[RenderPair]) -> list[RenderPair]:
     """Select the views whose images changed most, in descending order."""
     changes = [(look.after.image - look.before.image).abs().mean().item() for look in looks]
     order = sorted(range(len(looks)), key=changes.__getitem__, reverse=True)
-    return [looks[i] for i in order[:MAX_LOOKS] if changes[i] >= NOTICEABLE]
+    return [looks[i] for i in order[:MAX_SURROUNDING_VIEWS] if changes[i] >= MIN_COLOR_CHANGE]
 
 
-def spread(items: Sequence[Camera], most: int) -> Sequence[Camera]:
+def thin_evenly(items: Sequence[Camera], most: int) -> Sequence[Camera]:
     """Take every n-th item so that at most `most` are left."""
     return items[:: max(1, -(-len(items) // most))]
 
 
-def as_json(record: Record) -> str:
+def serialize_record(record: ReportRecord) -> str:
     """Serialize the record."""
     return json.dumps(record, default=vars, separators=(",", ":")) + "\n"
 
 
-def write_record(folder: Path, record: Record) -> None:
+def write_record(folder: Path, record: ReportRecord) -> None:
     """Write `report.json`."""
-    (folder / NAME).write_text(as_json(record))
+    (folder / RECORD_FILE).write_text(serialize_record(record))
 
 
-def rounded(values: Tensor) -> tuple[float, ...]:
+def round_values(values: Tensor) -> tuple[float, ...]:
     """Round numbers [n] to six significant digits."""
     return tuple(float(f"{value:.6g}") for value in values.detach().cpu().double().tolist())

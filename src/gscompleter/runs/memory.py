@@ -18,7 +18,7 @@ class Peak:
 
 
 @contextmanager
-def peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
+def measure_peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
     """Measure peak memory while the body runs: torch's on a GPU, the whole process's on a CPU."""
     peak = Peak()
     on_gpu = torch.device(device).type == "cuda"
@@ -33,10 +33,10 @@ def peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
         is_reset = True
     yield peak
     if is_reset:
-        peak.bytes = peak_of_process()
+        peak.bytes = read_process_peak()
 
 
-def peak_of_process() -> int | None:
+def read_process_peak() -> int | None:
     """Read the peak resident memory of this process, or None if the system does not report it."""
     try:
         status = Path("/proc/self/status").read_text()

@@ -10,8 +10,8 @@ import torch
 from gscompleter.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.completer import Clock, GSCompleter
-from gscompleter.config import ABLATIONS, named_config
-from gscompleter.errors import InputError, quoted
+from gscompleter.config import ABLATIONS, get_named_config
+from gscompleter.errors import InputError, quote_value
 from gscompleter.generators import Generator
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render import Renderer
@@ -30,15 +30,19 @@ class Models:
     baseline_iterations: int | None = None
     """Maximum number of iterations of the baselines; None keeps their own numbers."""
 
-    def completer(self, config: str = "default") -> GSCompleter:
+    def make_completer(self, config: str = "default") -> GSCompleter:
         """Return our method with the named config."""
         return GSCompleter(
-            self.reconstructor, self.generator, self.renderer, named_config(config), self.seed
+            self.reconstructor, self.generator, self.renderer, get_named_config(config), self.seed
         )
 
-    def iterations(self, wanted: int) -> int:
+    def limit_iterations(self, num_iterations: int) -> int:
         """Limit a number of iterations to `baseline_iterations`."""
-        return wanted if self.baseline_iterations is None else min(wanted, self.baseline_iterations)
+        return (
+            num_iterations
+            if self.baseline_iterations is None
+            else min(num_iterations, self.baseline_iterations)
+        )
 
 
 @dataclass(frozen=True)
@@ -67,16 +71,16 @@ Method = Callable[[Completion, Camera, Models], Prediction]
 """Function of the current scene with its photographs, the target and the models."""
 
 
-def nothing_added(state: Completion, target: Camera, models: Models) -> Prediction:
+def keep_scene(state: Completion, target: Camera, models: Models) -> Prediction:
     """Return the scene unchanged."""
     return Prediction(state.scene, state.scene[:0], {"total": 0.0})
 
 
-def completed_with(config: str) -> Method:
+def make_completion_method(config: str) -> Method:
     """Make a method of our completer with the named config."""
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
-        completer = replace(models.completer(config), keep_registered=True)
+        completer = replace(models.make_completer(config), keep_registered=True)
         context = InitialContext(state.scene, state.views)
         done = completer.advance(completer.begin_with(context), target)
         (made,) = done.targets
@@ -86,14 +90,14 @@ def completed_with(config: str) -> Method:
     return method
 
 
-def optimized_with(config: OptimizationConfig) -> Method:
+def make_optimization_method(config: OptimizationConfig) -> Method:
     """Make a method that optimizes the scene on the photographs and the reference."""
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         clock = Clock(())
         with clock("generate"):
-            views = [*state.views, models.completer().reference(state, target)]
-        budget = replace(config, iterations=models.iterations(config.iterations))
+            views = [*state.views, models.make_completer().synthesize_reference(state, target)]
+        budget = replace(config, iterations=models.limit_iterations(config.iterations))
         with clock("optimize"):
             fitted = optimize(state.scene, views, models.renderer, models.seed, budget)
         return Prediction(fitted.gaussians, None, clock.seconds)
@@ -101,16 +105,16 @@ def optimized_with(config: OptimizationConfig) -> Method:
     return method
 
 
-def registered_by_similarity(state: Completion, target: Camera, models: Models) -> Prediction:
+def complete_by_similarity(state: Completion, target: Camera, models: Models) -> Prediction:
     """Add all lifted Gaussians, registered to the scene by one similarity (RegGS)."""
     clock = Clock(())
     with clock("generate"):
-        reference = models.completer().reference(state, target)
+        reference = models.make_completer().synthesize_reference(state, target)
     with clock("lift"):
         anchor = select_anchor(reference.camera, state.views)
         lifted = lift(models.reconstructor, reference, state.views[anchor.index]).gaussians
     with clock("register"):
-        config = RegGSConfig(iterations=models.iterations(RegGSConfig.iterations))
+        config = RegGSConfig(iterations=models.limit_iterations(RegGSConfig.iterations))
         added = register_by_similarity(
             lifted, state.scene, reference, models.renderer, models.seed, config
         ).gaussians
@@ -118,7 +122,7 @@ def registered_by_similarity(state: Completion, target: Camera, models: Models) 
     return Prediction(scene, added, clock.seconds, anchor.index, anchor.fallback, registered=added)
 
 
-def numbered(prediction: Prediction, number: int, before: Gaussians) -> Prediction:
+def mark_target(prediction: Prediction, number: int, before: Gaussians) -> Prediction:
     """Mark the Gaussians added to `before` as generated for target `number`."""
     if prediction.added is None:
         return prediction
@@ -128,10 +132,10 @@ def numbered(prediction: Prediction, number: int, before: Gaussians) -> Predicti
 
 
 BASELINES: dict[str, Method] = {
-    "densify-100": optimized_with(OptimizationConfig(iterations=100)),
-    "densify-800": optimized_with(OptimizationConfig(iterations=800)),
-    "distill": optimized_with(OptimizationConfig(iterations=800, density_rounds=0)),
-    "reggs": registered_by_similarity,
+    "densify-100": make_optimization_method(OptimizationConfig(iterations=100)),
+    "densify-800": make_optimization_method(OptimizationConfig(iterations=800)),
+    "distill": make_optimization_method(OptimizationConfig(iterations=800, density_rounds=0)),
+    "reggs": complete_by_similarity,
 }
 """Methods of others."""
 
@@ -148,11 +152,11 @@ SETTINGS: dict[str, str] = {
     **_ABLATIONS,
     **{f"paper/{title}": f"paper/{name}" for title, name in _ABLATIONS.items()},
 }
-"""Our methods, with the name of their config for `named_config`."""
+"""Our methods, with the name of their config for `get_named_config`."""
 
 METHODS: dict[str, Method] = {
-    "context": nothing_added,
-    **{title: completed_with(name) for title, name in SETTINGS.items()},
+    "context": keep_scene,
+    **{title: make_completion_method(name) for title, name in SETTINGS.items()},
     **BASELINES,
 }
 """All methods by name, in the order of the tables."""
@@ -165,7 +169,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 """Names that stand for several methods."""
 
 
-def methods_named(names: Sequence[str]) -> tuple[str, ...]:
+def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
     """Replace groups by their methods and drop duplicates; raise as `check_methods`."""
     found = [method for name in names for method in GROUPS.get(name, (name,))]
     chosen = tuple(dict.fromkeys(found))
@@ -181,7 +185,8 @@ def check_methods(names: Sequence[str], steps: int = 1) -> None:
     for name in names:
         if name not in METHODS:
             raise InputError(
-                f"There is no method '{quoted(name)}'; choose one of {known} (paper/no-sa for an "
+                f"There is no method '{quote_value(name)}'; choose one of {known} (paper/no-sa "
+                "for an "
                 "ablation of the paper's settings)."
             )
         if steps > 1 and name in SCENE_CHANGING:

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from gscompleter.completer import MAX_TARGETS
+from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.photographs import PosedPhotographs
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.files import replacing
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import replace_file
 from gscompleter.io.json_file import read_json
 
 VERSION = 1
@@ -30,7 +30,7 @@ class Split:
 
     context: tuple[int, ...]
     targets: tuple[int, ...]
-    in_sequence: bool = False
+    is_sequence: bool = False
     """True if all targets are completed into one scene, one after the other."""
 
 
@@ -42,7 +42,7 @@ class EvaluationProtocol(Protocol):
     def name(self) -> str:
         """Name of the protocol for `parse_protocol` and the tables."""
 
-    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """Return the splits of a clip; none if it is skipped."""
 
 
@@ -66,7 +66,7 @@ class Extrapolation:
         """Name of the protocol."""
         return f"n-{self.k}" + ("" if self.stride is None else f"-stride-{self.stride}")
 
-    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """Return the splits of a clip."""
         k, stride = self.k, self.stride or 2 * self.k + 1
         return tuple(
@@ -82,7 +82,7 @@ class StressTest:
 
     name: str = "stress"
 
-    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """Return the split of a clip; none if it is too short."""
         split = Split((0, 30), (99,))
         return (split,) if len(clip) > max(split.targets) else ()
@@ -98,7 +98,7 @@ class EvaluationIndex:
     skipped: tuple[str, ...] = ()
     """Scenes without a split: null in a published file, clips that are too short in ours."""
 
-    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """Return the splits of a clip; none if the index skips or lacks its scene."""
         return self.scenes.get(clip.name, ())
 
@@ -110,14 +110,14 @@ class ViewByView:
     k: int
     """Step between frames."""
     steps: int | None = None
-    """Maximum number of targets; None takes all frames of the clip, up to `MAX_TARGETS`."""
+    """Maximum number of targets; None takes all frames of the clip, up to `MAX_TARGET_ID`."""
 
     def __post_init__(self) -> None:
         if self.k < 1:
             raise InputError("A sequence of every 0th frame is impossible; give at least 1.")
-        if self.steps is not None and not 1 <= self.steps <= MAX_TARGETS:
+        if self.steps is not None and not 1 <= self.steps <= MAX_TARGET_ID:
             raise InputError(
-                f"A sequence of {self.steps} steps is impossible; give 1 to {MAX_TARGETS}, the "
+                f"A sequence of {self.steps} steps is impossible; give 1 to {MAX_TARGET_ID}, the "
                 "number of targets that a .ply can tell apart."
             )
 
@@ -126,12 +126,12 @@ class ViewByView:
         """Name of the protocol."""
         return f"sequence-{self.k}" + ("" if self.steps is None else f"-steps-{self.steps}")
 
-    def splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """Return the split of a clip; none if it is too short."""
-        targets = tuple(range(2 * self.k, len(clip), self.k))[: self.steps or MAX_TARGETS]
-        return (Split((0, self.k), targets, in_sequence=True),) if targets else ()
+        targets = tuple(range(2 * self.k, len(clip), self.k))[: self.steps or MAX_TARGET_ID]
+        return (Split((0, self.k), targets, is_sequence=True),) if targets else ()
 
-    def reason_to_skip(self, clip: PosedPhotographs) -> str | None:
+    def explain_skip(self, clip: PosedPhotographs) -> str | None:
         """Explain why a clip has no split, or return None if it has one."""
         needed = 2 * self.k + 1
         if len(clip) >= needed:
@@ -155,12 +155,12 @@ def parse_protocol(text: str) -> EvaluationProtocol:
     if os.path.isfile(text):
         return read_evaluation_index(text)
     raise InputError(
-        f"There is no protocol '{quoted(text)}'; give n-K for a number of frames K (as n-10), "
+        f"There is no protocol '{quote_value(text)}'; give n-K for a number of frames K (as n-10), "
         "stress, sequence-K (as sequence-4), or the path of an evaluation index."
     )
 
 
-def index_of(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) -> EvaluationIndex:
+def build_index(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) -> EvaluationIndex:
     """Write down the splits of each clip; raise InputError for equal names or a sequence."""
     if isinstance(protocol, ViewByView):
         raise InputError(
@@ -171,7 +171,7 @@ def index_of(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) ->
     for clip in clips:
         if clip.name in scenes:
             raise InputError(f"Two clips are called {clip.name}; rename one of them.")
-        scenes[clip.name] = protocol.splits(clip)
+        scenes[clip.name] = protocol.select_splits(clip)
     chosen = {name: splits for name, splits in scenes.items() if splits}
     return EvaluationIndex(protocol.name, chosen, tuple(n for n in scenes if not scenes[n]))
 
@@ -186,16 +186,17 @@ def read_evaluation_index(path: Path | str) -> EvaluationIndex:
             "and target frames, or to null."
         )
     if "version" not in content:
-        return _index(path.stem, content, path)
+        return _parse_index(path.stem, content, path)
     if content["version"] != VERSION:
         raise InputError(
-            f"{path} is of version {quoted(content['version'])} and version {VERSION} can be read; "
+            f"{path} is of version {quote_value(content['version'])} and version {VERSION} can be "
+            "read; "
             "update gscompleter, or write the index again."
         )
     name, scenes = content.get("protocol"), content.get("scenes")
     if not isinstance(name, str) or not isinstance(scenes, dict):
         raise InputError(f"{path} is damaged: `protocol` and `scenes` are needed; write it again.")
-    return _index(name, scenes, path)
+    return _parse_index(name, scenes, path)
 
 
 def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
@@ -211,37 +212,40 @@ def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
         + ",\n".join(rows)
         + "\n }\n}\n"
     )
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(text.encode())
 
 
-def _index(name: str, content: Mapping[str, Any], path: Path) -> EvaluationIndex:
+def _parse_index(name: str, content: Mapping[str, Any], path: Path) -> EvaluationIndex:
     scenes = {
-        scene: _splits(entry, scene, path) for scene, entry in content.items() if entry is not None
+        scene: _parse_splits(entry, scene, path)
+        for scene, entry in content.items()
+        if entry is not None
     }
     return EvaluationIndex(name, scenes, tuple(s for s, entry in content.items() if entry is None))
 
 
-def _splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
+def _parse_splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
     """Parse the entry of a scene: one split in a published file, a list of splits in ours."""
     rows = entry if isinstance(entry, list) else [entry]
     if not rows or not all(isinstance(row, dict) for row in rows):
         raise InputError(
-            f"The entry of the scene {scene} in {path} is {quoted(entry)}; context and target, "
+            f"The entry of the scene {scene} in {path} is {quote_value(entry)}; context and "
+            "target, "
             "or null, are needed."
         )
     return tuple(
-        Split(_frames(row, "context", scene, path), _frames(row, "target", scene, path))
+        Split(_parse_frames(row, "context", scene, path), _parse_frames(row, "target", scene, path))
         for row in rows
     )
 
 
-def _frames(row: dict[str, Any], key: str, scene: str, path: Path) -> tuple[int, ...]:
+def _parse_frames(row: dict[str, Any], key: str, scene: str, path: Path) -> tuple[int, ...]:
     frames = row.get(key)
     whole = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
     if not whole or not frames:
         raise InputError(
-            f"The `{key}` of the scene {scene} in {path} is {quoted(frames)}; a list of frame "
+            f"The `{key}` of the scene {scene} in {path} is {quote_value(frames)}; a list of frame "
             "numbers, at least one, is needed."
         )
     return tuple(frames)

@@ -12,31 +12,31 @@ from typing import Any, Literal
 from gscompleter.batch.engines import Engine
 from gscompleter.batch.jobs import CLAIMS, Job, Outcome
 from gscompleter.batch.places import FolderPlace
-from gscompleter.batch.rounds import Rounds, in_this_process
-from gscompleter.batch.shards import checked_shard
+from gscompleter.batch.rounds import Rounds, run_in_this_process
+from gscompleter.batch.shards import check_shard
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, load_generator
 from gscompleter.memory import check_memory
-from gscompleter.progress import Activity, going_on, shown_on, stage
+from gscompleter.progress import Activity, show_activity, show_progress, stage
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.runs.methods import Models, check_methods
-from gscompleter.runs.steps import Prepared, Step, attempt, complete_task, kept
+from gscompleter.runs.steps import PreparedTask, Step, attempt, complete_task, load_or_compute
 from gscompleter.runs.store import (
     VERSION,
     SavedContext,
     claim,
+    get_row_path,
+    get_task_folder,
     load_context,
+    make_file_name,
     read_json,
-    row_path,
     save_context,
-    slug,
-    task_folder,
     write_json,
 )
 from gscompleter.runs.tasks import Task
-from gscompleter.stages.context import exposed_alike, sort_by_frame
+from gscompleter.stages.context import normalize_exposures, sort_by_frame
 from gscompleter.types import View
 
 RETRIES = 2
@@ -71,7 +71,7 @@ class RunConfig:
             self.generator, self.seed, targets, self.device, self.generator_settings
         )
 
-    def models(self, targets: Sequence[View]) -> Models:
+    def load_models(self, targets: Sequence[View]) -> Models:
         """Load the models of a task; only the generator `oracle` uses the images of `targets`."""
         return Models(
             self.load_reconstructor(),
@@ -82,7 +82,7 @@ class RunConfig:
         )
 
 
-Again = Literal["nothing", "failures", "scores"]
+Rerun = Literal["nothing", "failures", "scores"]
 """Earlier results to redo: none, failed tasks, or all scores from saved predictions."""
 
 
@@ -103,8 +103,8 @@ def evaluate(
     out: Path,
     config: RunConfig = RunConfig(),
     shard: tuple[int, int] = (0, 1),
-    again: Again = "nothing",
-    engine: Engine = in_this_process,
+    rerun: Rerun = "nothing",
+    engine: Engine = run_in_this_process,
 ) -> RowCounts:
     """Run methods on tasks and write a row of scores for each pair.
 
@@ -123,59 +123,59 @@ def evaluate(
         InputError: Invalid name or shard, other content in `out`, or a full disk.
     """
     check_evaluation(tasks, methods, config, shard)
-    claim(out, deciding(config))
+    claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
-    runner = Evaluating(out, tuple(methods), config, again)
-    todo = {row: task for task in share for row in runner.missing(task)}
-    jobs = [job_of(task) for task in {task.name: task for task in todo.values()}.values()]
+    runner = TaskRunner(out, tuple(methods), config, rerun)
+    todo = {row: task for task in share for row in runner.find_missing_rows(task)}
+    jobs = [make_task_job(task) for task in {task.name: task for task in todo.values()}.values()]
     rounds = Rounds(FolderPlace(out), runner, jobs, RETRIES)
     activity = Activity("evaluating", len(todo))
-    with going_on(activity) if todo else nullcontext():
-        for outcome in rounds.outcomes(engine, runner):
-            for _ in runner.rows_of(outcome.job.options["task"]) & set(todo):
-                activity.stepped()
+    with show_activity(activity) if todo else nullcontext():
+        for outcome in rounds.run(engine, runner):
+            for _ in runner.get_row_paths(outcome.job.options["task"]) & set(todo):
+                activity.count_step()
     failed = sum(read_json(row).get("error") is not None for row in todo)
     return RowCounts(len(todo) - failed, failed, len(share) * len(methods) - len(todo))
 
 
-def job_of(task: Task) -> Job:
+def make_task_job(task: Task) -> Job:
     """Make a job of a task, with all its methods."""
-    return Job(slug(task.name), {"task": task})
+    return Job(make_file_name(task.name), {"task": task})
 
 
 @dataclass(frozen=True)
-class Evaluating:
+class TaskRunner:
     """Runs the jobs of an evaluation and finds their results."""
 
     out: Path
     methods: tuple[str, ...]
     config: RunConfig
-    again: Again = "nothing"
+    rerun: Rerun = "nothing"
 
-    def rows_of(self, task: Task) -> set[Path]:
+    def get_row_paths(self, task: Task) -> set[Path]:
         """Return the paths of the rows of a task."""
-        return {row_path(self.out, task.name, method) for method in self.methods}
+        return {get_row_path(self.out, task.name, method) for method in self.methods}
 
-    def missing(self, task: Task) -> dict[Path, str]:
+    def find_missing_rows(self, task: Task) -> dict[Path, str]:
         """Return the rows of a task that have to be computed, with their methods."""
-        rows = {row_path(self.out, task.name, method): method for method in self.methods}
-        return {row: method for row, method in rows.items() if is_missing(row, self.again)}
+        rows = {get_row_path(self.out, task.name, method): method for method in self.methods}
+        return {row: method for row, method in rows.items() if is_missing(row, self.rerun)}
 
-    def ended(self, job: Job) -> Outcome | None:
+    def find_outcome(self, job: Job) -> Outcome | None:
         """Return the outcome of a task that another process completed, or None."""
-        there = all(row.exists() for row in self.rows_of(job.options["task"]))
+        there = all(row.exists() for row in self.get_row_paths(job.options["task"]))
         return Outcome(job, "done") if there else None
 
     def give_up(self, job: Job, reason: str) -> Outcome:
         """Write rows with the reason why there is no result."""
         task = job.options["task"]
-        for row, method in self.missing(task).items():
-            write_json(row, row_of(task, method, reason, task_folder(self.out, task.name)))
+        for row, method in self.find_missing_rows(task).items():
+            write_json(row, build_row(task, method, reason, get_task_folder(self.out, task.name)))
         return Outcome(job, "failed", reason)
 
     def __call__(self, job: Job) -> Outcome:
         """Compute the missing rows of a task, unless another process does it."""
-        with FolderPlace(self.out).claimed(f"{CLAIMS}/{job.name}") as lost:
+        with FolderPlace(self.out).hold_claim(f"{CLAIMS}/{job.name}") as lost:
             if lost is None:
                 return Outcome(job, "elsewhere")
             self.run(job.options["task"])
@@ -183,41 +183,41 @@ class Evaluating:
 
     def run(self, task: Task) -> None:
         """Compute the missing rows of a task."""
-        prepared, folder = None, task_folder(self.out, task.name)
-        for row, method in self.missing(task).items():
+        prepared, folder = None, get_task_folder(self.out, task.name)
+        for row, method in self.find_missing_rows(task).items():
             # Progress inside a task would flood a log.
-            with stage(f"{task.name}, {method}"), shown_on(None):
+            with stage(f"{task.name}, {method}"), show_progress(None):
                 if prepared is None:
-                    prepared = attempt(partial(prepare, task, folder, self.config))
-                made = row_of(task, method, prepared, folder)
+                    prepared = attempt(partial(prepare_task, task, folder, self.config))
+                made = build_row(task, method, prepared, folder)
             write_json(row, made)
 
 
-def is_missing(path: Path, again: Again) -> bool:
+def is_missing(path: Path, rerun: Rerun) -> bool:
     """Return True if a row has to be computed."""
-    if again == "scores" or not path.exists():
+    if rerun == "scores" or not path.exists():
         return True
-    return again == "failures" and read_json(path).get("error") is not None
+    return rerun == "failures" and read_json(path).get("error") is not None
 
 
-def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
+def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
     """Load the photographs of a task, and load or reconstruct its initial scene."""
-    views = sort_by_frame(photographs(task, task.context, config))
-    neighbours = photographs(task, task.neighbours, config)
-    targets, error = readable_targets(task, config)
+    views = sort_by_frame(load_task_views(task, task.context, config))
+    neighbours = load_task_views(task, task.neighbours, config)
+    targets, error = load_readable_targets(task, config)
     if not targets:
         raise InputError(str(error))
     images = [*views, *targets]
     check_memory(max(v.camera.width * v.camera.height for v in images), len(images))
-    models = config.models(targets)
-    context = context_at(folder / "context.npz", views, models)
+    models = config.load_models(targets)
+    context = load_or_reconstruct(folder / "context.npz", views, models)
 
     def set_range(view: View) -> View:
         return replace(view, camera=replace(view.camera, near=context.near, far=context.far))
 
-    return Prepared(
+    return PreparedTask(
         context.gaussians,
-        tuple(map(set_range, exposed_alike(views, context.gains))),
+        tuple(map(set_range, normalize_exposures(views, context.gains))),
         tuple(map(set_range, targets)),
         tuple(map(set_range, neighbours)),
         models,
@@ -226,7 +226,7 @@ def prepare(task: Task, folder: Path, config: RunConfig) -> Prepared:
     )
 
 
-def photographs(task: Task, frames: tuple[int, ...], config: RunConfig) -> list[View]:
+def load_task_views(task: Task, frames: tuple[int, ...], config: RunConfig) -> list[View]:
     """Load photographs and number them by their frames."""
     return [
         replace(view.to(config.device), frame=frame)
@@ -234,33 +234,35 @@ def photographs(task: Task, frames: tuple[int, ...], config: RunConfig) -> list[
     ]
 
 
-def readable_targets(task: Task, config: RunConfig) -> tuple[list[View], str | None]:
+def load_readable_targets(task: Task, config: RunConfig) -> tuple[list[View], str | None]:
     """Load the targets up to the first damaged photograph, and return its error."""
     targets: list[View] = []
     for frame in task.targets:
-        loaded = attempt(partial(photographs, task, (frame,), config))
+        loaded = attempt(partial(load_task_views, task, (frame,), config))
         if isinstance(loaded, str):
             return targets, f"Frame {frame}: {loaded}"
         targets += loaded
     return targets, None
 
 
-def context_at(path: Path, views: Sequence[View], models: Models) -> SavedContext:
+def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> SavedContext:
     """Load the scene saved at `path`, or reconstruct and save it."""
     device = views[0].image.device if views else "cpu"
 
     def save() -> None:
-        made = models.completer().reconstruct(views)
+        made = models.make_completer().reconstruct(views)
         near, far = made.views[0].camera.near, made.views[0].camera.far
         assert near is not None
         assert far is not None
         seconds = made.seconds["total"]
-        save_context(path, SavedContext(made.gaussians, near, far, seconds, made.gains))
+        save_context(path, SavedContext(made.gaussians, near, far, seconds, made.exposure_gains))
 
-    return kept(path, lambda: load_context(path, device), save)
+    return load_or_compute(path, lambda: load_context(path, device), save)
 
 
-def row_of(task: Task, method: str, prepared: Prepared | str, folder: Path) -> dict[str, Any]:
+def build_row(
+    task: Task, method: str, prepared: PreparedTask | str, folder: Path
+) -> dict[str, Any]:
     """Build the row of a method on a task; `prepared` may be an error instead of a task."""
     steps: tuple[Step, ...] = ()
     error: str | None
@@ -289,7 +291,7 @@ def check_evaluation(
 ) -> None:
     """Raise InputError before anything is written if a run is impossible."""
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
-    checked_shard(shard)
+    check_shard(shard)
     check_tasks(tasks)
     config.load_reconstructor()
     config.load_generator()
@@ -304,7 +306,7 @@ def check_tasks(tasks: Sequence[Task]) -> None:
         )
     names: dict[str, str] = {}
     for task in tasks:
-        folder = slug(task.name)
+        folder = make_file_name(task.name)
         if folder in names:
             raise InputError(
                 f"The cases {names[folder]} and {task.name} have the same name; rename a scene."
@@ -312,7 +314,7 @@ def check_tasks(tasks: Sequence[Task]) -> None:
         names[folder] = task.name
 
 
-def deciding(config: RunConfig) -> dict[str, Any]:
+def collect_settings(config: RunConfig) -> dict[str, Any]:
     """Collect all settings that determine the numbers, named as on the command line."""
     values = asdict(config)
     settings = values.pop("generator_settings") or {}

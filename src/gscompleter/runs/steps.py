@@ -18,16 +18,23 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.errors import InputError, OutputError
-from gscompleter.metrics.scores import MIN_PIXELS, Drawings, Scores, Truth, counted_psnr, score
+from gscompleter.metrics.scores import (
+    MIN_PIXELS,
+    Scores,
+    TargetRenders,
+    Truth,
+    compute_view_psnr,
+    score,
+)
 from gscompleter.render import Renderer
-from gscompleter.runs.memory import peak_memory
-from gscompleter.runs.methods import METHODS, Models, Prediction, numbered
+from gscompleter.runs.memory import measure_peak_memory
+from gscompleter.runs.methods import METHODS, Models, Prediction, mark_target
 from gscompleter.runs.store import (
+    get_step_path,
+    get_truth_path,
     load_prediction,
     save_image,
     save_prediction,
-    step_path,
-    truth_path,
 )
 from gscompleter.stages.anchor import lift
 from gscompleter.types import Camera, Completion, DepthMap, Gaussians, InitialContext, View
@@ -36,7 +43,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedTask:
     """A task with the data that all methods share; cameras have the depth range of the scene."""
 
     context: Gaussians
@@ -89,30 +96,30 @@ class Progress:
     """Reason why the task stopped, or None."""
 
 
-def complete_task(task: Prepared, method: str, folder: Path) -> Progress:
+def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
     """Complete targets in order until a step fails; saved steps in `folder` are read back."""
     progress = Progress(task.context, task.views, error=task.error)
     for target in task.targets:
-        following = attempt(partial(advanced, progress, target, task, method, folder))
+        following = attempt(partial(advance_task, progress, target, task, method, folder))
         if isinstance(following, str):
             progress = replace(progress, error=f"Frame {target.frame}: {following}")
             break
         progress = following
-    return ended(progress, task.targets, task.models.renderer)
+    return add_final_psnr(progress, task.targets, task.models.renderer)
 
 
-def advanced(
-    progress: Progress, target: View, task: Prepared, method: str, folder: Path
+def advance_task(
+    progress: Progress, target: View, task: PreparedTask, method: str, folder: Path
 ) -> Progress:
     """Complete one more target and save its prediction and images."""
     number = len(progress.steps) + 1
-    state = task.models.completer().begin_with(InitialContext(progress.scene, progress.views))
-    path = step_path(folder, method, number)
-    prediction = predicted(method, state, target.camera, number, task.models, path)
-    step, seen = step_of(prediction, state, target, task)
+    state = task.models.make_completer().begin_with(InitialContext(progress.scene, progress.views))
+    path = get_step_path(folder, method, number)
+    prediction = load_or_predict(method, state, target.camera, number, task.models, path)
+    step, seen = score_step(prediction, state, target, task)
     save_image(path.with_suffix(".png"), seen.after.image)
     save_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
-    save_image(truth_path(folder, number), target.image)
+    save_image(get_truth_path(folder, number), target.image)
     return replace(
         progress,
         scene=prediction.scene,
@@ -121,21 +128,21 @@ def advanced(
     )
 
 
-def predicted(
+def load_or_predict(
     method: str, state: Completion, target: Camera, number: int, models: Models, path: Path
 ) -> Prediction:
     """Load the prediction at `path`, or compute and save it."""
 
     def save() -> None:
-        with peak_memory(state.scene.means.device) as peak:
+        with measure_peak_memory(state.scene.means.device) as peak:
             made = METHODS[method](state, target, models)
-        made = numbered(made, number, state.scene)
+        made = mark_target(made, number, state.scene)
         save_prediction(path, replace(made, peak_bytes=peak.bytes))
 
-    return kept(path, lambda: load_prediction(path, state.scene), save)
+    return load_or_compute(path, lambda: load_prediction(path, state.scene), save)
 
 
-def kept(path: Path, load: Callable[[], T | None], save: Callable[[], None]) -> T:
+def load_or_compute(path: Path, load: Callable[[], T | None], save: Callable[[], None]) -> T:
     """Load a result from `path`, after computing and saving it if it is missing.
 
     It is always read back, so that a resumed run continues with the same tensors.
@@ -149,9 +156,9 @@ def kept(path: Path, load: Callable[[], T | None], save: Callable[[], None]) -> 
     return found
 
 
-def step_of(
-    prediction: Prediction, state: Completion, target: View, task: Prepared
-) -> tuple[Step, Drawings]:
+def score_step(
+    prediction: Prediction, state: Completion, target: View, task: PreparedTask
+) -> tuple[Step, TargetRenders]:
     """Score a step and render its target camera."""
     truth = Truth(state.views, target, task.neighbours)
     before, after = state.scene, prediction.scene
@@ -161,13 +168,13 @@ def step_of(
     anchor = None if prediction.anchor is None else state.views[prediction.anchor]
     scale = None
     if len(task.targets) > 1 and anchor is not None and prediction.added is not None:
-        expected = metric_depth(target, anchor, task.models)
-        scale = depth_scale(
+        expected = get_metric_depth(target, anchor, task.models)
+        scale = compute_depth_scale(
             prediction.added, seen.holes, target.camera, expected, task.models.renderer
         )
     step = Step(
-        frame=number_of(target),
-        anchor=None if anchor is None else number_of(anchor),
+        frame=get_frame_number(target),
+        anchor=None if anchor is None else get_frame_number(anchor),
         anchor_fallback=prediction.anchor_fallback,
         scores=scores,
         psnr_end=None,
@@ -182,20 +189,20 @@ def step_of(
     return step, seen
 
 
-def number_of(view: View) -> int:
+def get_frame_number(view: View) -> int:
     """Return the frame number of a view."""
     assert view.frame is not None
     return view.frame
 
 
-def metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
+def get_metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
     """Return the measured depth of `target`, or an estimate of Ψ if the data have none."""
     if target.depth is not None:
         return DepthMap(target.depth, target.depth > 0)
     return lift(models.reconstructor, target, anchor).reference_depth
 
 
-def depth_scale(
+def compute_depth_scale(
     added: Gaussians,
     holes: Bool[Tensor, "h w"],
     target: Camera,
@@ -214,17 +221,17 @@ def depth_scale(
     return (alone.depth / expected.depth)[both].median().item()
 
 
-def scale_drift(scales: Sequence[float]) -> float | None:
+def compute_scale_drift(scales: Sequence[float]) -> float | None:
     """Compute max(ln s) - min(ln s) of the depth scales s; None for fewer than two."""
     return math.log(max(scales)) - math.log(min(scales)) if len(scales) > 1 else None
 
 
-def ended(progress: Progress, targets: Sequence[View], renderer: Renderer) -> Progress:
+def add_final_psnr(progress: Progress, targets: Sequence[View], renderer: Renderer) -> Progress:
     """Set the PSNR of the final scene at each step."""
     steps = []
     for step, target in zip(progress.steps, targets, strict=False):  # the last may have failed
         image = renderer.render(progress.scene, target.camera).image
-        steps.append(replace(step, psnr_end=counted_psnr(image, target)))
+        steps.append(replace(step, psnr_end=compute_view_psnr(image, target)))
     return replace(progress, steps=tuple(steps))
 
 

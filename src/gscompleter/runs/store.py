@@ -26,11 +26,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError, OutputError, quoted
+from gscompleter.errors import InputError, OutputError, quote_value
 from gscompleter.io import json_file
-from gscompleter.io.files import replacing
+from gscompleter.io.files import replace_file
 from gscompleter.io.image import write_image
-from gscompleter.io.unfinished import MARK
+from gscompleter.io.unfinished import UNFINISHED_PREFIX
 from gscompleter.runs.methods import Prediction
 from gscompleter.types import Gaussians, merge
 
@@ -43,7 +43,7 @@ TASKS = "tasks"
 VERSION = 3
 """Version of the files of a run."""
 
-REGISTERED = "registered_"
+REGISTERED_PREFIX = "registered_"
 """Prefix of the arrays of registered Gaussians in the file of a prediction."""
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
@@ -51,32 +51,32 @@ _FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 Arrays = dict[str, np.ndarray]
 
 
-def slug(name: str) -> str:
+def make_file_name(name: str) -> str:
     """Turn a name into a valid file name."""
     return re.sub(r"[^\w.+-]+", "-", name.replace(">", "-to-"))
 
 
-def task_folder(out: Path, task: str) -> Path:
+def get_task_folder(out: Path, task: str) -> Path:
     """Return the folder of a task."""
-    return out / TASKS / slug(task)
+    return out / TASKS / make_file_name(task)
 
 
-def row_path(out: Path, task: str, method: str) -> Path:
+def get_row_path(out: Path, task: str, method: str) -> Path:
     """Return the path of the row of a task and a method."""
-    return task_folder(out, task) / f"{slug(method)}.json"
+    return get_task_folder(out, task) / f"{make_file_name(method)}.json"
 
 
-def step_path(folder: Path, method: str, number: int) -> Path:
+def get_step_path(folder: Path, method: str, number: int) -> Path:
     """Return the path of the prediction of step `number`, counted from 1."""
-    return folder / slug(method) / f"step-{number:03d}.npz"
+    return folder / make_file_name(method) / f"step-{number:03d}.npz"
 
 
-def truth_path(folder: Path, number: int) -> Path:
+def get_truth_path(folder: Path, number: int) -> Path:
     """Return the path of the target photograph of step `number`, counted from 1."""
     return folder / f"truth-{number:03d}.png"
 
 
-def row_paths(out: Path) -> list[Path]:
+def list_row_paths(out: Path) -> list[Path]:
     """List all rows of a run."""
     return sorted((out / TASKS).glob("*/*.json"))
 
@@ -88,13 +88,13 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     """
     wanted = json.loads(json.dumps({"version": VERSION, **settings}))
     if not is_run(out):
-        if holds_something_else(out):
+        if has_other_content(out):
             raise InputError(f"{out} holds something other than a run; name another folder.")
-        write_json(out / RUN, wanted, first_stays=True)
-    found = settings_of(out)
+        write_json(out / RUN, wanted, keep_existing=True)
+    found = read_settings(out)
     for key in {**wanted, **found}:
         if found.get(key) != wanted.get(key):
-            old, new = quoted(repr(found.get(key))), quoted(repr(wanted.get(key)))
+            old, new = quote_value(repr(found.get(key))), quote_value(repr(wanted.get(key)))
             raise InputError(
                 f"{out} holds a run with {key} {old}, and this run has {new}; name another folder."
             )
@@ -104,16 +104,17 @@ def check_run(out: Path) -> None:
     """Raise InputError if `out` holds no run, or one of another version."""
     if not is_run(out):
         raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
-    settings_of(out)
+    read_settings(out)
 
 
-def settings_of(out: Path) -> dict[str, Any]:
+def read_settings(out: Path) -> dict[str, Any]:
     """Read the settings of a run; raise InputError if they are damaged or of another version."""
     found = read_json(out / RUN, "name another folder")
     version = found.get("version") if isinstance(found, dict) else None
     if version != VERSION:
         raise InputError(
-            f"{out} holds a run of version {quoted(version)}, and version {VERSION} is needed; "
+            f"{out} holds a run of version {quote_value(version)}, and version {VERSION} is "
+            "needed; "
             "name another folder and run it again."
         )
     return dict(found)
@@ -124,13 +125,13 @@ def is_run(out: Path) -> bool:
     return (out / RUN).is_file()
 
 
-def holds_something_else(out: Path) -> bool:
+def has_other_content(out: Path) -> bool:
     """Return True if `out` exists and is neither empty, unfinished, nor a run."""
     if not os.path.lexists(out):
         return False
     if not out.is_dir():
         return True
-    entries = {name for name in os.listdir(out) if not name.startswith(MARK)}
+    entries = {name for name in os.listdir(out) if not name.startswith(UNFINISHED_PREFIX)}
     return bool(entries) and RUN not in entries and not is_run(out)
 
 
@@ -150,7 +151,7 @@ class SavedContext:
 def save_context(path: Path, context: SavedContext) -> None:
     """Write the initial scene of a task."""
     numbers = np.array([context.seconds, context.near, context.far], dtype=np.float64)
-    arrays = {**_arrays_of(context.gaussians), "seconds_near_far": numbers}
+    arrays = {**_to_arrays(context.gaussians), "seconds_near_far": numbers}
     if context.gains is not None:
         arrays["gains"] = context.gains.cpu().numpy()
     write_arrays(path, arrays)
@@ -163,7 +164,7 @@ def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
         return None
     seconds, near, far = arrays["seconds_near_far"].tolist()
     gains = torch.from_numpy(arrays["gains"]).to(device) if "gains" in arrays else None
-    return SavedContext(_gaussians_of(arrays, device), near, far, seconds, gains)
+    return SavedContext(_to_gaussians(arrays, device), near, far, seconds, gains)
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
@@ -173,15 +174,15 @@ def save_prediction(path: Path, prediction: Prediction) -> None:
     write_arrays(
         path,
         {
-            **_arrays_of(prediction.scene if prediction.added is None else prediction.added),
+            **_to_arrays(prediction.scene if prediction.added is None else prediction.added),
             "whole": np.array(whole),
             "stages": np.array(list(prediction.seconds), dtype=np.str_),
             "seconds": np.array(list(prediction.seconds.values()), dtype=np.float64),
-            "anchor": _optional(prediction.anchor),
+            "anchor": _encode_optional(prediction.anchor),
             "anchor_fallback": np.array(prediction.anchor_fallback),
             "notes": np.array(prediction.notes, dtype=np.str_),
-            "peak_bytes": _optional(prediction.peak_bytes),
-            **({} if registered is None else _arrays_of(registered, REGISTERED)),
+            "peak_bytes": _encode_optional(prediction.peak_bytes),
+            **({} if registered is None else _to_arrays(registered, REGISTERED_PREFIX)),
         },
     )
 
@@ -191,37 +192,37 @@ def load_prediction(path: Path, before: Gaussians) -> Prediction | None:
     arrays = load_arrays(path)
     if arrays is None:
         return None
-    changed = _gaussians_of(arrays, before.means.device)
+    changed = _to_gaussians(arrays, before.means.device)
     whole = bool(arrays["whole"])
     return Prediction(
         scene=changed if whole else merge([before, changed]),
         added=None if whole else changed,
         seconds=dict(zip(arrays["stages"].tolist(), arrays["seconds"].tolist(), strict=True)),
-        anchor=_known(arrays["anchor"]),
+        anchor=_decode_optional(arrays["anchor"]),
         anchor_fallback=bool(arrays["anchor_fallback"]),
         notes=tuple(arrays["notes"].tolist()),
-        peak_bytes=_known(arrays["peak_bytes"]),
+        peak_bytes=_decode_optional(arrays["peak_bytes"]),
         registered=(
-            _gaussians_of(arrays, before.means.device, REGISTERED)
-            if f"{REGISTERED}means" in arrays
+            _to_gaussians(arrays, before.means.device, REGISTERED_PREFIX)
+            if f"{REGISTERED_PREFIX}means" in arrays
             else None
         ),
     )
 
 
-def _optional(number: int | None) -> np.ndarray:
+def _encode_optional(number: int | None) -> np.ndarray:
     return np.array(-1 if number is None else number, dtype=np.int64)
 
 
-def _known(number: np.ndarray) -> int | None:
+def _decode_optional(number: np.ndarray) -> int | None:
     return None if number < 0 else int(number)
 
 
-def _arrays_of(gaussians: Gaussians, prefix: str = "") -> Arrays:
+def _to_arrays(gaussians: Gaussians, prefix: str = "") -> Arrays:
     return {f"{prefix}{name}": getattr(gaussians, name).detach().cpu().numpy() for name in _FIELDS}
 
 
-def _gaussians_of(
+def _to_gaussians(
     arrays: Mapping[str, np.ndarray], device: torch.device | str, prefix: str = ""
 ) -> Gaussians:
     """Copy arrays to tensors with torch's own memory layout, on which rounding of sums depends."""
@@ -241,19 +242,19 @@ def load_arrays(path: Path) -> Arrays | None:
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
     """Write arrays atomically; raise OutputError if that fails."""
-    with _writing(path), replacing(path) as file:
+    with _convert_errors(path), replace_file(path) as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def write_json(path: Path, content: Any, first_stays: bool = False) -> None:
-    """Write JSON atomically; the arguments are those of `replacing`."""
-    with _writing(path), replacing(path, first_stays) as file:
+def write_json(path: Path, content: Any, keep_existing: bool = False) -> None:
+    """Write JSON atomically; the arguments are those of `replace_file`."""
+    with _convert_errors(path), replace_file(path, keep_existing) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
     """Write an image; raise OutputError if that fails."""
-    with _writing(path):
+    with _convert_errors(path):
         write_image(path, image)
 
 
@@ -263,7 +264,7 @@ def read_json(path: Path, advice: str = "delete it and run again") -> Any:
 
 
 @contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def _convert_errors(path: Path) -> Iterator[None]:
     """Create the folder of `path` and turn write errors into OutputError, which ends the run."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

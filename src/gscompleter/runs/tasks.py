@@ -8,7 +8,7 @@ from functools import partial
 
 from gscompleter.data.cases import Case
 from gscompleter.data.framing import Resolution
-from gscompleter.data.photographs import PosedPhotographs, without_masked
+from gscompleter.data.photographs import PosedPhotographs, apply_masks
 from gscompleter.errors import InputError
 from gscompleter.runs.protocols import EvaluationProtocol, Split
 from gscompleter.types import View
@@ -36,16 +36,16 @@ class Task:
         return f"{self.scene} {'+'.join(map(str, self.context))}>{span}"
 
 
-def task_of(case: Case) -> Task:
+def make_case_task(case: Case) -> Task:
     """Make a task of a case of a `cases.json`."""
     return Task(case.scene.name, case.context, (case.target,), case.load, case.neighbours)
 
 
-def tasks_of(
+def make_tasks(
     protocol: EvaluationProtocol,
     clip: PosedPhotographs,
     resolution: Resolution = None,
-    ignore_masked: bool = False,
+    use_masks: bool = False,
 ) -> list[Task]:
     """Make the tasks of a clip: one per target, or one per sequence.
 
@@ -55,25 +55,25 @@ def tasks_of(
         resolution: As in `PosedPhotographs.views`.
         ignore_masked: True to ignore masked pixels of the photographs.
     """
-    load = partial(photographs_of, clip, resolution, ignore_masked)
+    load = partial(load_clip_views, clip, resolution, use_masks)
     tasks = []
-    for split in protocol.splits(clip):
+    for split in protocol.select_splits(clip):
         check_frames(protocol, split, clip)
-        if split.in_sequence:
+        if split.is_sequence:
             tasks.append(Task(clip.name, split.context, split.targets, load))
             continue
         for target in split.targets:
-            beside = neighbours(target, split.context, len(clip))
+            beside = find_neighbours(target, split.context, len(clip))
             tasks.append(Task(clip.name, split.context, (target,), load, beside))
     return tasks
 
 
-def photographs_of(
-    clip: PosedPhotographs, resolution: Resolution, ignore_masked: bool, frames: tuple[int, ...]
+def load_clip_views(
+    clip: PosedPhotographs, resolution: Resolution, use_masks: bool, frames: tuple[int, ...]
 ) -> list[View]:
     """Load photographs of a clip, with the arguments of `make_tasks`."""
     views = clip.views(frames, resolution)
-    return without_masked(views, clip, resolution) if ignore_masked else views
+    return apply_masks(views, clip, resolution) if use_masks else views
 
 
 def check_frames(protocol: EvaluationProtocol, split: Split, clip: PosedPhotographs) -> None:
@@ -86,7 +86,7 @@ def check_frames(protocol: EvaluationProtocol, split: Split, clip: PosedPhotogra
             )
 
 
-def neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:
+def find_neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:
     """Return the frames before and after `target` that exist and are not context."""
     return tuple(
         frame

@@ -12,47 +12,49 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.render.spherical_harmonics import sh_basis
+from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.types import Gaussians
 
-ABOUT_X = (1.0, -1.0, -1.0)
+HALF_TURN_X = (1.0, -1.0, -1.0)
 """Signs of the axes after half a turn about x."""
-ABOUT_Z = (-1.0, -1.0, 1.0)
+HALF_TURN_Z = (-1.0, -1.0, 1.0)
 """Signs of the axes after half a turn about z."""
 
 
-def half_turned(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
+def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
     """Rotate Gaussians by half a turn about an axis; exact, because only signs change."""
     flip = torch.tensor(signs)
     return replace(
         gaussians,
         means=gaussians.means * flip,
         quats=gaussians.quats * torch.tensor((1.0, *signs)),
-        sh=gaussians.sh * _signs_of_harmonics(signs, gaussians.sh.shape[1])[:, None],
+        sh=gaussians.sh * _compute_sh_signs(signs, gaussians.sh.shape[1])[:, None],
     )
 
 
-def _signs_of_harmonics(signs: tuple[float, float, float], k: int) -> Float[Tensor, "k"]:
+def _compute_sh_signs(signs: tuple[float, float, float], k: int) -> Float[Tensor, "k"]:
     """Compute the sign of each SH basis function, all even or odd under half a turn."""
     direction = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.7]]), dim=1)
-    return (sh_basis(direction * torch.tensor(signs), k) / sh_basis(direction, k))[0].round()
+    return (
+        evaluate_sh_basis(direction * torch.tensor(signs), k) / evaluate_sh_basis(direction, k)
+    )[0].round()
 
 
-def moved(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:
+def transform_gaussians(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:
     """Transform Gaussians by a similarity `x' = s R x + t`."""
     scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
     rotation = similarity[:3, :3] / scale
     return replace(
         gaussians,
         means=gaussians.means @ similarity[:3, :3].T + similarity[:3, 3],
-        quats=_product(_quaternion(rotation), gaussians.quats),
+        quats=_multiply_quats(_matrix_to_quat(rotation), gaussians.quats),
         scales=gaussians.scales * scale,
-        sh=_turned_harmonics(gaussians.sh, rotation),
+        sh=_rotate_sh(gaussians.sh, rotation),
         encoded=None,
     )
 
 
-def _turned_harmonics(
+def _rotate_sh(
     sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "n k 3"]:
     """Rotate SH by least squares, so that they show along `R d` what `sh` shows along d."""
@@ -61,12 +63,12 @@ def _turned_harmonics(
     directions = torch.nn.functional.normalize(
         torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1
     )
-    before = sh_basis(directions, k)
-    after = sh_basis(directions @ rotation.double().T, k)
+    before = evaluate_sh_basis(directions, k)
+    after = evaluate_sh_basis(directions @ rotation.double().T, k)
     return torch.einsum("ij,njc->nic", torch.linalg.lstsq(after, before).solution.to(sh), sh)
 
 
-def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
+def _matrix_to_quat(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
     """Convert a rotation to wxyz: the largest eigenvector of Bar-Itzhack's matrix."""
     (a, b, c), (d, e, f), (g, h, i) = rotation.double().tolist()
     matrix = torch.tensor(
@@ -81,7 +83,7 @@ def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
     return torch.linalg.eigh(matrix).eigenvectors[:, -1].to(rotation.dtype)
 
 
-def _product(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+def _multiply_quats(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
     """Compute the Hamilton product of wxyz quaternions: rotation `b` first, then `a`."""
     vector = (
         a[0] * b[:, 1:] + b[:, :1] * a[1:] + torch.linalg.cross(a[1:].expand(len(b), 3), b[:, 1:])

@@ -7,19 +7,19 @@ from jaxtyping import Float, Integer, UInt32
 from numpy import ndarray
 
 
-def fraction(packed: UInt32[ndarray, "*n"], shift: int, bits: int) -> Float[ndarray, "*n"]:
+def unpack_fraction(packed: UInt32[ndarray, "*n"], shift: int, bits: int) -> Float[ndarray, "*n"]:
     """Unpack `bits` bits of each number from bit `shift` on, as a fraction in [0, 1]."""
     most = (1 << bits) - 1
     return ((packed >> np.uint32(shift)) & np.uint32(most)).astype(np.float32) / np.float32(most)
 
 
-def quantized(fractions: Float[ndarray, "*n"], bits: int) -> UInt32[ndarray, "*n"]:
+def quantize(fractions: Float[ndarray, "*n"], bits: int) -> UInt32[ndarray, "*n"]:
     """Quantize fractions to integers of `bits` bits; the inverse of `unpack_fraction`."""
     most = (1 << bits) - 1
     return np.rint(np.clip(fractions, 0, 1) * most).astype(np.uint32)
 
 
-def with_largest(
+def restore_largest(
     largest: Integer[ndarray, "n"], smaller: Float[ndarray, "n 3"]
 ) -> Float[ndarray, "n 4"]:
     """Restore unit quaternions whose positive component `largest` was dropped."""
@@ -31,7 +31,7 @@ def with_largest(
     return quats
 
 
-def without_largest(
+def drop_largest(
     quats: Float[ndarray, "n 4"],
 ) -> tuple[Integer[ndarray, "n"], Float[ndarray, "n 3"]]:
     """Drop the largest component, made positive; return its number and the other three."""

@@ -1,6 +1,6 @@
 """Pruned Gaussians, stored with their row numbers in the input scene.
 
-`removed.ply` is a 3DGS .ply with a further element `place` that has one property `uint row`.
+`pruned_mask.ply` is a 3DGS .ply with a further element `place` that has one property `uint row`.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.files import replacing
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import replace_file
 from gscompleter.io.ply import load_ply, read_header, save_ply
-from gscompleter.splats.layout import given_layout, write_layout
+from gscompleter.splats.layout import find_layout, write_layout
 from gscompleter.types import Gaussians, merge
 
-NAME = "removed.ply"
+REMOVED_FILE = "removed.ply"
 """Name of the file, beside the completed scene."""
 
 
@@ -37,17 +37,17 @@ def save_removed(
     of
     `given` that the scene has; None for all.
     """
-    layout = given_layout(given)
+    layout = find_layout(given)
     with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / NAME
+        plain = Path(folder) / REMOVED_FILE
         if layout is None:
             save_ply(plain, removed)
         else:
             all_rows = layout.rows if kept is None else layout.rows[kept.numpy()]
-            write_layout(plain, replace(layout, rows=all_rows[rows.numpy()], behind=b""))
+            write_layout(plain, replace(layout, rows=all_rows[rows.numpy()], trailer=b""))
         head, end, vertices = plain.read_bytes().partition(b"end_header\n")
     place = f"element place {len(rows)}\nproperty uint row\n".encode()
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(head + place + end + vertices)
         file.write(rows.numpy().astype("<u4").tobytes())
 
@@ -60,29 +60,31 @@ def load_removed(path: Path) -> tuple[Gaussians, Int[Tensor, "n"]]:
         layout = [(e.name, e.count, [(p.name, p.kind) for p in e.properties]) for e in others]
         if layout != [("place", len(removed), [("row", "u4")])]:
             raise InputError(
-                f"{quoted(path)} does not say where its Gaussians belong in the scene; without it "
+                f"{quote_value(path)} does not say where its Gaussians belong in the scene; "
+                "without it "
                 "they cannot be put back in order."
             )
         file.seek(vertex.count * vertex.dtype("<").itemsize, 1)
         rows = np.frombuffer(file.read(), "<u4")
     if len(rows) != len(removed) or (np.diff(rows.astype(np.int64)) <= 0).any():
         raise InputError(
-            f"{quoted(path)} is damaged: its rows do not ascend; fetch the file again."
+            f"{quote_value(path)} is damaged: its rows do not ascend; fetch the file again."
         )
     return removed, torch.from_numpy(rows.astype(np.int64))
 
 
-def put_back(kept: Gaussians, removed: Gaussians, rows: Int[Tensor, "n"], path: Path) -> Gaussians:
+def reinsert(kept: Gaussians, removed: Gaussians, rows: Int[Tensor, "n"], path: Path) -> Gaussians:
     """Insert pruned Gaussians at their rows; `path` names their file in errors."""
     total = len(kept) + len(removed)
     if len(rows) and int(rows.max()) >= total:
         raise InputError(
-            f"{quoted(path)} belongs to another scene: it names row {int(rows.max()):,} of one "
+            f"{quote_value(path)} belongs to another scene: it names row {int(rows.max()):,} of "
+            "one "
             f"that has {total:,} Gaussians."
         )
     if kept.is_antialiased != removed.is_antialiased:
         raise InputError(
-            f"{quoted(path)} belongs to another scene: only one of the two is antialiased."
+            f"{quote_value(path)} belongs to another scene: only one of the two is antialiased."
         )
     taken: Bool[Tensor, "n"] = torch.zeros(total, dtype=torch.bool)
     taken[rows] = True

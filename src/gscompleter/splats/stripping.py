@@ -5,11 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 from gscompleter.io.ply import save_ply
-from gscompleter.splats.formats import format_of, load_splat, save_splat, writable_format
-from gscompleter.splats.layout import Layout, read_layout, unlabelled, with_rows, write_layout
-from gscompleter.splats.removed import NAME, load_removed, put_back
+from gscompleter.splats.formats import (
+    detect_splat_format,
+    get_writable_format,
+    load_splat,
+    save_splat,
+)
+from gscompleter.splats.layout import (
+    PlyLayout,
+    drop_generated,
+    insert_rows,
+    read_layout,
+    write_layout,
+)
+from gscompleter.splats.removed import REMOVED_FILE, load_removed, reinsert
 from gscompleter.types import Gaussians
 
 
@@ -24,29 +35,30 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
         InputError: All Gaussians are generated, or a file cannot be read or written.
     """
     completed = load_splat(path)
-    given = as_given(completed, path)
-    layout = file_as_given(path, given)
-    if layout is not None and writable_format(out).write is save_ply:
+    given = restore_input(completed, path)
+    layout = restore_layout(path, given)
+    if layout is not None and get_writable_format(out).write is save_ply:
         write_layout(out, layout)
     else:
         save_splat(out, given)
     return len(given), int((completed.generated > 0).sum())
 
 
-def as_given(completed: Gaussians, path: Path) -> Gaussians:
+def restore_input(completed: Gaussians, path: Path) -> Gaussians:
     """Restore the input Gaussians of the completed scene at `path`, in their order."""
-    given = without_padding(completed)
-    place = path.parent / NAME
+    given = drop_sh_padding(completed)
+    place = path.parent / REMOVED_FILE
     if place.is_file():
-        given = put_back(given, *load_removed(place), place)
+        given = reinsert(given, *load_removed(place), place)
     if len(given) == 0:
         raise InputError(
-            f"{quoted(path)} holds only generated Gaussians: there is no input scene to restore."
+            f"{quote_value(path)} holds only generated Gaussians: there is no input scene to "
+            "restore."
         )
     return given
 
 
-def without_padding(completed: Gaussians) -> Gaussians:
+def drop_sh_padding(completed: Gaussians) -> Gaussians:
     """Select the observed Gaussians, without the SH padding of a scene of lower degree."""
     observed = completed[completed.generated == 0]
     generated = completed[completed.generated > 0]
@@ -58,15 +70,15 @@ def without_padding(completed: Gaussians) -> Gaussians:
     return replace(observed, sh=observed.sh[:, :k].contiguous())
 
 
-def file_as_given(path: Path, given: Gaussians) -> Layout | None:
+def restore_layout(path: Path, given: Gaussians) -> PlyLayout | None:
     """Remove what completing added to the .ply at `path`; None if its rows cannot be restored."""
-    layout = read_layout(path) if format_of(path) == "ply" else None
+    layout = read_layout(path) if detect_splat_format(path) == "ply" else None
     if layout is None or layout.num_rest != 3 * (given.sh.shape[1] - 1):
         return None
-    layout, place = unlabelled(layout), path.parent / NAME
+    layout, place = drop_generated(layout), path.parent / REMOVED_FILE
     if not place.is_file():
         return layout
     others = read_layout(place)
     if others is None:
         return None
-    return with_rows(layout, unlabelled(others), load_removed(place)[1])
+    return insert_rows(layout, drop_generated(others), load_removed(place)[1])

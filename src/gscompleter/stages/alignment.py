@@ -13,7 +13,7 @@ from gscompleter.types import DepthAffine, DepthMap, Lift, Render
 
 MAX_TRIALS = 512
 """Two-point hypotheses."""
-AT_ONCE = 32
+HYPOTHESES_PER_BATCH = 32
 """Hypotheses that are scored together, so few that their residuals stay in the cache."""
 MAX_PIXELS = 8192
 """Pixels that hypotheses are scored on; of more, a random sample is used."""
@@ -23,7 +23,7 @@ MIN_INLIERS = 0.3
 """Smallest inlier fraction of a reliable fit."""
 MIN_PIXELS = 64
 """Fewest comparable pixels that a fit needs."""
-MIN_SEEN = 0.01
+MIN_TARGET_COVERAGE = 0.01
 """Fraction of its image that the target must see of the scene to reject an affine."""
 MIN_DEPTH_SPREAD = 0.05
 """Smallest depth spread that separates scale and shift; below, only a scale is fitted."""
@@ -34,25 +34,25 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
 
     The fallback is the median ratio with shift 0, and the identity if nothing can be compared.
     """
-    x, y = compared(predicted, context)
+    x, y = pair_depths(predicted, context)
     if len(x) < MIN_PIXELS:
         return DepthAffine()
     if len(x) > MAX_PIXELS:
         sample = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
         x, y = x[sample], y[sample]
 
-    if depth_spread(x) >= MIN_DEPTH_SPREAD:
-        scale, shift = ransac_line(x, y, rng)
-        inliers = affine_inliers(x, y, scale, shift).double().mean().item()
+    if compute_depth_spread(x) >= MIN_DEPTH_SPREAD:
+        scale, shift = fit_line_ransac(x, y, rng)
+        inliers = find_affine_inliers(x, y, scale, shift).double().mean().item()
         if scale > 0 and inliers >= MIN_INLIERS:
             return DepthAffine(scale, shift, inliers, "ransac")
 
     scale = (y / x).median().item()
-    inliers = affine_inliers(x, y, scale, 0.0).double().mean().item()
+    inliers = find_affine_inliers(x, y, scale, 0.0).double().mean().item()
     return DepthAffine(scale, 0.0, inliers, "median")
 
 
-def compared(
+def pair_depths(
     predicted: DepthMap, context: DepthMap
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
     """Return both z-depths at the pixels where both are valid."""
@@ -60,20 +60,20 @@ def compared(
     return predicted.depth[comparable].double(), context.depth[comparable].double()
 
 
-def depth_spread(depth: Float[Tensor, "n"]) -> float:
+def compute_depth_spread(depth: Float[Tensor, "n"]) -> float:
     """Compute (p95 - p5) / median of depths."""
     low, median, high = depth.quantile(depth.new_tensor([0.05, 0.5, 0.95])).tolist()
     return (high - low) / median
 
 
-def affine_inliers(
+def find_affine_inliers(
     x: Float[Tensor, "n"], y: Float[Tensor, "n"], scale: float, shift: float
 ) -> Bool[Tensor, "n"]:
     """Find pixels with a small residual, relative to `y`."""
     return (scale * x + shift - y).abs() < RESIDUAL_THRESHOLD * y
 
 
-def ransac_line(
+def fit_line_ransac(
     x: Float[Tensor, "n"], y: Float[Tensor, "n"], rng: torch.Generator
 ) -> tuple[float, float]:
     """Fit scale and shift to the most inliers of two-point hypotheses, then refit them.
@@ -88,7 +88,7 @@ def ransac_line(
     counts = torch.cat(
         [
             ((batch @ points).sub_(1).abs_() < RESIDUAL_THRESHOLD).sum(dim=1)
-            for batch in torch.stack([scales, shifts], dim=1).split(AT_ONCE)
+            for batch in torch.stack([scales, shifts], dim=1).split(HYPOTHESES_PER_BATCH)
         ]
     )
     best = counts.where(scales > 0, -1).argmax()
@@ -97,7 +97,7 @@ def ransac_line(
 
     scale, shift = scales[best].item(), shifts[best].item()
     for _ in range(3):
-        agree = affine_inliers(x, y, scale, shift)
+        agree = find_affine_inliers(x, y, scale, shift)
         weight = 1 / y[agree]
         design = torch.stack([x[agree], torch.ones_like(x[agree])], dim=-1) * weight[:, None]
         # Unlike lstsq, the normal equations are solved in closed form on any device.
@@ -110,7 +110,7 @@ def ransac_line(
     return scale, shift
 
 
-def fit_bridge(
+def align_depth(
     lift: Lift,
     at_target: Render,
     at_anchor: Render,
@@ -128,12 +128,12 @@ def fit_bridge(
     if config.align_at == "target":
         return fit_affine(lift.reference_depth, at_target.depth_map(), rng)
     affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng)
-    return unless_contradicted(
+    return refit_at_target(
         affine, lift.reference_depth, at_target.depth_map(), rng, config, reject_below
     )
 
 
-def unless_contradicted(
+def refit_at_target(
     affine: DepthAffine,
     predicted: DepthMap,
     context: DepthMap,
@@ -146,15 +146,15 @@ def unless_contradicted(
     With little overlap or pose drift, Ψ's two depth maps differ in scale. If no fit at the target
     is better, the paper's choice stays, and is rejected if hardly any depth agrees.
     """
-    x, y = compared(predicted, context)
+    x, y = pair_depths(predicted, context)
     if config.min_agreement is None or len(x) < MIN_PIXELS:
         return affine
-    agree = affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
+    agree = find_affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
     affine = replace(affine, agreement=agree)
     if agree >= config.min_agreement:
         return affine
     refitted = fit_affine(predicted, context, rng)
     if refitted.inliers >= max(MIN_INLIERS, 2 * agree):
-        return replace(refitted, agreement=refitted.inliers, contradicted=True)
-    enough = len(x) >= MIN_SEEN * context.depth.numel()
-    return replace(affine, refuted=enough and agree < (reject_below or 0.0))
+        return replace(refitted, agreement=refitted.inliers, is_refitted_at_target=True)
+    enough = len(x) >= MIN_TARGET_COVERAGE * context.depth.numel()
+    return replace(affine, is_rejected=enough and agree < (reject_below or 0.0))

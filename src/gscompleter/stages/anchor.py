@@ -10,10 +10,16 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.config import AnchorConfig
-from gscompleter.generators import Generator, ImageFunction, Request, Synthesis, as_generator
-from gscompleter.geometry import baseline_between, inside, project, rotation_between
-from gscompleter.reconstructors import Reconstructor, reconstructed
-from gscompleter.types import Camera, Lift, SceneContext, View
+from gscompleter.generators import (
+    Generator,
+    GeneratorOutput,
+    GeneratorRequest,
+    ImageFunction,
+    as_generator,
+)
+from gscompleter.geometry import is_inside, measure_baseline, measure_rotation, project
+from gscompleter.reconstructors import Reconstructor, run_reconstructor
+from gscompleter.types import Camera, GeneratorInput, Lift, View
 
 
 @dataclass(frozen=True)
@@ -25,12 +31,12 @@ class AnchorChoice:
     """True if every view exceeded the rotation limit, so that the smallest rotation won."""
 
 
-def nearest_view(target: Camera, views: Sequence[View]) -> int:
+def find_nearest_view(target: Camera, views: Sequence[View]) -> int:
     """Return the index of the view closest to `target`; a tie goes to the smaller rotation."""
 
     def remoteness(index: int) -> tuple[float, float]:
         camera = views[index].camera
-        return baseline_between(target, camera), rotation_between(target, camera)
+        return measure_baseline(target, camera), measure_rotation(target, camera)
 
     return min(range(len(views)), key=remoteness)
 
@@ -51,10 +57,10 @@ def select_anchor(
     if not views:
         raise ValueError("select_anchor needs at least one observed view, got none")
     if config.selection == "nearest":
-        return AnchorChoice(nearest_view(target, views), fallback=False)
+        return AnchorChoice(find_nearest_view(target, views), fallback=False)
 
-    rotations = [rotation_between(target, view.camera) for view in views]
-    baselines = [baseline_between(target, view.camera) for view in views]
+    rotations = [measure_rotation(target, view.camera) for view in views]
+    baselines = [measure_baseline(target, view.camera) for view in views]
     least = config.min_baseline * max(baselines)
     possible = [i for i in range(len(views)) if baselines[i] >= least]
     overlapping = [i for i in possible if rotations[i] < config.max_rotation]
@@ -69,61 +75,63 @@ def select_anchor(
 
 
 @dataclass(frozen=True)
-class Synthesized(View):
+class GeneratedView(View):
     """The image synthesized at the target, with the notes of its generator."""
 
     notes: tuple[str, ...] = ()
     """One sentence each, for the results."""
-    disagrees: bool = False
+    is_inconsistent: bool = False
     """True if the image is photometrically inconsistent with the photographs."""
 
 
 def synthesize(
-    generator: Generator | ImageFunction, target: Camera, context: SceneContext
-) -> Synthesized:
+    generator: Generator | ImageFunction, target: Camera, context: GeneratorInput
+) -> GeneratedView:
     """Synthesize `Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 6)."""
     return synthesize_all(generator, [(target, context)])[0]
 
 
 def synthesize_all(
-    generator: Generator | ImageFunction, asked: Sequence[tuple[Camera, SceneContext]]
-) -> list[Synthesized]:
+    generator: Generator | ImageFunction, inputs: Sequence[tuple[Camera, GeneratorInput]]
+) -> list[GeneratedView]:
     """Synthesize the images of several targets in one call of Φ."""
     requests = [
-        Request(context.views[nearest_view(target, context.views)], target, context)
-        for target, context in asked
+        GeneratorRequest(context.views[find_nearest_view(target, context.views)], target, context)
+        for target, context in inputs
     ]
     outputs = as_generator(generator).synthesize(requests)
-    return [as_view(output, r.target) for output, r in zip(outputs, requests, strict=True)]
+    return [convert_output(output, r.target) for output, r in zip(outputs, requests, strict=True)]
 
 
-def as_view(answer: Synthesis, target: Camera) -> Synthesized:
+def convert_output(output: GeneratorOutput, target: Camera) -> GeneratedView:
     """Convert the output of a generator to a view, after checking its size and values."""
     expected = (target.height, target.width, 3)
-    if tuple(answer.image.shape) != expected or not torch.isfinite(answer.image).all():
+    if tuple(output.image.shape) != expected or not torch.isfinite(output.image).all():
         raise ValueError(
             f"the generator must return a finite image of shape {expected}, "
-            f"got {tuple(answer.image.shape)}"
+            f"got {tuple(output.image.shape)}"
         )
-    return Synthesized(answer.image, target, notes=answer.notes, disagrees=answer.disagrees)
+    return GeneratedView(
+        output.image, target, notes=output.notes, is_inconsistent=output.is_inconsistent
+    )
 
 
 def lift(
     reconstructor: Reconstructor,
     reference: View,
     anchor: View,
-    wanted: Bool[Tensor, "h w"] | None = None,
+    pixel_mask: Bool[Tensor, "h w"] | None = None,
 ) -> Lift:
     """Lift `Ψ((Ĩ_t, P_t), (I_s, P_s))` and keep the target's Gaussians (paper, Eq. 7).
 
     These are all that the target sees if Ψ is not pixel-aligned, else those inside `pixel_mask`.
     """
-    pair = reconstructed(reconstructor, [reference, anchor], wanted)
+    pair = run_reconstructor(reconstructor, [reference, anchor], pixel_mask)
     reference_depth, anchor_depth = pair.depths
     if pair.view_index is None or pair.pixel_index is None:
-        seen = inside(*project(pair.gaussians.means, reference.camera), reference.camera)
+        seen = is_inside(*project(pair.gaussians.means, reference.camera), reference.camera)
         return Lift(pair.gaussians[seen], reference_depth, anchor_depth, None)
     own = pair.view_index == 0
-    if wanted is not None:
-        own &= wanted.flatten()[pair.pixel_index.where(own, 0)]
+    if pixel_mask is not None:
+        own &= pixel_mask.flatten()[pair.pixel_index.where(own, 0)]
     return Lift(pair.gaussians[own], reference_depth, anchor_depth, pair.pixel_index[own])

@@ -15,12 +15,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter.config import NextBestViewConfig
-from gscompleter.geometry import project, rotation_about
+from gscompleter.geometry import axis_angle_to_matrix, project
 from gscompleter.types import Camera, Render
 
-MARGIN = 0.1
+FREE_SPACE_MARGIN = 0.1
 """Distance in front of a surface, relative to depth, from which a point is in free space."""
-MIN_SEEN = 0.05
+MIN_COVERAGE = 0.05
 """Fraction of its image that must show the scene for a camera to have a known depth."""
 
 
@@ -35,7 +35,7 @@ class Candidate:
     """5 % quantile of the z-depths that this camera sees, in scene units."""
 
 
-def candidates(
+def propose_candidates(
     bases: Sequence[Camera],
     renders: Sequence[Render],
     step: float,
@@ -45,20 +45,20 @@ def candidates(
 
     `renders` show the scene at `bases`. `step` is the longest move in scene units, 0 if unknown.
     """
-    depths, nearest = depths_at(renders, 0.5), depths_at(renders, 0.05)
-    up = upward(bases)
+    depths, nearest = compute_depth_quantiles(renders, 0.5), compute_depth_quantiles(renders, 0.05)
+    up = estimate_up(bases)
     found = []
     for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
         longest = config.max_step * depth
-        away = moves(
+        away = make_moves(
             base, depth, min(step, longest) if step > 0 else longest, config.yaw_fraction, up
         )
         found += [Candidate(camera, index, nearest[index]) for camera in away]
-    small = [resized(b, *r.alpha.T.shape) for b, r in zip(bases, renders, strict=True)]
-    return [c for c in found if in_the_open(c.camera.center, small, renders)]
+    small = [resize_camera(b, *r.alpha.T.shape) for b, r in zip(bases, renders, strict=True)]
+    return [c for c in found if is_in_free_space(c.camera.center, small, renders)]
 
 
-def moves(
+def make_moves(
     camera: Camera, depth: float, step: float, turn: float, up: Float[Tensor, "3"]
 ) -> list[Camera]:
     """Make fourteen cameras one move away from `camera`.
@@ -68,31 +68,31 @@ def moves(
     """
     axes = camera.c2w[:3, :3].T
     shifts = [sign * step * axis for axis in axes for sign in (1, -1)]
-    translated = [moved(camera, torch.eye(3).to(up), shift) for shift in shifts]
+    translated = [move_camera(camera, torch.eye(3).to(up), shift) for shift in shifts]
     ahead = camera.center + depth * camera.forward
-    wide, high = opening(camera)
+    wide, high = compute_field_of_view(camera)
     return [
         *translated,
-        *swung(camera, camera.center, (turn * wide, turn * high), up),
-        *swung(camera, ahead, (step / depth, step / depth), up),
+        *orbit_camera(camera, camera.center, (turn * wide, turn * high), up),
+        *orbit_camera(camera, ahead, (step / depth, step / depth), up),
     ]
 
 
-def swung(
+def orbit_camera(
     camera: Camera, pivot: Float[Tensor, "3"], angles: tuple[float, float], up: Float[Tensor, "3"]
 ) -> list[Camera]:
     """Turn a camera about a point by two angles in radians, about `up` and about its x axis."""
     axes = (up, camera.c2w[:3, 0])
     arm = camera.center - pivot
     turns = [
-        rotation_about(axis, sign * angle)
+        axis_angle_to_matrix(axis, sign * angle)
         for axis, angle in zip(axes, angles, strict=True)
         for sign in (1, -1)
     ]
-    return [moved(camera, turn, turn @ arm - arm) for turn in turns]
+    return [move_camera(camera, turn, turn @ arm - arm) for turn in turns]
 
 
-def moved(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]) -> Camera:
+def move_camera(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]) -> Camera:
     """Rotate a camera in world axes and shift its centre."""
     c2w = camera.c2w.clone()
     c2w[:3, :3] = turn @ camera.c2w[:3, :3]
@@ -100,21 +100,21 @@ def moved(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"])
     return replace(camera, c2w=c2w)
 
 
-def opening(camera: Camera) -> tuple[float, float]:
+def compute_field_of_view(camera: Camera) -> tuple[float, float]:
     """Compute the horizontal and vertical field of view in radians."""
     half = torch.tensor([camera.width, camera.height]) / 2 / camera.K.diagonal()[:2].cpu()
     wide, high = (2 * torch.atan(half)).tolist()
     return wide, high
 
 
-def upward(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
+def estimate_up(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
     """Estimate the unit up direction that most images share."""
     ups = torch.stack([-camera.c2w[:3, 1] for camera in cameras])
     likeness = (ups @ ups.T).sum(dim=1)
     return normalize(ups[(ups @ ups[likeness.argmax()]) > 0].mean(dim=0), dim=0)
 
 
-def in_the_open(
+def is_in_free_space(
     point: Float[Tensor, "3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> bool:
     """Return True if a photograph sees through a point, or if none shows an occluder."""
@@ -127,7 +127,7 @@ def in_the_open(
         surface = render.depth_map()
         if not surface.valid[y, x]:
             continue
-        if z < (1 - MARGIN) * surface.depth[y, x]:
+        if z < (1 - FREE_SPACE_MARGIN) * surface.depth[y, x]:
             return True
         hidden = True
     return not hidden
@@ -140,7 +140,7 @@ def is_close(render: Render, nearest: float, config: NextBestViewConfig) -> bool
     return near.float().mean().item() > config.max_close
 
 
-def depths_at(renders: Sequence[Render], share: float) -> list[float]:
+def compute_depth_quantiles(renders: Sequence[Render], share: float) -> list[float]:
     """Compute a quantile of the z-depths in each render, in scene units.
 
     A render that shows hardly anything of the scene gets the quantile over all renders.
@@ -153,25 +153,27 @@ def depths_at(renders: Sequence[Render], share: float) -> list[float]:
     if sum(len(values) for values in own) == 0:
         raise ValueError("no camera sees the scene, so its distance is unknown")
     usual = torch.cat(own).quantile(share).item()
-    known = [where.float().mean().item() >= MIN_SEEN for where in valid]
+    known = [where.float().mean().item() >= MIN_COVERAGE for where in valid]
     return [v.quantile(share).item() if k else usual for v, k in zip(own, known, strict=True)]
 
 
-def shrunk(camera: Camera, side: int) -> Camera:
+def shrink_camera(camera: Camera, side: int) -> Camera:
     """Reduce the image of a camera to at most `side` pixels on its longer side."""
     factor = min(side / max(camera.width, camera.height), 1.0)
-    return resized(camera, *(max(round(factor * n), 1) for n in (camera.width, camera.height)))
+    return resize_camera(
+        camera, *(max(round(factor * n), 1) for n in (camera.width, camera.height))
+    )
 
 
-def resized(camera: Camera, width: int, height: int) -> Camera:
+def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     """Change the image size of a camera, in pixels."""
     scale = torch.tensor([width / camera.width, height / camera.height, 1.0]).to(camera.K)
     return replace(camera, K=scale[:, None] * camera.K, width=width, height=height)
 
 
-def spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
+def select_spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
     """Select up to `count` cameras that are far apart (farthest point sampling); return indices."""
-    where = places(cameras)
+    where = embed_cameras(cameras)
     chosen = [0]
     apart = (where - where[0]).norm(dim=1)
     while len(chosen) < min(count, len(cameras)):
@@ -181,14 +183,14 @@ def spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
     return chosen
 
 
-def places(cameras: Sequence[Camera]) -> Float[Tensor, "n 6"]:
+def embed_cameras(cameras: Sequence[Camera]) -> Float[Tensor, "n 6"]:
     """Embed cameras as centres, relative to their extent, and viewing directions."""
     centers = torch.stack([camera.center for camera in cameras])
     extent = (centers - centers.mean(dim=0)).norm(dim=1).max().clamp_min(1e-30)
     return torch.cat([centers / extent, torch.stack([c.forward for c in cameras])], dim=1)
 
 
-def spacing(cameras: Sequence[Camera]) -> float:
+def compute_spacing(cameras: Sequence[Camera]) -> float:
     """Compute the median distance to the nearest other camera, in scene units."""
     centers = torch.stack([camera.center for camera in cameras]).double()
     apart = (centers[:, None] - centers).norm(dim=-1)

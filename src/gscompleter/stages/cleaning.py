@@ -19,19 +19,19 @@ from torch.nn.functional import avg_pool2d
 
 from gscompleter.config.cleaning import CleaningConfig
 from gscompleter.progress import track
-from gscompleter.render import OpacityRender, Renderer, image_of
-from gscompleter.stages.harm import error_slope, error_with_loss
-from gscompleter.stages.setting_aside import error_of, without_needed
-from gscompleter.stages.support import weight_sums
+from gscompleter.render import OpacityRender, Renderer, restrict_to_image
+from gscompleter.stages.harm import add_psnr_loss, compute_mse_and_gradient
+from gscompleter.stages.setting_aside import compute_scene_error, exclude_needed
+from gscompleter.stages.support import sum_weights
 from gscompleter.types import Gaussians, View
 
-FADED = 0.02
+FADED_OPACITY = 0.02
 """Largest opacity of a faded Gaussian; at zero it would have no gradient."""
-LEAST = 1e-12
+MIN_ERROR = 1e-12
 """Smallest mean squared error that fractions refer to."""
 
 
-def superfluous(
+def find_superfluous(
     scene: Gaussians,
     views: Sequence[View],
     renderer: Renderer,
@@ -39,17 +39,18 @@ def superfluous(
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians that can be removed together; generated and unobserved ones stay."""
     removable = torch.zeros_like(scene.generated, dtype=torch.bool)
-    removable = unwanted(scene, removable, views, renderer, config) & (scene.generated == 0)
-    removable = unwanted(scene, removable, views, renderer, config) & removable
-    checks = [*views, *map(halved, views)]
+    removable = find_removable(scene, removable, views, renderer, config) & (scene.generated == 0)
+    removable = find_removable(scene, removable, views, renderer, config) & removable
+    checks = [*views, *map(halve_view, views)]
     allowed = [
-        error_with_loss(error_of(scene, view, renderer).item(), config.tolerance) for view in checks
+        add_psnr_loss(compute_scene_error(scene, view, renderer).item(), config.tolerance)
+        for view in checks
     ]
-    removed = without_needed(scene, removable, checks, allowed, renderer)
-    return guarded(scene, removed, checks, allowed, renderer)
+    removed = exclude_needed(scene, removable, checks, allowed, renderer)
+    return keep_needed(scene, removed, checks, allowed, renderer)
 
 
-def unwanted(
+def find_removable(
     scene: Gaussians,
     faded: Bool[Tensor, "n"],
     views: Sequence[View],
@@ -61,7 +62,7 @@ def unwanted(
     gained, lost = torch.zeros_like(scene.opacities), torch.zeros_like(scene.opacities)
     equal_share = 0.0
     for view in track(views, "Comparing photographs"):
-        change = change_without(scene, faded, view, renderer, config.probes, generator)
+        change = predict_error_change(scene, faded, view, renderer, config.probes, generator)
         gained += (-change).clamp_min(0)
         lost += change.clamp_min(0)
         equal_share += 1 / max(int((change != 0).sum()), 1) / len(views)
@@ -69,7 +70,7 @@ def unwanted(
     return shown & (lost < gained / config.min_ratio + config.idle * equal_share)
 
 
-def change_without(
+def predict_error_change(
     scene: Gaussians,
     faded: Bool[Tensor, "n"],
     view: View,
@@ -78,16 +79,16 @@ def change_without(
     generator: torch.Generator,
 ) -> Float[Tensor, "n"]:
     """Predict the relative change of a photograph's squared error without each Gaussian."""
-    plan = renderer.freeze(scene[:0], view.camera).plan(scene)
+    plan = renderer.freeze(scene[:0], view.camera).vary_opacities(scene)
     full = scene.opacities
-    left = torch.where(faded, full.clamp_max(FADED), full)
-    error, gradient = error_slope(image_of(plan), view, left)
-    square = mean_squares(plan, left, probes, generator)
+    left = torch.where(faded, full.clamp_max(FADED_OPACITY), full)
+    error, gradient = compute_mse_and_gradient(restrict_to_image(plan), view, left)
+    square = estimate_squared_gradient(plan, left, probes, generator)
     # Difference of the parabola between zero and full opacity, expanded at `left`.
-    return (square * (left**2 - (full - left) ** 2) - gradient * full) / max(error, LEAST)
+    return (square * (left**2 - (full - left) ** 2) - gradient * full) / max(error, MIN_ERROR)
 
 
-def mean_squares(
+def estimate_squared_gradient(
     plan: OpacityRender,
     opacities: Float[Tensor, "n"],
     probes: int,
@@ -108,11 +109,11 @@ def mean_squares(
     return squares / probes / image.numel()
 
 
-def guarded(
+def keep_needed(
     scene: Gaussians,
-    taken: Bool[Tensor, "n"],
+    removed: Bool[Tensor, "n"],
     views: Sequence[View],
-    allowed: Sequence[float],
+    max_errors: Sequence[float],
     renderer: Renderer,
 ) -> Bool[Tensor, "n"]:
     """Keep Gaussians visible in photographs that exceed their error limit without them.
@@ -120,17 +121,17 @@ def guarded(
     This repeats until every photograph is within its limit.
     """
     before = None
-    while before is None or not torch.equal(taken, before):
-        before = taken
-        for view, error in zip(views, allowed, strict=True):
-            if error_of(scene[~taken], view, renderer).item() > error:
-                taken = taken & ~(weight_sums(renderer.freeze(scene, view.camera)) > 0)
-    return taken
+    while before is None or not torch.equal(removed, before):
+        before = removed
+        for view, error in zip(views, max_errors, strict=True):
+            if compute_scene_error(scene[~removed], view, renderer).item() > error:
+                removed = removed & ~(sum_weights(renderer.freeze(scene, view.camera)) > 0)
+    return removed
 
 
-def halved(view: View) -> View:
+def halve_view(view: View) -> View:
     """Reduce a photograph to half its size."""
     image = avg_pool2d(view.image.permute(2, 0, 1), 2).permute(1, 2, 0)
     K = view.camera.K * view.camera.K.new_tensor([[0.5], [0.5], [1.0]])
     camera = replace(view.camera, K=K, height=image.shape[0], width=image.shape[1])
-    return replace(view, image=image, camera=camera, depth=None, ignored=None)
+    return replace(view, image=image, camera=camera, depth=None, ignore_mask=None)

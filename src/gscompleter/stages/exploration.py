@@ -14,31 +14,31 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.config import NextBestViewConfig
-from gscompleter.frames.thinning import thinned, thinning
+from gscompleter.frames.thinning import choose_thinned_rows, thin_gaussians
 from gscompleter.geometry import (
-    baseline_between,
-    inside,
+    is_inside,
+    measure_baseline,
+    measure_rotation,
     project,
-    rotation_between,
     sample,
     unproject,
 )
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.masks import dilate
-from gscompleter.stages.candidates import Candidate, opening
+from gscompleter.stages.candidates import Candidate, compute_field_of_view
 from gscompleter.types import (
     Camera,
     Completion,
-    Evidence,
     Gaussians,
+    PhotoObservations,
     Render,
+    make_observed,
     merge,
-    observed,
 )
 
 MAX_GAUSSIANS = 25_000
 """Gaussians of a simplified scene: several per pixel of the small images."""
-SAME_DEPTH = 0.1
+SURFACE_TOLERANCE = 0.1
 """Tolerated distance behind the anchor's depth map, relative to depth, for the same surface."""
 
 
@@ -47,7 +47,7 @@ class Choice:
     """A candidate with its score."""
 
     candidate: Candidate
-    hole: float
+    hole_fraction: float
     """Fraction of its image in holes."""
     gain: float
     """Expected gain, as a fraction of its image."""
@@ -58,7 +58,7 @@ class Choice:
         return self.candidate.camera
 
 
-def gain(
+def compute_gain(
     holes: Bool[Tensor, "h w"], overlap: float, config: NextBestViewConfig = NextBestViewConfig()
 ) -> float:
     """Compute the gain of completing an image, as a fraction of the image.
@@ -70,7 +70,7 @@ def gain(
     return bordering.float().mean().item() * overlap
 
 
-def overlap_of(camera: Camera, render: Render, anchor: Camera, at_anchor: Render) -> float:
+def compute_overlap(camera: Camera, render: Render, anchor: Camera, at_anchor: Render) -> float:
     """Compute the fraction of visible surfaces that the anchor sees, too; 0 if there are none."""
     seen = render.depth_map()
     points = unproject(seen.depth, camera)[seen.valid]
@@ -78,10 +78,15 @@ def overlap_of(camera: Camera, render: Render, anchor: Camera, at_anchor: Render
         return 0.0
     pixels, z = project(points, anchor)
     surface = sample(at_anchor.depth[..., None], pixels)[:, 0]
-    return (inside(pixels, z, anchor) & (z < (1 + SAME_DEPTH) * surface)).float().mean().item()
+    return (
+        (is_inside(pixels, z, anchor) & (z < (1 + SURFACE_TOLERANCE) * surface))
+        .float()
+        .mean()
+        .item()
+    )
 
 
-def best(
+def choose_best(
     choices: Sequence[Choice],
     photographs: Sequence[Camera],
     step: float,
@@ -94,29 +99,29 @@ def best(
     good = [choice for choice in choices if choice.gain >= config.enough * most]
 
     def order(choice: Choice) -> tuple[int, float]:
-        return round(remoteness(choice.camera, photographs, step)), -choice.gain
+        return round(compute_remoteness(choice.camera, photographs, step)), -choice.gain
 
     return min(good, key=order)
 
 
-def remoteness(camera: Camera, photographs: Sequence[Camera], step: float) -> float:
+def compute_remoteness(camera: Camera, photographs: Sequence[Camera], step: float) -> float:
     """Compute the distance to the nearest photograph in steps; a quarter field of view is one."""
-    quarter = torch.rad2deg(torch.tensor(min(opening(camera)) / 4)).item()
+    quarter = torch.rad2deg(torch.tensor(min(compute_field_of_view(camera)) / 4)).item()
     return min(
-        baseline_between(camera, other) / max(step, 1e-30)
-        + rotation_between(camera, other) / quarter
+        measure_baseline(camera, other) / max(step, 1e-30)
+        + measure_rotation(camera, other) / quarter
         for other in photographs
     )
 
 
-def stand_ins(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gaussians:
+def make_placeholders(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gaussians:
     """Make grey Gaussians that close holes at the smoothly extrapolated depth around them."""
     seen = render.depth_map()
     depth = fill_smoothly(seen.depth, seen.valid & ~holes)
     means = unproject(depth, camera)[holes]
     size = (0.7 * depth / camera.K[0, 0])[holes]
     quats = torch.eye(4).to(means)[:1].repeat(len(means), 1)
-    return observed(
+    return make_observed(
         means,
         quats,
         size[:, None].repeat(1, 3),
@@ -125,23 +130,23 @@ def stand_ins(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gau
     )
 
 
-def miniature(completion: Completion, most: int = MAX_GAUSSIANS) -> Completion:
+def simplify_completion(completion: Completion, most: int = MAX_GAUSSIANS) -> Completion:
     """Simplify a completion for small images, with its photo observations."""
-    context, observations = completion.drawn_context, completion.evidence
-    pruned = completion.set_aside
-    rows, growth = thinning(context, most)
-    context = thinned(context, most)
-    observations = None if observations is None else thinned_evidence(observations, rows, growth)
+    context, observations = completion.rendered_context, completion.observations
+    pruned = completion.pruned
+    rows, growth = choose_thinned_rows(context, most)
+    context = thin_gaussians(context, most)
+    observations = None if observations is None else thin_observations(observations, rows, growth)
     pruned = None if pruned is None else pruned[rows]
     kept = context if pruned is None else context[~pruned]
-    rendered = merge([kept, thinned(completion.added, most)])
-    completion = replace(completion, proxy=None, evidence=observations, set_aside=pruned)
-    return replace(completion, drawn=rendered, context=context)
+    rendered = merge([kept, thin_gaussians(completion.added, most)])
+    completion = replace(completion, proxy=None, observations=observations, pruned=pruned)
+    return replace(completion, rendered_scene=rendered, context=context)
 
 
-def thinned_evidence(
-    evidence: Evidence, rows: Int64[Tensor, "r"], growth: Float[Tensor, "r"]
-) -> Evidence:
+def thin_observations(
+    observations: PhotoObservations, rows: Int64[Tensor, "r"], growth: Float[Tensor, "r"]
+) -> PhotoObservations:
     """Keep observations of some Gaussians, whose sizes grow by a factor."""
-    areas, agreement = evidence.areas[:, rows] * growth**2, evidence.agreement[:, rows]
-    return Evidence(evidence.means[rows], evidence.centers, areas, agreement)
+    areas, agreement = observations.areas[:, rows] * growth**2, observations.agreement[:, rows]
+    return PhotoObservations(observations.means[rows], observations.centers, areas, agreement)

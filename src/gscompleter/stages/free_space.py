@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import FreeSpaceConfig
-from gscompleter.geometry import project, slide, z_depths
-from gscompleter.sky import shows_sky, sky_depth
+from gscompleter.geometry import compute_z_depths, project, slide
+from gscompleter.sky import compute_sky_depth, is_sky_visible
 from gscompleter.types import Camera, Gaussians, Render
 
-STEP = 0.04
+SLIDE_STEP = 0.04
 """Step of a Gaussian along its ray, relative to its distance."""
 CLEARANCE = 0.01
 """Distance behind an observed surface, relative to depth, that counts as occluded.
@@ -47,15 +47,19 @@ def respect_free_space(
     waiting = torch.arange(len(gaussians), device=ratio.device)
     for step in range(config.num_steps):
         means = target.center + ratio[waiting, None] * offsets[waiting]
-        waiting = waiting[seen_through(means, cameras, renders)]
+        waiting = waiting[find_in_free_space(means, cameras, renders)]
         if len(waiting) == 0:
             break
-        ratio[waiting] = (1 + STEP) ** (step + 1)
-    if any(shows_sky(render, camera) for render, camera in zip(renders, cameras, strict=True)):
+        ratio[waiting] = (1 + SLIDE_STEP) ** (step + 1)
+    if any(is_sky_visible(render, camera) for render, camera in zip(renders, cameras, strict=True)):
         # Gaussians that find no position up to the sky become part of the sky.
-        behind = (1 + STEP) * sky_depth(target) / z_depths(gaussians.means[waiting], target)
+        behind = (
+            (1 + SLIDE_STEP)
+            * compute_sky_depth(target)
+            / compute_z_depths(gaussians.means[waiting], target)
+        )
         means = target.center + behind[:, None] * offsets[waiting]
-        found = ~seen_through(means, cameras, renders)
+        found = ~find_in_free_space(means, cameras, renders)
         ratio[waiting[found]] = behind[found]
         waiting = waiting[~found]
     placed = torch.ones_like(ratio, dtype=torch.bool)
@@ -63,7 +67,7 @@ def respect_free_space(
     return slide(gaussians, target, ratio, footprint), placed
 
 
-def seen_through(
+def find_in_free_space(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> Bool[Tensor, "n"]:
     """Find points in front of an observed surface, or inside the near distance of a camera."""

@@ -14,23 +14,23 @@ from torch.nn.functional import pad
 
 from gscompleter.config import PsnrGuardConfig
 from gscompleter.masks import dilate
-from gscompleter.render import FrozenView, OpacityImage, image_of
+from gscompleter.render import FrozenScene, OpacityImage, restrict_to_image
 from gscompleter.ssim import RADIUS, ssim_map
-from gscompleter.stages.integration import falling_on
-from gscompleter.threads import torch_on_one_thread
+from gscompleter.stages.integration import project_mask
+from gscompleter.threads import use_one_torch_thread
 from gscompleter.types import ErrorBudget, Gaussians, View
 
-HALVINGS = 16
+NUM_HALVINGS = 16
 """Rounds of halving opacities before Gaussians at the worst pixels are removed."""
-REMOVALS = 12
+NUM_REMOVALS = 12
 """Rounds of removal before a photograph loses all generated Gaussians that it sees."""
-ROUNDING = 1e-4
+MIN_PSNR_LOSS = 1e-4
 """Smallest tolerated loss of PSNR in dB, for rounding."""
-REACH = 2
+PIXEL_RADIUS = 2
 """Radius around the worst pixels within which Gaussians are removed, in pixels."""
 
 
-def error_budgets(
+def set_error_budgets(
     photograph: View,
     image: Float[Tensor, "h w 3"],
     holes: Bool[Tensor, "h w"],
@@ -52,12 +52,12 @@ def error_budgets(
     """
 
     def budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
-        error = errors(image.clamp(0, 1), ErrorBudget(view, metric, 0.0)).sum().item()
+        error = compute_pixel_errors(image.clamp(0, 1), ErrorBudget(view, metric, 0.0)).sum().item()
         if metric == "mse":
-            return ErrorBudget(view, metric, error_with_loss(error, max(tolerance, ROUNDING)))
+            return ErrorBudget(view, metric, add_psnr_loss(error, max(tolerance, MIN_PSNR_LOSS)))
         return ErrorBudget(view, metric, error + ssim_tolerance)
 
-    budgets = [budget(replace(photograph, ignored=holes | ~photograph.counted), "mse")]
+    budgets = [budget(replace(photograph, ignore_mask=holes | ~photograph.valid_mask), "mse")]
     if holes.any():
         budgets.append(budget(photograph, "mse"))
     if min(photograph.image.shape[:2]) > 2 * RADIUS:
@@ -65,24 +65,26 @@ def error_budgets(
     return tuple(budgets)
 
 
-def errors(image: Float[Tensor, "h w 3"], budget: ErrorBudget) -> Float[Tensor, "h w"]:
+def compute_pixel_errors(
+    image: Float[Tensor, "h w 3"], budget: ErrorBudget
+) -> Float[Tensor, "h w"]:
     """Compute what each pixel adds to the error that a budget limits; differentiable."""
     view = budget.view
-    masked = view.compared(image)
+    masked = view.fill_ignored(image)
     if budget.metric == "mse":
-        return (masked - view.image).square().mean(dim=-1) / view.counted.numel()
+        return (masked - view.image).square().mean(dim=-1) / view.valid_mask.numel()
     inner = slice(RADIUS, -RADIUS)
     dissimilar = (1 - ssim_map(masked, view.image).mean(dim=(0, 1)))[inner, inner]
     return pad(dissimilar / dissimilar.numel(), (RADIUS,) * 4)
 
 
-@torch_on_one_thread()
-def do_no_harm(
+@use_one_torch_thread()
+def meet_error_budgets(
     added: Gaussians,
-    frozen_views: Sequence[FrozenView],
+    frozen_views: Sequence[FrozenScene],
     budgets: Sequence[Sequence[ErrorBudget]],
     config: PsnrGuardConfig = PsnrGuardConfig(),
-    drawings: Sequence[OpacityImage] | None = None,
+    images: Sequence[OpacityImage] | None = None,
 ) -> Gaussians:
     """Fade added Gaussians until every photograph is within its error budgets.
 
@@ -95,23 +97,23 @@ def do_no_harm(
     """
     if config.max_drop is None or len(added) == 0:
         return added
-    if drawings is None:
-        drawings = [image_of(frozen.plan(added)) for frozen in frozen_views]
-    before = [frozen.context.image for frozen in frozen_views]
-    checks = [Check(*each) for each in zip(budgets, before, drawings, strict=True)]
+    if images is None:
+        images = [restrict_to_image(frozen.vary_opacities(added)) for frozen in frozen_views]
+    before = [frozen.render.image for frozen in frozen_views]
+    checks = [Check(*each) for each in zip(budgets, before, images, strict=True)]
     opacities, active = added.opacities, checks
-    for trial in range(HALVINGS + REMOVALS + 1):
-        worse = those_over(active, opacities)
+    for trial in range(NUM_HALVINGS + NUM_REMOVALS + 1):
+        worse = find_over_budget(active, opacities)
         if not worse and len(active) < len(checks):  # Faded Gaussians may have occluded others.
-            worse = those_over(checks, opacities)
+            worse = find_over_budget(checks, opacities)
         if not worse:
             break
-        lowered = [seen.to_lower(trial, added) for seen in worse]
-        left = 0.5 if trial < HALVINGS else 0.0
+        lowered = [seen.choose_fading(trial, added) for seen in worse]
+        left = 0.5 if trial < NUM_HALVINGS else 0.0
         opacities = torch.where(torch.stack(lowered).any(dim=0), left * opacities, opacities)
-        if is_undone(added.opacities, opacities, config):
+        if is_mostly_faded(added.opacities, opacities, config):
             return added[:0]
-        active = [seen.check for seen in worse] if trial + 1 < HALVINGS else checks
+        active = [seen.check for seen in worse] if trial + 1 < NUM_HALVINGS else checks
     return replace(added, opacities=opacities, encoded=None)
 
 
@@ -120,13 +122,13 @@ class Check:
     """A photograph with its error budgets."""
 
     budgets: Sequence[ErrorBudget]
-    before: Float[Tensor, "h w 3"]
-    draw: OpacityImage
+    image_before: Float[Tensor, "h w 3"]
+    render_image: OpacityImage
     """Differentiable image in the opacities of the added Gaussians."""
 
 
 @dataclass(frozen=True)
-class Drawn:
+class CheckedRender:
     """A photograph's render with given opacities."""
 
     check: Check
@@ -134,54 +136,58 @@ class Drawn:
     image: Float[Tensor, "h w 3"]
 
     @staticmethod
-    def of(check: Check, opacities: Float[Tensor, "n"]) -> Drawn:
+    def from_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:
         """Render the photograph of a check."""
-        return Drawn(check, *drawn_with(check.draw, opacities))
+        return CheckedRender(check, *render_with_gradient(check.render_image, opacities))
 
     @cached_property
-    def broken(self) -> ErrorBudget:
+    def worst_budget(self) -> ErrorBudget:
         """The budget that is exceeded most, relative to its limit."""
-        return max(self.check.budgets, key=lambda one: self.error(one) / max(one.limit, 1e-12))
+        return max(
+            self.check.budgets, key=lambda one: self.compute_error(one) / max(one.limit, 1e-12)
+        )
 
     @cached_property
     def excess(self) -> float:
         """Error above the limit of that budget."""
-        return self.error(self.broken) - self.broken.limit
+        return self.compute_error(self.worst_budget) - self.worst_budget.limit
 
-    def error(self, budget: ErrorBudget) -> float:
+    def compute_error(self, budget: ErrorBudget) -> float:
         """Compute the error that a budget limits."""
-        return errors(self.image.detach().clamp(0, 1), budget).sum().item()
+        return compute_pixel_errors(self.image.detach().clamp(0, 1), budget).sum().item()
 
-    def to_lower(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
+    def choose_fading(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
         """Choose the Gaussians that lose opacity.
 
         SSIM is not linear in opacities, so Gaussians at the worst pixels are chosen from the first
         round on.
         """
-        is_first_order = self.broken.metric == "mse" and trial < HALVINGS
-        if not is_first_order and trial < HALVINGS + REMOVALS:
-            return self.at_worst(added)
-        gradient = gradient_of(self.image, self.broken, self.opacities)
+        is_first_order = self.worst_budget.metric == "mse" and trial < NUM_HALVINGS
+        if not is_first_order and trial < NUM_HALVINGS + NUM_REMOVALS:
+            return self.find_at_worst_pixels(added)
+        gradient = compute_gradient(self.image, self.worst_budget, self.opacities)
         if is_first_order:
-            return fewest(gradient * self.opacities.detach() / 2, self.excess)
+            return select_fewest(gradient * self.opacities.detach() / 2, self.excess)
         return gradient != 0
 
-    def at_worst(self, added: Gaussians) -> Bool[Tensor, "n"]:
+    def find_at_worst_pixels(self, added: Gaussians) -> Bool[Tensor, "n"]:
         """Find Gaussians at the fewest pixels that account for the excess."""
-        images = (self.image.detach(), self.check.before)
-        after, before = (errors(image.clamp(0, 1), self.broken) for image in images)
+        images = (self.image.detach(), self.check.image_before)
+        after, before = (
+            compute_pixel_errors(image.clamp(0, 1), self.worst_budget) for image in images
+        )
         relief = after - before
-        pixels = fewest(relief.flatten(), self.excess).view(relief.shape)
-        return falling_on(dilate(pixels, REACH), added, self.broken.view.camera)
+        pixels = select_fewest(relief.flatten(), self.excess).view(relief.shape)
+        return project_mask(dilate(pixels, PIXEL_RADIUS), added, self.worst_budget.view.camera)
 
 
-def those_over(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[Drawn]:
+def find_over_budget(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[CheckedRender]:
     """Render all photographs and return those over budget."""
-    rendered = (Drawn.of(check, opacities) for check in checks)
+    rendered = (CheckedRender.from_check(check, opacities) for check in checks)
     return [render for render in rendered if render.excess > 0]
 
 
-def is_undone(
+def is_mostly_faded(
     added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: PsnrGuardConfig = PsnrGuardConfig()
 ) -> bool:
     """Return True if added Gaussians lost more than `max_opacity_loss` of their opacity."""
@@ -190,8 +196,8 @@ def is_undone(
     return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_opacity_loss
 
 
-def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
-    """Select the fewest entries whose relief sums to `needed`, or to half of all relief.
+def select_fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
+    """Select the fewest entries whose relief sums to `require_stored`, or to half of all relief.
 
     Relief is a first-order estimate, so the other half is re-evaluated after the change.
     """
@@ -202,38 +208,40 @@ def fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
     return torch.zeros_like(relief, dtype=torch.bool).index_fill(0, taken, True)
 
 
-def error_slope(
-    draw: OpacityImage, view: View, opacities: Float[Tensor, "n"]
+def compute_mse_and_gradient(
+    render_image: OpacityImage, view: View, opacities: Float[Tensor, "n"]
 ) -> tuple[float, Float[Tensor, "n"]]:
     """Compute the squared error against a photograph and its gradient in the opacities."""
-    variable, image = drawn_with(draw, opacities)
-    gradient = gradient_of(image, ErrorBudget(view, "mse", 0.0), variable)
-    return squared_error(view.compared(image.detach()), view.image).item(), gradient
+    variable, image = render_with_gradient(render_image, opacities)
+    gradient = compute_gradient(image, ErrorBudget(view, "mse", 0.0), variable)
+    return compute_squared_error(view.fill_ignored(image.detach()), view.image).item(), gradient
 
 
-def drawn_with(
-    draw: OpacityImage, opacities: Float[Tensor, "n"]
+def render_with_gradient(
+    render_image: OpacityImage, opacities: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "h w 3"]]:
     """Render with opacities as the variable of gradients."""
     with torch.enable_grad():
         variable = opacities.detach().clone().requires_grad_()
-        return variable, draw(variable)
+        return variable, render_image(variable)
 
 
-def gradient_of(
+def compute_gradient(
     image: Float[Tensor, "h w 3"], budget: ErrorBudget, variable: Float[Tensor, "n"]
 ) -> Float[Tensor, "n"]:
     """Differentiate the error that a budget limits."""
     with torch.enable_grad():
-        error = errors(image, budget).sum()
+        error = compute_pixel_errors(image, budget).sum()
     return torch.autograd.grad(error, variable)[0]
 
 
-def squared_error(image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]) -> Tensor:
+def compute_squared_error(
+    image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]
+) -> Tensor:
     """Compute the mean squared error of an image clipped to [0, 1]."""
     return (image.clamp(0, 1) - photograph).square().mean()
 
 
-def error_with_loss(error: float, decibel: float) -> float:
+def add_psnr_loss(error: float, decibel: float) -> float:
     """Compute the mean squared error after a loss of PSNR in dB."""
     return error * 10 ** (decibel / 10)

@@ -11,21 +11,21 @@ from torch import Tensor
 
 from gscompleter.config import HoleConfig, RefineConfig
 from gscompleter.descent import Adam
-from gscompleter.geometry import inside, project
+from gscompleter.geometry import is_inside, project
 from gscompleter.progress import track
 from gscompleter.render import OpacityRender
-from gscompleter.threads import torch_on_one_thread
+from gscompleter.threads import use_one_torch_thread
 from gscompleter.types import Camera, Gaussians, View
 
 
-def hole_mask(
+def compute_hole_mask(
     alpha: Float[Tensor, "h w"], config: HoleConfig = HoleConfig()
 ) -> Bool[Tensor, "h w"]:
     """Return True where alpha is below the threshold, before dilation (paper, Eq. 12)."""
     return alpha < config.max_alpha
 
 
-def keep_in_holes(
+def filter_holes(
     registered: Gaussians,
     pixel_index: Int[Tensor, "n"] | None,
     mask: Bool[Tensor, "h w"],
@@ -34,15 +34,15 @@ def keep_in_holes(
     """Keep Gaussians inside `mask`, by their source pixel if known, otherwise by projection."""
     if pixel_index is not None:
         return registered[mask.flatten()[pixel_index]]
-    return registered[falling_on(mask, registered, target)]
+    return registered[project_mask(mask, registered, target)]
 
 
-def falling_on(
+def project_mask(
     mask: Bool[Tensor, "h w"], gaussians: Gaussians, camera: Camera
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians whose means project into `mask`."""
     pixels, z = project(gaussians.means, camera)
-    seen = inside(pixels, z, camera)
+    seen = is_inside(pixels, z, camera)
     x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
     return seen & mask[y, x]
 
@@ -52,7 +52,7 @@ def has_settled(losses: Sequence[float], min_fall: float) -> bool:
     return len(losses) > 1 and losses[-2] - losses[-1] <= min_fall * losses[-2]
 
 
-@torch_on_one_thread()
+@use_one_torch_thread()
 def refine_opacities(
     added: Gaussians,
     at_target: OpacityRender,
@@ -82,7 +82,7 @@ def refine_opacities(
     for _ in track(range(config.iterations), "Refining"):
         current = opacities()
         terms = [
-            weight * (view.compared(plan(current).image) - view.image).abs().mean()
+            weight * (view.fill_ignored(plan(current).image) - view.image).abs().mean()
             for plan, view, weight in plans
         ]
         loss = torch.stack(terms).sum()

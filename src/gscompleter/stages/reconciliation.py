@@ -17,25 +17,25 @@ from torch.nn.functional import pad
 from gscompleter.config import ReconcileConfig
 from gscompleter.descent import Adam
 from gscompleter.progress import track
-from gscompleter.render import AppearanceRender, FrozenView, LooksError
-from gscompleter.threads import torch_on_one_thread
+from gscompleter.render import AppearanceError, AppearanceRender, FrozenScene
+from gscompleter.threads import use_one_torch_thread
 from gscompleter.types import SH_C0, ErrorBudget, Gaussians, View
 
-Looks = tuple[Float[Tensor, "n"], Float[Tensor, "n k 3"]]
+Appearance = tuple[Float[Tensor, "n"], Float[Tensor, "n k 3"]]
 """Opacities and spherical harmonics."""
 
-FAINT = 0.2
+INITIAL_OPACITY = 0.2
 """Initial opacity as a fraction; growing harms photographs less than fading."""
-GOAL = 0.99
+TARGET_ERROR = 0.99
 """Fraction of the allowed error that the fit aims at, as a reserve."""
-MAX_BAND = 0.2
+MAX_SH_COEFFICIENT = 0.2
 """Largest view-dependent SH coefficient."""
 
 
-@torch_on_one_thread()
-def reconcile(
+@use_one_torch_thread()
+def refine_appearance(
     added: Gaussians,
-    frozen_target: FrozenView,
+    frozen_target: FrozenScene,
     reference: View,
     holes: Bool[Tensor, "h w"],
     plans: Sequence[AppearanceRender],
@@ -49,87 +49,92 @@ def reconcile(
     """
     if config.iterations == 0 or len(added) == 0:
         return added, ()
-    fit = Fit(added, config)
-    plan = frozen_target.plan_appearance(added, holes)
-    at_target = plan.compared(reference.image, shares_of(holes))
-    before = hole_error(frozen_target.context.image, reference, holes).clamp_min(1e-12)
-    photos = [Asked.by(*each) for each in zip(plans, budgets, strict=True)]
+    fit = AppearanceFit(added, config)
+    plan = frozen_target.vary_appearance(added, holes)
+    at_target = plan.make_error(reference.image, compute_pixel_weights(holes))
+    before = compute_hole_error(frozen_target.render.image, reference, holes).clamp_min(1e-12)
+    photos = [BudgetedPhoto.from_budget(*each) for each in zip(plans, budgets, strict=True)]
     with torch.no_grad():
-        appearance = fit.looks()
-        turns = Turns([photograph.excess(appearance).item() for photograph in photos])
+        appearance = fit.compute_appearance()
+        turns = PhotoSchedule(
+            [photograph.compute_excess(appearance).item() for photograph in photos]
+        )
     weight = config.photograph_weight / config.views_per_step
     losses = []
     for _ in track(range(config.iterations), "Refining"):
-        appearance = fit.looks()
+        appearance = fit.compute_appearance()
         loss = at_target(*appearance) / before
-        for over in objections(appearance, photos, turns, config.views_per_step):
+        for over in compute_excesses(appearance, photos, turns, config.views_per_step):
             loss = loss + weight * over
         fit.step(loss)
         losses.append(loss.item())
-    return fit.fitted(), tuple(losses)
+    return fit.build_gaussians(), tuple(losses)
 
 
-def objections(
-    looks: Looks, asked: Sequence[Asked], turns: Turns, count: int
+def compute_excesses(
+    appearance: Appearance, photos: Sequence[BudgetedPhoto], schedule: PhotoSchedule, count: int
 ) -> list[Float[Tensor, ""]]:
     """Compute the excess of the next `count` photographs, and return the positive ones."""
-    chosen = turns.take(count)
-    found = [asked[k].excess(looks) for k in chosen]
+    chosen = schedule.take(count)
+    found = [photos[k].compute_excess(appearance) for k in chosen]
     for k, over in zip(chosen, found, strict=True):
-        turns.excess[k] = over.item()
+        schedule.excess[k] = over.item()
     return [over for over in found if over > 0]
 
 
 @dataclass(frozen=True)
-class Asked:
+class BudgetedPhoto:
     """A photograph with the largest error that it may have."""
 
-    error: LooksError
+    error: AppearanceError
     """Mean squared error of its render, differentiable."""
-    allowed: float
+    max_error: float
 
     @staticmethod
-    def by(plan: AppearanceRender, budget: ErrorBudget) -> Asked:
+    def from_budget(plan: AppearanceRender, budget: ErrorBudget) -> BudgetedPhoto:
         """Create it from a budget and a differentiable image."""
         view = budget.view
-        return Asked(plan.compared(view.image, shares_of(view.counted)), max(budget.limit, 1e-12))
+        return BudgetedPhoto(
+            plan.make_error(view.image, compute_pixel_weights(view.valid_mask)),
+            max(budget.limit, 1e-12),
+        )
 
-    def excess(self, looks: Looks) -> Float[Tensor, ""]:
+    def compute_excess(self, appearance: Appearance) -> Float[Tensor, ""]:
         """Compute the error above its goal, relative to the largest error."""
-        return (self.error(*looks) / self.allowed - GOAL).clamp_min(0.0)
+        return (self.error(*appearance) / self.max_error - TARGET_ERROR).clamp_min(0.0)
 
 
-class Fit:
+class AppearanceFit:
     """Optimizer of the appearance of added Gaussians."""
 
     def __init__(self, added: Gaussians, config: ReconcileConfig) -> None:
         self._added = added
-        self._sh = widened(added.sh, (config.sh_degree + 1) ** 2).requires_grad_()
-        self._logits = (FAINT * added.opacities).logit(eps=1e-4).requires_grad_()
+        self._sh = resize_sh(added.sh, (config.sh_degree + 1) ** 2).requires_grad_()
+        self._logits = (INITIAL_OPACITY * added.opacities).logit(eps=1e-4).requires_grad_()
         rates = [(self._logits, config.opacity_step), (self._sh, config.color_step)]
         self._optimizer = Adam(rates, (config.beta1, config.beta2))
 
-    def looks(self) -> Looks:
+    def compute_appearance(self) -> Appearance:
         """Return the current opacities and SH; differentiable."""
         return self._logits.sigmoid(), self._sh
 
     def step(self, loss: Float[Tensor, ""]) -> None:
         """Take one gradient step and clamp colours."""
         self._optimizer.step(loss)
-        keep_colours(self._sh)
+        clamp_colors(self._sh)
 
-    def fitted(self) -> Gaussians:
+    def build_gaussians(self) -> Gaussians:
         """Return the fitted Gaussians."""
         opacities, sh = self._logits.detach().sigmoid(), self._sh.detach()
         return replace(self._added, opacities=opacities, sh=sh, encoded=None)
 
 
-def widened(sh: Float[Tensor, "n k 3"], count: int) -> Float[Tensor, "n l 3"]:
+def resize_sh(sh: Float[Tensor, "n k 3"], count: int) -> Float[Tensor, "n l 3"]:
     """Copy spherical harmonics with `count` coefficients, truncated or padded with zeros."""
     return pad(sh[:, :count], (0, 0, 0, max(count - sh.shape[1], 0))).clone()
 
 
-class Turns:
+class PhotoSchedule:
     """Schedule of photographs: the worst ones first, the others in turn."""
 
     def __init__(self, excess: Sequence[float]) -> None:
@@ -147,22 +152,22 @@ class Turns:
 
 
 @torch.no_grad()
-def keep_colours(sh: Float[Tensor, "n k 3"]) -> None:
-    """Clamp base colours to [0, 1] and view dependence to `MAX_BAND`, in place.
+def clamp_colors(sh: Float[Tensor, "n k 3"]) -> None:
+    """Clamp base colours to [0, 1] and view dependence to `MAX_SH_COEFFICIENT`, in place.
 
     Gaussians seen from few directions would otherwise glitter from others.
     """
     sh[:, 0].clamp_(-0.5 / SH_C0, 0.5 / SH_C0)
-    sh[:, 1:].clamp_(-MAX_BAND, MAX_BAND)
+    sh[:, 1:].clamp_(-MAX_SH_COEFFICIENT, MAX_SH_COEFFICIENT)
 
 
-def hole_error(
+def compute_hole_error(
     image: Float[Tensor, "h w 3"], reference: View, holes: Bool[Tensor, "h w"]
 ) -> Float[Tensor, ""]:
     """Compute the mean squared difference to the synthesized image in holes."""
-    return (shares_of(holes) * (image - reference.image).square().sum(dim=-1)).sum()
+    return (compute_pixel_weights(holes) * (image - reference.image).square().sum(dim=-1)).sum()
 
 
-def shares_of(where: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+def compute_pixel_weights(where: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Return the weight of each pixel and channel in a mean over the image."""
     return where.float() / (3 * where.numel())

@@ -13,19 +13,19 @@ from torch import Tensor
 from gscompleter.config import AlignmentConfig, DepthAgreementConfig, RegistrationConfig
 from gscompleter.coverage import COVERED
 from gscompleter.descent import Adam
-from gscompleter.geometry import reaching, slide, z_depths
+from gscompleter.geometry import compute_z_depths, footprint_mask, slide
 from gscompleter.interpolation import fill_smoothly
 from gscompleter.progress import track
-from gscompleter.render import FrozenView, Renderer
-from gscompleter.sky import surfaces_in
-from gscompleter.stages.alignment import fit_bridge
-from gscompleter.stages.sky_in_holes import sky_into_holes
-from gscompleter.threads import torch_on_one_thread
+from gscompleter.render import FrozenScene, Renderer
+from gscompleter.sky import mask_out_sky
+from gscompleter.stages.alignment import align_depth
+from gscompleter.stages.sky_in_holes import extrapolate_sky
+from gscompleter.threads import use_one_torch_thread
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
 
 OCCLUSION_TOLERANCE = 0.05
 """Distance behind the context, relative to depth, that still counts as the same surface."""
-CARRY_TOLERANCE = 0.02
+EXTRAPOLATION_TOLERANCE = 0.02
 """Largest relative depth error of a pixel whose correction is extrapolated into holes."""
 
 
@@ -39,10 +39,10 @@ class Registration:
     """Value of Eq. 11 at each iteration."""
 
 
-@torch_on_one_thread()
+@use_one_torch_thread()
 def register(
     lift: Lift,
-    frozen_target: FrozenView,
+    frozen_target: FrozenScene,
     at_anchor: Render,
     reference: View,
     anchor: Camera,
@@ -68,11 +68,11 @@ def register(
         alignment: Settings of the affine fit.
         reject_below: As `DepthAgreementConfig`.
     """
-    affine = fit_bridge(lift, frozen_target.context, at_anchor, rng, alignment, reject_below)
+    affine = align_depth(lift, frozen_target.render, at_anchor, rng, alignment, reject_below)
     coarse = apply_affine(
         lift.gaussians, affine, reference.camera, config.footprint, config.min_ratio
     )
-    if affine.refuted or config.iterations == 0 or len(coarse) == 0:
+    if affine.is_rejected or config.iterations == 0 or len(coarse) == 0:
         return Registration(coarse, affine, ())
     registered, losses = register_along_rays(
         coarse, frozen_target, at_anchor, reference, anchor, renderer, config
@@ -82,15 +82,15 @@ def register(
         and config.degrees_of_freedom == 1
         and lift.pixel_index is not None
     ):
-        scene = frozen_target.context.depth_map(max_alpha)
-        registered = carry_into_holes(
+        scene = frozen_target.render.depth_map(max_alpha)
+        registered = extrapolate_into_holes(
             coarse, registered, lift.pixel_index, scene, reference.camera, config
         )
-        registered = sky_into_holes(registered, lift.pixel_index, scene, reference)
+        registered = extrapolate_sky(registered, lift.pixel_index, scene, reference)
     return Registration(registered, affine, losses)
 
 
-def carry_into_holes(
+def extrapolate_into_holes(
     coarse: Gaussians,
     registered: Gaussians,
     pixel_index: Int[Tensor, "n"],
@@ -99,10 +99,10 @@ def carry_into_holes(
     config: RegistrationConfig,
 ) -> Gaussians:
     """Extrapolate the correction d' / d of well registered Gaussians smoothly into holes."""
-    before = z_depths(coarse.means, camera)
-    after = z_depths(registered.means, camera)
+    before = compute_z_depths(coarse.means, camera)
+    after = compute_z_depths(registered.means, camera)
     error = (after / scene.depth.flatten()[pixel_index].clamp_min(1e-12) - 1).abs()
-    agrees = scene.valid.flatten()[pixel_index] & (error < CARRY_TOLERANCE)
+    agrees = scene.valid.flatten()[pixel_index] & (error < EXTRAPOLATION_TOLERANCE)
 
     correction = torch.zeros_like(scene.depth).flatten()
     correction[pixel_index] = (after / before).log()
@@ -126,7 +126,7 @@ def apply_affine(
 
     The ray distance follows from the means, d' = d z'/z: the paper's Eq. 9 without a depth map.
     """
-    z = z_depths(gaussians.means, camera)
+    z = compute_z_depths(gaussians.means, camera)
     ratio = (affine.scale * z + affine.shift) / z
     return slide(gaussians, camera, bound(ratio, min_ratio), footprint)
 
@@ -138,7 +138,7 @@ def bound(ratio: Float[Tensor, "n"], least: float | None) -> Float[Tensor, "n"]:
 
 def register_along_rays(
     coarse: Gaussians,
-    frozen_target: FrozenView,
+    frozen_target: FrozenScene,
     at_anchor: Render,
     reference: View,
     anchor: Camera,
@@ -149,10 +149,12 @@ def register_along_rays(
 
     Gaussians that reach no compared pixel have no gradient and are not rendered.
     """
-    objective = Objective.of(frozen_target.context, at_anchor, reference, anchor, config)
-    rows = objective.reached_by(coarse, reference.camera, anchor).nonzero()[:, 0]
+    objective = Objective.from_renders(frozen_target.render, at_anchor, reference, anchor, config)
+    rows = objective.find_reached(coarse, reference.camera, anchor).nonzero()[:, 0]
     seen = coarse[rows]
-    alone = drawn_alone(seen, reference.camera, objective.target_depth.valid, renderer, config)
+    alone = make_renderer_alone(
+        seen, reference.camera, objective.target_depth.valid, renderer, config
+    )
     parameters = torch.zeros(
         (len(seen), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )
@@ -160,17 +162,17 @@ def register_along_rays(
     losses = []
     for iteration in track(range(config.iterations), "Registering"):
         left = 1 - iteration / config.iterations if config.lr_schedule == "linear" else 1.0
-        moved = displace(seen, parameters, reference.camera, config)
+        moved = move_along_rays(seen, parameters, reference.camera, config)
         loss = objective(moved, frozen_target, alone, renderer.render(moved, anchor))
         optimizer.step(loss, left)
         losses.append(loss.item())
     with torch.no_grad():
         found = parameters.new_zeros((len(coarse), config.degrees_of_freedom))
         found[rows] = parameters.detach()
-        return displace(coarse, found, reference.camera, config), tuple(losses)
+        return move_along_rays(coarse, found, reference.camera, config), tuple(losses)
 
 
-def displace(
+def move_along_rays(
     coarse: Gaussians,
     parameters: Float[Tensor, "n dof"],
     camera: Camera,
@@ -186,7 +188,7 @@ def displace(
     return slide(coarse, camera, bound(ratio, config.min_ratio), config.footprint)
 
 
-def drawn_alone(
+def make_renderer_alone(
     coarse: Gaussians,
     camera: Camera,
     where: Bool[Tensor, "h w"],
@@ -200,13 +202,13 @@ def drawn_alone(
     """
     if config.degrees_of_freedom == 3 or config.footprint == "fixed":
         return lambda moved: renderer.render(moved, camera)
-    plan = renderer.freeze(coarse[:0], camera).plan_depths(coarse, where)
-    return lambda moved: plan(z_depths(moved.means, camera))
+    plan = renderer.freeze(coarse[:0], camera).vary_depths(coarse, where)
+    return lambda moved: plan(compute_z_depths(moved.means, camera))
 
 
-def compared_depth(render: Render, camera: Camera, config: RegistrationConfig) -> DepthMap:
+def get_compared_depth(render: Render, camera: Camera, config: RegistrationConfig) -> DepthMap:
     """Return the rendered depth that losses compare with, without the sky if `mask_sky` is set."""
-    return surfaces_in(render, camera) if config.mask_sky else render.depth_map()
+    return mask_out_sky(render, camera) if config.mask_sky else render.depth_map()
 
 
 @dataclass(frozen=True)
@@ -221,7 +223,7 @@ class Objective:
     config: RegistrationConfig
 
     @staticmethod
-    def of(
+    def from_renders(
         at_target: Render,
         at_anchor: Render,
         reference: View,
@@ -229,48 +231,50 @@ class Objective:
         config: RegistrationConfig,
     ) -> Objective:
         """Create the objective from renders of the scene at target and anchor."""
-        anchor_depth = compared_depth(at_anchor, anchor, config)
+        anchor_depth = get_compared_depth(at_anchor, anchor, config)
         seen = anchor_depth.depth[anchor_depth.valid]
         relative = config.lr_unit == "distance" and len(seen) > 0
         unit = seen.median().item() if relative else 1.0
-        target_depth = compared_depth(at_target, reference.camera, config)
+        target_depth = get_compared_depth(at_target, reference.camera, config)
         return Objective(target_depth, anchor_depth, reference.image, unit, config)
 
-    def reached_by(self, candidates: Gaussians, target: Camera, anchor: Camera) -> Tensor:
+    def find_reached(self, candidates: Gaussians, target: Camera, anchor: Camera) -> Tensor:
         """Find Gaussians that reach a compared pixel of the target or the anchor."""
         counted = self.target_depth.valid
         if self.config.rgb_weight > 0:
             counted = torch.ones_like(counted)
-        at_target = reaching(candidates, target, counted)
-        return at_target | reaching(candidates, anchor, self.anchor_depth.valid)
+        at_target = footprint_mask(candidates, target, counted)
+        return at_target | footprint_mask(candidates, anchor, self.anchor_depth.valid)
 
     def __call__(
         self,
         candidates: Gaussians,
-        frozen_target: FrozenView,
+        frozen_target: FrozenScene,
         alone: Callable[[Gaussians], Render],
         at_anchor: Render,
     ) -> Float[Tensor, ""]:
-        """Compute the loss; `alone` renders `candidates` at the target without the scene."""
+        """Compute the loss; `is_alone` renders `candidates` at the target without the scene."""
         c = self.config
         loss = torch.zeros((), device=candidates.means.device)
         if c.rendered_depth == "composite" or c.rgb_weight > 0:
             together = frozen_target.composite(candidates)
             loss = loss + c.rgb_weight * (together.image - self.image).abs().mean()
         shown = together if c.rendered_depth == "composite" else alone(candidates)
-        loss = loss + c.depth_weight * self.depth_error(
+        loss = loss + c.depth_weight * self.compute_depth_error(
             shown, self.target_depth, self.target_depth.valid & shown.depth_map().valid
         )
-        return loss + c.stereo_weight * self.depth_error(
-            at_anchor, self.anchor_depth, self.comparable(at_anchor)
+        return loss + c.stereo_weight * self.compute_depth_error(
+            at_anchor, self.anchor_depth, self.find_comparable(at_anchor)
         )
 
-    def depth_error(self, shown: Render, expected: DepthMap, where: Tensor) -> Float[Tensor, ""]:
+    def compute_depth_error(
+        self, shown: Render, expected: DepthMap, where: Tensor
+    ) -> Float[Tensor, ""]:
         """Compute the L1 depth error inside `where`, in `unit`, averaged over the image."""
         error = (shown.depth - expected.depth).abs() / self.unit
         return torch.where(where, error, 0.0).mean()
 
-    def comparable(self, alone: Render) -> Tensor:
+    def find_comparable(self, alone: Render) -> Tensor:
         """Find anchor pixels that show the scene and unoccluded Gaussians."""
         seen = self.anchor_depth.valid & alone.depth_map().valid
         if not self.config.mask_occluded:

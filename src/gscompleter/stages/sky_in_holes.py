@@ -8,15 +8,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gscompleter.geometry import at_depths, z_depths
-from gscompleter.sky import is_sky, sky_depth
+from gscompleter.geometry import compute_z_depths, move_to_depths
+from gscompleter.sky import compute_sky_depth, is_sky
 from gscompleter.types import DepthMap, Gaussians, View
 
-LIKE = 0.1
+MAX_COLOR_DIFFERENCE = 0.1
 """Largest colour difference per channel between the hole and the nearest sky."""
 
 
-def sky_into_holes(
+def extrapolate_sky(
     candidates: Gaussians, pixel_index: Int[Tensor, "n"], scene: DepthMap, reference: View
 ) -> Gaussians:
     """Move Gaussians of holes that continue the sky to its depth.
@@ -27,12 +27,12 @@ def sky_into_holes(
     sky = scene.valid & is_sky(scene.depth, camera)
     if not sky.any():
         return candidates
-    continued = continuing(sky, scene.valid, reference.image).flatten()[pixel_index]
-    depths = z_depths(candidates.means, camera)
-    return at_depths(candidates, camera, depths.where(~continued, sky_depth(camera)))
+    continued = find_sky_continuation(sky, scene.valid, reference.image).flatten()[pixel_index]
+    depths = compute_z_depths(candidates.means, camera)
+    return move_to_depths(candidates, camera, depths.where(~continued, compute_sky_depth(camera)))
 
 
-def continuing(
+def find_sky_continuation(
     sky: Bool[Tensor, "h w"], known: Bool[Tensor, "h w"], image: Float[Tensor, "h w 3"]
 ) -> Bool[Tensor, "h w"]:
     """Find hole pixels whose nearest known pixel is sky of a similar colour."""
@@ -45,5 +45,5 @@ def continuing(
     pixel[label.flatten()[at]] = at
     nearest = pixel[label]
     colours = image.reshape(-1, 3)[nearest]
-    like = (image - colours).abs().amax(dim=-1) < LIKE
+    like = (image - colours).abs().amax(dim=-1) < MAX_COLOR_DIFFERENCE
     return ~known & sky.flatten()[nearest] & like

@@ -20,66 +20,75 @@ from gscompleter.reconstructors import Reconstructor
 from gscompleter.render import Renderer
 from gscompleter.stages.context import init_context
 from gscompleter.stages.selection import select_context
-from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
-from gscompleter.types import Camera, Render, SceneContext, View
+from gscompleter.stages.support import (
+    compute_trust,
+    compute_trusted_alpha,
+    gather_observations,
+    sum_weights,
+)
+from gscompleter.types import Camera, GeneratorInput, Render, View
 
 NUM_VIEWS = 3
 """Photographs that Ψ reconstructs; time grows with their number."""
-BETTER = 0.1
+MIN_ADVANTAGE = 0.1
 """Required advantage in trusted alpha over the scene."""
 
 
 @dataclass(frozen=True)
-class Stereo:
+class StereoRender:
     """Render of stereo among the photographs at a camera."""
 
     render: Render
-    support: Float[Tensor, "h w"]
+    trusted_alpha: Float[Tensor, "h w"]
     """Alpha weighted by trust."""
 
-    def better(self, believed: Float[Tensor, "h w"], min_alpha: float) -> Bool[Tensor, "h w"]:
+    def find_better(
+        self, trusted_alpha: Float[Tensor, "h w"], min_alpha: float
+    ) -> Bool[Tensor, "h w"]:
         """Find pixels at which stereo is trusted enough, and more than the scene."""
-        return (self.support >= min_alpha) & (self.support > believed + BETTER)
+        return (self.trusted_alpha >= min_alpha) & (
+            self.trusted_alpha > trusted_alpha + MIN_ADVANTAGE
+        )
 
 
-def stereo_among(
+def render_stereo(
     views: Sequence[View],
     camera: Camera,
-    drawn: Render,
+    render: Render,
     reconstructor: Reconstructor,
     renderer: Renderer,
     config: TrustConfig,
-) -> Stereo | None:
+) -> StereoRender | None:
     """Reconstruct the photographs that show most of a target, and render the result there.
 
     `render` shows the scene there. Returns None if the photographs determine no depth.
     """
-    covered = drawn.depth_map().valid
+    covered = render.depth_map().valid
     if len(views) < 2 or not covered.any():
         return None
-    points = unproject(drawn.depth, camera)[covered]
+    points = unproject(render.depth, camera)[covered]
     chosen = select_context([camera], [view.camera for view in views], points, NUM_VIEWS)
     try:
         scene, _ = init_context(reconstructor, [views[index] for index in chosen])
     except InputError:
         return None
     frozen_views = [renderer.freeze(scene, view.camera) for view in views]
-    observations = gather_evidence(scene, views, frozen_views, config)
+    observations = gather_observations(scene, views, frozen_views, config)
     frozen = renderer.freeze(scene, camera)
-    trust = support(observations, weight_sums(frozen), camera, config)
-    return Stereo(frozen.context, believed_alpha(frozen, trust))
+    trust = compute_trust(observations, sum_weights(frozen), camera, config)
+    return StereoRender(frozen.render, compute_trusted_alpha(frozen, trust))
 
 
-def corrected(context: SceneContext, stereo: Stereo) -> SceneContext:
+def apply_stereo(context: GeneratorInput, stereo: StereoRender) -> GeneratorInput:
     """Replace the target render in the input of Φ where stereo is better."""
-    if context.believed is None:
+    if context.trusted_alpha is None:
         return context
-    better = context.holes & stereo.better(context.believed, context.max_alpha)
-    scene, shown = context.at_target, stereo.render
+    better = context.holes & stereo.find_better(context.trusted_alpha, context.max_alpha)
+    scene, shown = context.target_render, stereo.render
     at_target = Render(
         torch.where(better[..., None], shown.image, scene.image),
         torch.where(better, shown.depth, scene.depth),
         torch.where(better, shown.alpha, scene.alpha),
     )
-    trusted_alpha = torch.where(better, stereo.support, context.believed)
-    return replace(context, at_target=at_target, believed=trusted_alpha)
+    trusted_alpha = torch.where(better, stereo.trusted_alpha, context.trusted_alpha)
+    return replace(context, target_render=at_target, trusted_alpha=trusted_alpha)

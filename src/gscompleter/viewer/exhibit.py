@@ -15,13 +15,13 @@ from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.frame import Frame
 from gscompleter.data.framing import Resolution
-from gscompleter.data.origin import frame_from_photographs
+from gscompleter.data.origin import compute_frame_from_photographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.structure_from_motion import POSES
-from gscompleter.errors import InputError, quoted
-from gscompleter.frames.similarity import moved_camera
-from gscompleter.io.files import COMPLETED, CONTEXT, SUMMARY, TARGETS
-from gscompleter.io.image import jpeg_of, read_pixels
+from gscompleter.errors import InputError, quote_value
+from gscompleter.frames.similarity import transform_camera
+from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE, TARGETS_FILE
+from gscompleter.io.image import encode_jpeg, read_pixels
 from gscompleter.io.json_file import read_json
 from gscompleter.io.ply import note_infinite_opacities
 from gscompleter.splats.formats import load_splat
@@ -39,7 +39,7 @@ Summary = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Shot:
+class ViewerCamera:
     """A camera to jump to."""
 
     name: str
@@ -53,7 +53,7 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Place:
+class SceneTransform:
     """Transform from the frame of given cameras to that of a scene."""
 
     origin: Float[np.ndarray, "3"]
@@ -62,35 +62,35 @@ class Place:
     """Applied afterwards."""
 
 
-SAME = Place(np.zeros(3), np.eye(4))
+IDENTITY_TRANSFORM = SceneTransform(np.zeros(3), np.eye(4))
 """Transform of cameras in the frame of the scene."""
 
 
 @dataclass(frozen=True)
-class Exhibit:
+class ViewerContent:
     """Two states of a scene in one frame, with cameras."""
 
     title: str
     after: Gaussians
     before: Gaussians | None
     """The other state, or None to show one only."""
-    shots: tuple[Shot, ...] = ()
-    remarks: tuple[str, ...] = ()
+    cameras: tuple[ViewerCamera, ...] = ()
+    notes: tuple[str, ...] = ()
     """Sentences on missing or changed content."""
-    place: Place = SAME
+    scene_transform: SceneTransform = IDENTITY_TRANSFORM
     """Frame of further cameras."""
 
 
-def exhibit_of_files(after: Path, before: Path | None, drop_nonfinite: bool) -> Exhibit:
+def load_viewer_files(after: Path, before: Path | None, drop_nonfinite: bool) -> ViewerContent:
     """Load a splat to compare with `before`, or with its observed part if that is None."""
     scene = load_splat(after, drop_nonfinite)
     note = note_infinite_opacities(scene)
     remarks = () if note is None else (note,)
     if before is not None:
-        return Exhibit(after.name, scene, load_splat(before, drop_nonfinite), remarks=remarks)
+        return ViewerContent(after.name, scene, load_splat(before, drop_nonfinite), notes=remarks)
     given = scene[scene.generated == 0]
     shown = given if 0 < len(given) < len(scene) else None
-    return Exhibit(after.name, scene, shown, remarks=remarks)
+    return ViewerContent(after.name, scene, shown, notes=remarks)
 
 
 def is_completion(path: Path) -> bool:
@@ -98,109 +98,131 @@ def is_completion(path: Path) -> bool:
     return path.is_dir() and not (path / META).is_file()
 
 
-def exhibit_of_completion(folder: Path, drop_nonfinite: bool) -> Exhibit:
+def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
     """Load an output folder of `complete`, with target and context cameras.
 
     Raises:
         InputError: The folder is no output of `complete`, or a file cannot be read.
     """
-    missing = [name for name in (COMPLETED, CONTEXT, SUMMARY) if not (folder / name).is_file()]
+    missing = [
+        name
+        for name in (COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE)
+        if not (folder / name).is_file()
+    ]
     if missing:
         raise InputError(
-            f"{quoted(folder)} has no {missing[0]}; name a folder that a completion was written "
+            f"{quote_value(folder)} has no {missing[0]}; name a folder that a completion was "
+            "written "
             "to, or a file of Gaussians."
         )
-    before, after = (load_splat(folder / name, drop_nonfinite) for name in (CONTEXT, COMPLETED))
-    summary = summary_in(folder)
-    place = place_of_completion(folder, summary)
-    targets, remarks = target_shots(folder, summary, place), []
+    before, after = (
+        load_splat(folder / name, drop_nonfinite) for name in (CONTEXT_FILE, COMPLETED_FILE)
+    )
+    summary = load_summary(folder)
+    place = read_scene_transform(folder, summary)
+    targets, remarks = load_target_cameras(folder, summary, place), []
     try:
-        photographs = context_shots(folder, summary, place)
+        photographs = load_context_cameras(folder, summary, place)
     except InputError:
-        photographs, remarks = (), [_lost(source_of(folder, summary))]
+        photographs, remarks = (
+            (),
+            [_describe_missing_photographs(locate_photographs(folder, summary))],
+        )
     name = folder.resolve().name
-    return Exhibit(name, after, before, (*targets, *photographs), tuple(remarks), place)
+    return ViewerContent(name, after, before, (*targets, *photographs), tuple(remarks), place)
 
 
-def summary_in(folder: Path) -> Summary:
+def load_summary(folder: Path) -> Summary:
     """Read the summary of a completion."""
-    content = read_json(folder / SUMMARY, "complete the scene again")
+    content = read_json(folder / SUMMARY_FILE, "complete the scene again")
     return content if isinstance(content, dict) else {}
 
 
-def target_shots(folder: Path, summary: Summary, place: Place) -> tuple[Shot, ...]:
+def load_target_cameras(
+    folder: Path, summary: Summary, scene_transform: SceneTransform
+) -> tuple[ViewerCamera, ...]:
     """Load the targets of a completion, with thumbnails of the result; may be empty."""
-    if not (folder / TARGETS).is_file():
+    if not (folder / TARGETS_FILE).is_file():
         return ()
-    notes = notes_of(summary)
-    cameras = load_cameras(folder / TARGETS, origin=place.origin.tolist())
+    notes = collect_notes(summary)
+    cameras = load_cameras(folder / TARGETS_FILE, origin=scene_transform.origin.tolist())
     return tuple(
-        Shot(
+        ViewerCamera(
             f"target-{number}",
             f"Target {number}",
-            moved_camera(camera, place.transform),
-            thumbnail_of(folder / "images" / f"target{number}_after.png"),
+            transform_camera(camera, scene_transform.transform),
+            make_thumbnail(folder / "images" / f"target{number}_after.png"),
             notes[number - 1] if number <= len(notes) else (),
         )
         for number, camera in enumerate(cameras, start=1)
     )
 
 
-def context_shots(folder: Path, summary: Summary, place: Place) -> tuple[Shot, ...]:
+def load_context_cameras(
+    folder: Path, summary: Summary, scene_transform: SceneTransform
+) -> tuple[ViewerCamera, ...]:
     """Load the photographs of a completion's context; InputError if they were moved."""
-    rows, format = summary.get("context"), _part(summary, "settings").get("format")
-    photographs = open_photographs(source_of(folder, summary), format)
-    transform = place.transform @ frame_from_photographs(place.origin - photographs.origin)
+    rows, format = summary.get("context"), _get_table(summary, "settings").get("format")
+    photographs = open_photographs(locate_photographs(folder, summary), format)
+    transform = scene_transform.transform @ compute_frame_from_photographs(
+        scene_transform.origin - photographs.origin
+    )
     frames = [row["frame"] for row in rows or () if isinstance(row, dict) and "frame" in row]
     return tuple(
-        Shot(
+        ViewerCamera(
             f"photograph-{number}",
             f"Photograph {number}",
-            moved_camera(photographs.camera(number), transform),
-            thumbnail_in(photographs.frame(number)),
+            transform_camera(photographs.camera(number), transform),
+            make_frame_thumbnail(photographs.frame(number)),
         )
         for number in frames
     )
 
 
-def source_of(folder: Path, summary: Summary) -> Path:
+def locate_photographs(folder: Path, summary: Summary) -> Path:
     """Locate the photographs of a completion; in `folder` itself if their poses were computed."""
-    if _part(summary, "scene").get("format") == "photographs":
+    if _get_table(summary, "scene").get("format") == "photographs":
         return folder / POSES
-    return Path(str(_part(summary, "settings").get("folder")))
+    return Path(str(_get_table(summary, "settings").get("folder")))
 
 
-def camera_shots(path: Path, resolution: Resolution, place: Place) -> tuple[Shot, ...]:
+def load_file_cameras(
+    path: Path, resolution: Resolution, scene_transform: SceneTransform
+) -> tuple[ViewerCamera, ...]:
     """Load the cameras of a file, with thumbnails of photographs that exist.
 
     `resolution` is used if the file states no size; `place` leads from its frame to the scene's.
     """
     frames = read_cameras(path, resolution)
-    cameras = load_cameras(path, resolution, origin=place.origin.tolist())
+    cameras = load_cameras(path, resolution, origin=scene_transform.origin.tolist())
     return tuple(
-        Shot(
+        ViewerCamera(
             f"camera-{number}",
             Path(frame.name).name or f"Camera {number}",
-            moved_camera(camera, place.transform),
-            thumbnail_in(frame),
+            transform_camera(camera, scene_transform.transform),
+            make_frame_thumbnail(frame),
         )
         for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True), start=1)
     )
 
 
-def place_of_completion(folder: Path, summary: Summary) -> Place:
+def read_scene_transform(folder: Path, summary: Summary) -> SceneTransform:
     """Read the transform from the photographs' frame to that of a completion's scenes."""
-    frame = _part(summary, "frame")
-    transform, origin = _numbers(frame.get("transform"), 4, 4), _numbers(frame.get("origin"), 3)
+    frame = _get_table(summary, "frame")
+    transform, origin = (
+        _parse_array(frame.get("transform"), 4, 4),
+        _parse_array(frame.get("origin"), 3),
+    )
     if transform is None or origin is None or np.linalg.det(transform) <= 0:
         raise InputError(
-            f"{quoted(folder / SUMMARY)} has no `frame` with a `transform` of 4 x 4 numbers and an "
+            f"{quote_value(folder / SUMMARY_FILE)} has no `frame` with a `transform` of 4 x 4 "
+            "numbers and an "
             "`origin`; complete the scene again."
         )
-    return Place(origin, transform @ frame_from_photographs(-origin))
+    return SceneTransform(origin, transform @ compute_frame_from_photographs(-origin))
 
 
-def notes_of(summary: Summary) -> list[tuple[str, ...]]:
+def collect_notes(summary: Summary) -> list[tuple[str, ...]]:
     """Collect the notes on each target of a completion."""
     targets = summary.get("targets")
     rows = targets if isinstance(targets, list) else []
@@ -208,29 +230,30 @@ def notes_of(summary: Summary) -> list[tuple[str, ...]]:
     return [tuple(map(str, row)) if isinstance(row, list) else () for row in notes]
 
 
-def thumbnail_in(frame: Frame) -> bytes | None:
+def make_frame_thumbnail(frame: Frame) -> bytes | None:
     """Make a thumbnail of a frame's photograph; None if it is not in a file."""
-    stored = frame.stored()
-    return thumbnail_of(stored) if isinstance(stored, Path) else None
+    stored = frame.find_stored()
+    return make_thumbnail(stored) if isinstance(stored, Path) else None
 
 
-def thumbnail_of(path: Path) -> bytes | None:
+def make_thumbnail(path: Path) -> bytes | None:
     """Make a small JPEG of an image file; None if there is no file."""
     if not path.is_file():
         return None
     image = Image.fromarray(read_pixels(path))
     image.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
-    return jpeg_of(image, THUMBNAIL_QUALITY)
+    return encode_jpeg(image, THUMBNAIL_QUALITY)
 
 
-def _lost(source: Path) -> str:
+def _describe_missing_photographs(source: Path) -> str:
     return (
-        f"The context photographs are not shown: {quoted(source)} does not hold them any more; "
+        f"The context photographs are not shown: {quote_value(source)} does not hold them any "
+        "more; "
         "restore them, or name their cameras."
     )
 
 
-def _numbers(value: Any, *shape: int) -> Float[np.ndarray, "..."] | None:
+def _parse_array(value: Any, *shape: int) -> Float[np.ndarray, "..."] | None:
     """Convert `value` to an array of finite numbers of the given shape, or return None."""
     try:
         array = np.array(value, dtype=np.float64)
@@ -239,6 +262,6 @@ def _numbers(value: Any, *shape: int) -> Float[np.ndarray, "..."] | None:
     return array if array.shape == shape and np.isfinite(array).all() else None
 
 
-def _part(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+def _get_table(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     part = content.get(name)
     return part if isinstance(part, dict) else {}

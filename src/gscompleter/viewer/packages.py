@@ -22,13 +22,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from gscompleter.cache import cache_folder
+from gscompleter.cache import get_download_folder
 from gscompleter.errors import InputError
-from gscompleter.io.files import replacing
+from gscompleter.io.files import replace_file
 
-LOCK = Path(__file__).with_name("package-lock.json")
+LOCK_FILE = Path(__file__).with_name("package-lock.json")
 """Pinned packages with addresses and hashes."""
-BUILT = Path(__file__).with_name("libraries.json")
+BUILT_LIBRARIES = Path(__file__).with_name("libraries.json")
 """Libraries stored by the build of a wheel."""
 MODULES = {
     "three": ("three", "build/three.module.min.js"),
@@ -37,20 +37,20 @@ MODULES = {
     "@sparkjsdev/spark": ("@sparkjsdev/spark", "dist/spark.module.min.js"),
 }
 """Package and file of each module, by its import name."""
-CORE = ('"./three.core.min.js"', '"three-core"')
+CORE_IMPORT = ('"./three.core.min.js"', '"three-core"')
 """Replacement for the one relative import: modules in a page have no folder."""
-LICENCE = "LICENSE"
+LICENCE_FILE = "LICENSE"
 """File of each package that is distributed with it."""
-LARGEST_ARCHIVE = 64 << 20
+MAX_ARCHIVE_BYTES = 64 << 20
 """Largest archive in bytes; ours have up to 8 million."""
-SECONDS_TO_ANSWER = 30.0
+REGISTRY_TIMEOUT = 30.0
 """Timeout of the registry in seconds."""
-REGISTRY = "npm_config_registry"
+REGISTRY_VARIABLE = "npm_config_registry"
 """Environment variable of npm with the address of the registry."""
 
 
 @dataclass(frozen=True)
-class Package:
+class NpmPackage:
     """One npm package, as pinned by the lock."""
 
     name: str
@@ -84,7 +84,7 @@ class Libraries:
     """Licence texts by package name and version."""
 
 
-def load_libraries(lock: Path = LOCK, built: Path = BUILT) -> Libraries:
+def load_libraries(lock: Path = LOCK_FILE, built: Path = BUILT_LIBRARIES) -> Libraries:
     """Load the libraries of the wheel, or in a source tree those of the pinned archives.
 
     Raises:
@@ -92,69 +92,71 @@ def load_libraries(lock: Path = LOCK, built: Path = BUILT) -> Libraries:
     """
     if built.is_file():
         return Libraries(**json.loads(built.read_text(encoding="utf-8")))
-    return libraries_from(lock)
+    return extract_libraries(lock)
 
 
-def write_libraries(path: Path, lock: Path = LOCK) -> None:
+def write_libraries(path: Path, lock: Path = LOCK_FILE) -> None:
     """Write the libraries for a wheel; the same lock gives the same bytes."""
-    text = json.dumps(vars(libraries_from(lock)), sort_keys=True, ensure_ascii=False)
-    with replacing(path) as file:
+    text = json.dumps(vars(extract_libraries(lock)), sort_keys=True, ensure_ascii=False)
+    with replace_file(path) as file:
         file.write(text.encode())
 
 
-def libraries_from(lock: Path) -> Libraries:
+def extract_libraries(lock: Path) -> Libraries:
     """Extract the modules and licences of the packages pinned in `lock`."""
     packages = {package.name: package for package in read_lock(lock)}
-    archives = {name: archive_of(package) for name, package in packages.items()}
+    archives = {name: get_archive(package) for name, package in packages.items()}
     modules = {
-        name: member(archives[package], file).replace(*CORE)
+        name: read_archive_member(archives[package], file).replace(*CORE_IMPORT)
         for name, (package, file) in MODULES.items()
     }
     licences = {
-        f"{p.name} {p.version}": member(archives[name], LICENCE) for name, p in packages.items()
+        f"{p.name} {p.version}": read_archive_member(archives[name], LICENCE_FILE)
+        for name, p in packages.items()
     }
     return Libraries(modules, licences)
 
 
-def read_lock(lock: Path) -> list[Package]:
+def read_lock(lock: Path) -> list[NpmPackage]:
     """Read the packages of an npm lock file (`lockfileVersion` 3), in order."""
     entries = json.loads(lock.read_text(encoding="utf-8"))["packages"]
     return [
-        Package(path.removeprefix("node_modules/"), e["version"], e["integrity"])
+        NpmPackage(path.removeprefix("node_modules/"), e["version"], e["integrity"])
         for path, e in entries.items()
         if path
     ]
 
 
-def archive_of(package: Package) -> bytes:
+def get_archive(package: NpmPackage) -> bytes:
     """Get the archive of a package from the cache, or fetch and cache it."""
-    place = place_of(package)
+    place = get_archive_path(package)
     if place.is_file():
         archive = place.read_bytes()
         if package.is_intact(archive):
             return archive
-    archive = fetched(package)
+    archive = fetch_archive(package)
     place.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(place) as file:
+    with replace_file(place) as file:
         file.write(archive)
     return archive
 
 
-def place_of(package: Package) -> Path:
+def get_archive_path(package: NpmPackage) -> Path:
     """Get the path of an archive in the cache; users may put it there by hand."""
-    return cache_folder() / "viewer" / package.file
+    return get_download_folder() / "viewer" / package.file
 
 
-def fetched(package: Package) -> bytes:
+def fetch_archive(package: NpmPackage) -> bytes:
     """Fetch an archive from the npm registry and compare its hash."""
-    url = f"{registry_for(package)}/{package.path}"
+    url = f"{find_registry(package)}/{package.path}"
     try:
-        with urllib.request.urlopen(url, timeout=SECONDS_TO_ANSWER) as answer:
-            archive: bytes = answer.read(LARGEST_ARCHIVE)
+        with urllib.request.urlopen(url, timeout=REGISTRY_TIMEOUT) as answer:
+            archive: bytes = answer.read(MAX_ARCHIVE_BYTES)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{needed(package)}, and {urlsplit(url).netloc or 'its address'} cannot be reached; "
-            f"fetch {url} and put it at {place_of(package)}."
+            f"{describe_missing_package(package)}, and {urlsplit(url).netloc or 'its address'} "
+            "cannot be reached; "
+            f"fetch {url} and put it at {get_archive_path(package)}."
         ) from error
     if not package.is_intact(archive):
         raise InputError(
@@ -164,27 +166,29 @@ def fetched(package: Package) -> bytes:
     return archive
 
 
-def registry_for(package: Package) -> str:
+def find_registry(package: NpmPackage) -> str:
     """Find the npm registry, from the environment variable or from npm itself."""
-    address, npm = os.environ.get(REGISTRY), shutil.which("npm")
+    address, npm = os.environ.get(REGISTRY_VARIABLE), shutil.which("npm")
     if not address and npm is not None:
         command = [npm, "config", "get", "registry"]
         answer = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
         address = answer.stdout.strip()
     if not address:
         raise InputError(
-            f"{needed(package)}, and there is no npm to fetch it with; install gscompleter "
-            f"from its wheel, which contains it, or set {REGISTRY} to the address of a registry."
+            f"{describe_missing_package(package)}, and there is no npm to fetch it with; install "
+            "gscompleter "
+            f"from its wheel, which contains it, or set {REGISTRY_VARIABLE} to the address of a "
+            "registry."
         )
     return address.rstrip("/")
 
 
-def needed(package: Package) -> str:
+def describe_missing_package(package: NpmPackage) -> str:
     """Make the beginning of a sentence about a missing package."""
     return f"The page needs {package.name} {package.version}, which is not on this machine"
 
 
-def member(archive: bytes, name: str) -> str:
+def read_archive_member(archive: bytes, name: str) -> str:
     """Read a text file of an npm archive, below its folder `package`."""
     with tarfile.open(fileobj=io.BytesIO(archive), mode="r:gz") as files:
         file = files.extractfile(f"package/{name}")

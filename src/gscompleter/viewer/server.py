@@ -11,13 +11,13 @@ from gscompleter.viewer.page import Page
 
 ADDRESS = "127.0.0.1"
 """Network interface of the server."""
-NAMES = (ADDRESS, "localhost")
+HOST_NAMES = (ADDRESS, "localhost")
 """Accepted host names; any other one may be a DNS rebinding attack by a website."""
-TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8"}
+MEDIA_TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8"}
 """Media types by file extension."""
 
 
-def serving(page: Page, port: int = 0) -> ThreadingHTTPServer:
+def make_page_server(page: Page, port: int = 0) -> ThreadingHTTPServer:
     """Make a server for the page on `port` (0 for any), to be started by `serve_forever`.
 
     Raises:
@@ -25,7 +25,7 @@ def serving(page: Page, port: int = 0) -> ThreadingHTTPServer:
     """
     files = {"/": page.html, **{f"/{name}": part for name, part in page.parts.items()}}
     try:
-        return ThreadingHTTPServer((ADDRESS, port), handler_of(files))
+        return ThreadingHTTPServer((ADDRESS, port), make_handler(files))
     except OSError as error:
         raise InputError(
             f"Port {port} of {ADDRESS} is not available ({error.strerror}); name another one.",
@@ -33,7 +33,7 @@ def serving(page: Page, port: int = 0) -> ThreadingHTTPServer:
         ) from error
 
 
-def handler_of(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
+def make_handler(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
     """Make a request handler for `files`, which are keyed by URL path."""
 
     class Handler(BaseHTTPRequestHandler):
@@ -45,7 +45,7 @@ def handler_of(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
 
         def answer(self, with_body: bool) -> None:
             path = unquote(urlsplit(self.path).path)
-            if host_of(self.headers.get("Host", "")) not in NAMES:
+            if parse_host(self.headers.get("Host", "")) not in HOST_NAMES:
                 self.send_error(421, "This server answers to 127.0.0.1 and localhost only")
             elif path not in files:
                 self.send_error(404)
@@ -54,7 +54,9 @@ def handler_of(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
 
         def send(self, path: str, content: bytes, with_body: bool) -> None:
             self.send_response(200)
-            self.send_header("Content-Type", TYPES[".js" if path.endswith(".js") else ".html"])
+            self.send_header(
+                "Content-Type", MEDIA_TYPES[".js" if path.endswith(".js") else ".html"]
+            )
             self.send_header("Content-Length", str(len(content)))
             self.send_header("X-Content-Type-Options", "nosniff")
             self.send_header("Cross-Origin-Resource-Policy", "same-origin")
@@ -69,6 +71,6 @@ def handler_of(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
     return Handler
 
 
-def host_of(header: str) -> str:
+def parse_host(header: str) -> str:
     """Parse the host name of a Host header, without its port."""
     return header.rsplit(":", 1)[0].lower()

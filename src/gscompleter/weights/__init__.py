@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from gscompleter.weights.fetching import WeightsNotAvailable, cached, fetch, place_of
+from gscompleter.weights.fetching import WeightsNotAvailable, fetch, find_cached, get_cache_path
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
 if TYPE_CHECKING:
@@ -19,10 +19,10 @@ __all__ = [
     "PUBLISHED",
     "PublishedWeights",
     "WeightsNotAvailable",
-    "cached",
     "fetch",
+    "find_cached",
+    "get_cache_path",
     "load_strictly",
-    "place_of",
     "read_state_dict",
 ]
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
-from gscompleter.cache import cache_folder
+from gscompleter.cache import get_download_folder
 from gscompleter.errors import InputError
 from gscompleter.weights.published import PublishedWeights
 
@@ -36,29 +36,29 @@ def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = 
         WeightsNotAvailable: The file is not local and cannot be downloaded.
     """
     if local is not None:
-        return _given(weights, local)
-    found = cached(weights)
+        return _check_local_file(weights, local)
+    found = find_cached(weights)
     if found is not None:
         return found
     if weights.repository is None:
         raise WeightsNotAvailable(
             f"The weights {weights.name} are not on this machine and have no automatic download; "
-            f"{_by_hand(weights)}."
+            f"{_describe_manual_download(weights)}."
         )
     return _download(weights, offline)
 
 
-def place_of(weights: PublishedWeights) -> Path:
+def get_cache_path(weights: PublishedWeights) -> Path:
     """Return the path for a manually downloaded file: `weights/MODEL/FILE` in our cache."""
-    return cache_folder() / "weights" / weights.model.lower() / weights.file
+    return get_download_folder() / "weights" / weights.model.lower() / weights.file
 
 
-def cached(weights: PublishedWeights) -> Path | None:
+def find_cached(weights: PublishedWeights) -> Path | None:
     """Find the file in our cache or in the hub's; None if it is in neither."""
-    place = place_of(weights)
+    place = get_cache_path(weights)
     if os.path.isfile(place):
         return place
-    if weights.repository is None or not hub_is_installed():
+    if weights.repository is None or not is_hub_installed():
         return None
     from huggingface_hub import try_to_load_from_cache
 
@@ -66,12 +66,12 @@ def cached(weights: PublishedWeights) -> Path | None:
     return Path(found) if isinstance(found, str) else None
 
 
-def hub_is_installed() -> bool:
+def is_hub_installed() -> bool:
     """Return True if huggingface_hub is installed."""
     return find_spec("huggingface_hub") is not None
 
 
-def _given(weights: PublishedWeights, local: Path) -> Path:
+def _check_local_file(weights: PublishedWeights, local: Path) -> Path:
     path = local / weights.file if os.path.isdir(local) else local
     if not os.path.isfile(path):
         raise InputError(
@@ -81,13 +81,13 @@ def _given(weights: PublishedWeights, local: Path) -> Path:
     return path
 
 
-def _by_hand(weights: PublishedWeights) -> str:
+def _describe_manual_download(weights: PublishedWeights) -> str:
     address = weights.url if weights.repository else f"{weights.file} from {weights.url}"
-    return f"fetch {address} into {place_of(weights).parent}"
+    return f"fetch {address} into {get_cache_path(weights).parent}"
 
 
 @contextmanager
-def few_retries() -> Iterator[None]:
+def limit_retries() -> Iterator[None]:
     """Limit the hub's library to `MAX_RETRIES` retries, by temporarily changed defaults."""
     from huggingface_hub import utils
 
@@ -115,11 +115,11 @@ def _download(weights: PublishedWeights, offline: bool) -> Path:
         from huggingface_hub.errors import LocalEntryNotFoundError
     except ImportError as error:
         raise WeightsNotAvailable(
-            f"huggingface_hub is missing: {INSTALL}; or {_by_hand(weights)}."
+            f"huggingface_hub is missing: {INSTALL}; or {_describe_manual_download(weights)}."
         ) from error
     offline = offline or constants.HF_HUB_OFFLINE
     try:
-        with few_retries():
+        with limit_retries():
             path = hf_hub_download(
                 weights.repository,
                 weights.file,
@@ -129,12 +129,13 @@ def _download(weights: PublishedWeights, offline: bool) -> Path:
     except LocalEntryNotFoundError as error:
         reason = "downloads are off" if offline else "the hub cannot be reached"
         raise WeightsNotAvailable(
-            f"The weights {weights.name} are not on this machine and {reason}; {_by_hand(weights)}."
+            f"The weights {weights.name} are not on this machine and {reason}; "
+            f"{_describe_manual_download(weights)}."
         ) from error
     except Exception as error:
         # The error type depends on the version of huggingface_hub; the advice does not.
         raise WeightsNotAvailable(
             f"The weights {weights.name} were not downloaded ({type(error).__name__}); "
-            f"{_by_hand(weights)}."
+            f"{_describe_manual_download(weights)}."
         ) from error
     return Path(path)

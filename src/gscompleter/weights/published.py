@@ -67,7 +67,7 @@ class PublishedWeights:
         return self.gives != "depth" and self.network is not None
 
     @property
-    def pinned_by(self) -> str:
+    def integrity_check(self) -> str:
         """Description of the check that the file is the published one."""
         if self.sha256 is None:
             return "nothing"
@@ -129,7 +129,7 @@ PARAMETERS = {
 }
 
 
-def _depthsplat(
+def _create_depthsplat(
     file: str, configuration: str, caution: str = "", far: float = 100.0
 ) -> PublishedWeights:
     """Parse the name of a DepthSplat file: model, image size, view range, start of its SHA-256."""
@@ -154,7 +154,7 @@ def _depthsplat(
     )
 
 
-def _depth_anything(
+def _create_depth_anything(
     name: str, repository: str, parameters: int, caution: str = NON_COMMERCIAL, **others: Any
 ) -> PublishedWeights:
     return PublishedWeights(
@@ -176,7 +176,7 @@ def _depth_anything(
     )
 
 
-def _retrained(weights: PublishedWeights, **others: Any) -> PublishedWeights:
+def _create_retrained(weights: PublishedWeights, **others: Any) -> PublishedWeights:
     """Create the entry of a baseline that VolSplat's authors retrained and published."""
     return replace(
         weights,
@@ -193,40 +193,48 @@ def _retrained(weights: PublishedWeights, **others: Any) -> PublishedWeights:
     )
 
 
-DEPTHSPLAT = _depthsplat("depthsplat-gs-small-re10k-256x256-view2-cfeab6b1.pth", "small-s1-u4-l4")
+DEPTHSPLAT = _create_depthsplat(
+    "depthsplat-gs-small-re10k-256x256-view2-cfeab6b1.pth", "small-s1-u4-l4"
+)
 DEPTH_ALONE: dict[str, Any] = {"near_far": None, "entry": "model", "prefix": "", "gives": "depth"}
 
 _FILES = (
     MVSPLAT,
     replace(MVSPLAT, name="mvsplat-acid", file="acid.ckpt"),
     # Its tensor names are not known.
-    _retrained(MVSPLAT, name="mvsplat-re10k-6view", file="mvsplat-re10k-baseline-256x256.ckpt"),
+    _create_retrained(
+        MVSPLAT, name="mvsplat-re10k-6view", file="mvsplat-re10k-baseline-256x256.ckpt"
+    ),
     DEPTHSPLAT,
-    _depthsplat("depthsplat-gs-base-re10k-256x256-view2-ca7b6795.pth", "base-s2-u2-l4", FROM_BASE),
-    _depthsplat(
+    _create_depthsplat(
+        "depthsplat-gs-base-re10k-256x256-view2-ca7b6795.pth", "base-s2-u2-l4", FROM_BASE
+    ),
+    _create_depthsplat(
         "depthsplat-gs-large-re10k-256x256-view2-e0f0f27a.pth", "large-s2-u2-l4", FROM_LARGE
     ),
-    _depthsplat("depthsplat-gs-base-re10k-256x448-view2-fea94f65.pth", "base-s2-u4-l8", FROM_BASE),
-    _depthsplat(
+    _create_depthsplat(
+        "depthsplat-gs-base-re10k-256x448-view2-fea94f65.pth", "base-s2-u4-l8", FROM_BASE
+    ),
+    _create_depthsplat(
         "depthsplat-gs-base-dl3dv-256x448-randview2-6-02c7b19d.pth",
         "base-s2-u4-l8",
         f"{ON_DL3DV}; {FROM_BASE}",
         far=200.0,
     ),
-    _depthsplat(
+    _create_depthsplat(
         "depthsplat-gs-small-re10kdl3dv-448x768-randview4-10-c08188db.pth",
         "small-s1-u8-l8",
         ON_DL3DV,
         far=200.0,
     ),
-    _depthsplat(
+    _create_depthsplat(
         "depthsplat-gs-base-re10kdl3dv-448x768-randview2-6-f8ddd845.pth",
         "base-s2-u4-l8",
         f"{ON_DL3DV}; {FROM_BASE}",
         far=200.0,
     ),
     # Its size is not published.
-    _retrained(
+    _create_retrained(
         DEPTHSPLAT,
         name="depthsplat-re10k-6view",
         network=None,
@@ -235,13 +243,15 @@ _FILES = (
     ),
     # Its upsampling is not published.
     replace(
-        _depthsplat("depthsplat-depth-small-352x640-randview2-8-e807bd82.pth", "", ON_DEPTH_DATA),
+        _create_depthsplat(
+            "depthsplat-depth-small-352x640-randview2-8-e807bd82.pth", "", ON_DEPTH_DATA
+        ),
         network=None,
         parameters=36_000_000,
         **DEPTH_ALONE,
     ),
     replace(
-        _depthsplat(
+        _create_depthsplat(
             "depthsplat-depth-base-352x640-randview2-8-65a892c5.pth",
             "depth-base-s2-u4-l8",
             f"{ON_DEPTH_DATA}; {FROM_BASE}",
@@ -249,7 +259,7 @@ _FILES = (
         **DEPTH_ALONE,
     ),
     VOLSPLAT,
-    _depth_anything(
+    _create_depth_anything(
         "da3-small",
         "DA3-SMALL",
         34_299_463,
@@ -258,10 +268,10 @@ _FILES = (
         sha256="364492e38a3a06d221ac75da7f6621ada3f2361cd24fde11ba79091e9f40efcf",
         gives="scene depth",
     ),
-    _depth_anything("da3-base", "DA3-BASE", 135_366_599, "", gives="scene depth"),
-    _depth_anything("da3-large", "DA3-LARGE-1.1", 410_941_767, gives="scene depth"),
-    _depth_anything("da3-giant", "DA3-GIANT-1.1", 1_355_674_125),
-    _depth_anything(
+    _create_depth_anything("da3-base", "DA3-BASE", 135_366_599, "", gives="scene depth"),
+    _create_depth_anything("da3-large", "DA3-LARGE-1.1", 410_941_767, gives="scene depth"),
+    _create_depth_anything("da3-giant", "DA3-GIANT-1.1", 1_355_674_125),
+    _create_depth_anything(
         "da3-metric-large",
         "DA3METRIC-LARGE",
         334_171_394,
@@ -269,7 +279,7 @@ _FILES = (
         views=(1, 1),
         gives="scene depth",
     ),
-    _depth_anything("da3-nested-giant-large", "DA3NESTED-GIANT-LARGE-1.1", 1_689_845_519),
+    _create_depth_anything("da3-nested-giant-large", "DA3NESTED-GIANT-LARGE-1.1", 1_689_845_519),
 )
 
 PUBLISHED: dict[str, PublishedWeights] = {weights.name: weights for weights in _FILES}

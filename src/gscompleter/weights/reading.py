@@ -14,11 +14,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gscompleter.errors import InputError, names_listed, quoted, refuse_pointer
+from gscompleter.errors import InputError, join_names, quote_value, refuse_pointer
 from gscompleter.reading import open_file
 from gscompleter.weights.published import PUBLISHED, PublishedWeights
 
-NOT_THE_ENCODERS = ("decoder.", "losses.")
+IGNORED_PREFIXES = ("decoder.", "losses.")
 """Prefixes of tensors of other parts that training checkpoints contain."""
 
 
@@ -38,7 +38,7 @@ def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
     else:
         check_archive(path, weights.file)
     read = read_safetensors if path.suffix == ".safetensors" else read_tensors
-    return tensors_of_network(read(path, weights.file), path, weights)
+    return extract_network_tensors(read(path, weights.file), path, weights)
 
 
 def check_kind(path: Path, name: str) -> None:
@@ -56,12 +56,12 @@ def check_kind(path: Path, name: str) -> None:
     elif head.startswith(b"PK\x03\x04") and not is_archive(path):
         wrong = "ends too early, as after an interrupted download"
     if wrong:
-        raise _broken(path, wrong, name)
+        raise _create_file_error(path, wrong, name)
 
 
 def check_sha256(path: Path, expected: str, name: str) -> None:
     """Raise InputError if the SHA-256 of a file does not start with `expected`."""
-    digest = sha256_of(path)
+    digest = compute_sha256(path)
     if digest.startswith(expected):
         return
     for other in PUBLISHED.values():
@@ -70,10 +70,10 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
                 f"{path} is not the published file {name} but that of {other.name}; choose that "
                 f"model, or fetch {name}."
             )
-    raise _broken(path, f"is not the published file (SHA-256 {digest[:8]})", name)
+    raise _create_file_error(path, f"is not the published file (SHA-256 {digest[:8]})", name)
 
 
-def sha256_of(path: Path) -> str:
+def compute_sha256(path: Path) -> str:
     """Compute the SHA-256 of a file in blocks of 1 MiB."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
@@ -100,7 +100,7 @@ def check_archive(path: Path, name: str) -> None:
     except Exception as error:  # damaged archives raise many types
         damaged = str(error)
     if damaged is not None:
-        raise _broken(path, f"is damaged ({quoted(damaged)})", name)
+        raise _create_file_error(path, f"is damaged ({quote_value(damaged)})", name)
 
 
 def read_tensors(path: Path, name: str) -> Any:
@@ -112,11 +112,11 @@ def read_tensors(path: Path, name: str) -> Any:
     except pickle.UnpicklingError as error:
         found = re.search(r"GLOBAL (\S+)", str(error))
         if found is None:
-            raise _broken(path, "holds no plain weights", name) from error
-        objects = f"Python objects too ({quoted(found[1])}), which may run any code"
-        raise _broken(path, f"holds {objects}", name) from error
+            raise _create_file_error(path, "holds no plain weights", name) from error
+        objects = f"Python objects too ({quote_value(found[1])}), which may run any code"
+        raise _create_file_error(path, f"holds {objects}", name) from error
     except Exception as error:  # damaged pickles raise many types
-        raise _broken(path, "cannot be read by torch", name) from error
+        raise _create_file_error(path, "cannot be read by torch", name) from error
 
 
 def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
@@ -131,11 +131,13 @@ def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
         return safetensors.torch.load_file(path)
     except Exception as error:  # damaged files raise many types
         raise InputError(
-            f"{path} is no safetensors file ({quoted(str(error))}); give {name}."
+            f"{path} is no safetensors file ({quote_value(str(error))}); give {name}."
         ) from error
 
 
-def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
+def extract_network_tensors(
+    content: Any, path: Path, weights: PublishedWeights
+) -> dict[str, Tensor]:
     """Extract the network's tensors, without the prefix of their names; others are refused."""
 
     def other(held: str) -> InputError:
@@ -147,19 +149,19 @@ def tensors_of_network(content: Any, path: Path, weights: PublishedWeights) -> d
     prefix = weights.prefix
     found = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
     if not found:
-        raise other(f"no tensors named {prefix}…, but {_some(list(inner))}")
+        raise other(f"no tensors named {prefix}…, but {_list_some(list(inner))}")
     unknown = [
         key
         for key, value in inner.items()
         if not (key.startswith(prefix) and isinstance(value, Tensor))
-        and not key.startswith(NOT_THE_ENCODERS)
+        and not key.startswith(IGNORED_PREFIXES)
     ]
     if unknown:
-        raise other(f"more than the network {weights.name}: {_some(unknown)}")
+        raise other(f"more than the network {weights.name}: {_list_some(unknown)}")
     odd = [key for key, value in found.items() if not is_plain(value)]
     if odd:
         kinds = "empty shells, sparse or quantized ones"
-        raise other(f"tensors without plain numbers ({_some(odd)}): {kinds}")
+        raise other(f"tensors without plain numbers ({_list_some(odd)}): {kinds}")
     return found
 
 
@@ -169,7 +171,7 @@ def is_plain(tensor: Tensor) -> bool:
     return strided and not (tensor.is_meta or tensor.is_quantized or tensor.is_complex())
 
 
-def _broken(path: Path, wrong: str, name: str) -> InputError:
+def _create_file_error(path: Path, wrong: str, name: str) -> InputError:
     # In the hub's cache the path is a link; deleting its target makes the hub download again.
     file = path.resolve()
     if file == path.absolute():
@@ -177,5 +179,5 @@ def _broken(path: Path, wrong: str, name: str) -> InputError:
     return InputError(f"{name} {wrong}; delete {file} and fetch it anew.")
 
 
-def _some(keys: list[str]) -> str:
-    return names_listed(keys, 3) or "nothing"
+def _list_some(keys: list[str]) -> str:
+    return join_names(keys, 3) or "nothing"

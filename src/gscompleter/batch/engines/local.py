@@ -14,8 +14,8 @@ from multiprocessing.synchronize import Event
 from threading import Lock, Thread
 
 from gscompleter.batch.jobs import Job, Outcome, Perform
-from gscompleter.memory import memory_bytes, needed_bytes
-from gscompleter.threads import usable_cores
+from gscompleter.memory import estimate_bytes, read_memory_bytes
+from gscompleter.threads import count_available_cores
 
 PIXELS, IMAGES = 640 * 480, 8
 """Size of a typical completion, for the default number of workers."""
@@ -25,11 +25,11 @@ CLEANING_SECONDS = 20.0
 """Time that it then has to release its claim."""
 
 
-def default_workers() -> int:
+def choose_num_workers() -> int:
     """Return the number of cores, limited by the memory of a typical completion."""
-    there = memory_bytes()
-    fitting = usable_cores() if there is None else there // needed_bytes(PIXELS, IMAGES)
-    return max(1, min(usable_cores(), fitting))
+    there = read_memory_bytes()
+    fitting = count_available_cores() if there is None else there // estimate_bytes(PIXELS, IMAGES)
+    return max(1, min(count_available_cores(), fitting))
 
 
 @dataclass(frozen=True)
@@ -45,18 +45,18 @@ class LocalEngine:
         running: dict[Future[Outcome], tuple[ProcessPoolExecutor, Job]] = {}
         try:
             for _, job in zip(range(self.workers), waiting, strict=False):
-                send(perform, job, worker(stop), running)
+                submit_job(perform, job, start_worker(stop), running)
             while running:
                 ended, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in ended:
                     executor, job = running.pop(future)
-                    outcome = outcome_of(future, job)
+                    outcome = get_outcome(future, job)
                     following = next(waiting, None)
                     if outcome.state == "lost" or following is None:
                         executor.shutdown(wait=False)
                     if following is not None:
-                        again = worker(stop) if outcome.state == "lost" else executor
-                        send(perform, following, again, running)
+                        again = start_worker(stop) if outcome.state == "lost" else executor
+                        submit_job(perform, following, again, running)
                     yield outcome
         finally:
             stop.set()
@@ -64,17 +64,17 @@ class LocalEngine:
                 executor.shutdown(cancel_futures=True)
 
 
-def send(
+def submit_job(
     perform: Perform,
     job: Job,
     executor: ProcessPoolExecutor,
     running: dict[Future[Outcome], tuple[ProcessPoolExecutor, Job]],
 ) -> None:
     """Submit a job to a worker."""
-    running[executor.submit(busy_with, perform, job)] = executor, job
+    running[executor.submit(run_job, perform, job)] = executor, job
 
 
-def outcome_of(future: Future[Outcome], job: Job) -> Outcome:
+def get_outcome(future: Future[Outcome], job: Job) -> Outcome:
     """Return the outcome of a finished job; raise any error but that of a killed worker."""
     error = future.exception()
     if error is None:
@@ -84,7 +84,7 @@ def outcome_of(future: Future[Outcome], job: Job) -> Outcome:
     raise error
 
 
-def worker(stop: Event) -> ProcessPoolExecutor:
+def start_worker(stop: Event) -> ProcessPoolExecutor:
     """Start a process that ends with `stop` or with this process."""
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, context, begin_worker, (stop,))
@@ -94,7 +94,7 @@ _busy = Lock()
 """Held by a worker while it runs a job."""
 
 
-def busy_with(perform: Perform, job: Job) -> Outcome:
+def run_job(perform: Perform, job: Job) -> Outcome:
     """Run a job in this worker."""
     with _busy:
         return perform(job)
@@ -104,10 +104,10 @@ def begin_worker(stop: Event) -> None:
     """Initialize a worker: ignore Ctrl-C, which is for the parent, and watch `stop`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    Thread(target=watch, args=(stop,), daemon=True).start()
+    Thread(target=watch_parent, args=(stop,), daemon=True).start()
 
 
-def watch(stop: Event) -> None:
+def watch_parent(stop: Event) -> None:
     """End this process when it has to stop or its parent is gone; a job releases its claim."""
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from gscompleter.batch.jobs import Job, Outcome, Perform
-from gscompleter.errors import InputError, quoted
-from gscompleter.threads import bound_threads
+from gscompleter.errors import InputError, quote_value
+from gscompleter.threads import limit_threads
 
 IN_FLIGHT = 2
 """Tasks that wait or run, per task that the cluster can run at once."""
@@ -35,15 +35,15 @@ class RayEngine:
 
     def __call__(self, perform: Perform, jobs: Iterable[Job]) -> Iterator[Outcome]:
         """Run jobs as `Engine` does."""
-        with self._cluster() as ray:
+        with self._connect() as ray:
             # `Rounds` repeats lost tasks, because it counts the attempts of a job.
-            task = ray.remote(done).options(
+            task = ray.remote(run_remote_job).options(
                 num_cpus=self.threads, num_gpus=self.gpus, max_retries=0
             )
             waiting = iter(jobs)
             running: dict[Any, Job] = {}
             try:
-                for _, job in zip(range(self._in_flight(ray)), waiting, strict=False):
+                for _, job in zip(range(self._count_in_flight(ray)), waiting, strict=False):
                     running[task.remote(perform, job, self.threads)] = job
                 while running:
                     [ended], _ = ray.wait(list(running), num_returns=1)
@@ -52,7 +52,7 @@ class RayEngine:
                     if following is not None:
                         reference = task.remote(perform, following, self.threads)
                         running[reference] = following
-                    yield outcome_of(ray, ended, job)
+                    yield get_outcome(ray, ended, job)
             finally:
                 for reference in running:
                     ray.cancel(reference)
@@ -60,15 +60,16 @@ class RayEngine:
                     ray.wait(list(running), num_returns=len(running), timeout=STOP_SECONDS)
 
     @contextlib.contextmanager
-    def _cluster(self) -> Iterator[Any]:
+    def _connect(self) -> Iterator[Any]:
         """Connect to Ray, and shut down a local cluster at the end."""
-        ray = imported_ray()
+        ray = import_ray()
         handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
-            ray.init(log_to_driver=False, logging_level="ERROR", **self._where())
+            ray.init(log_to_driver=False, logging_level="ERROR", **self._get_init_options())
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise InputError(
-                f"There is no cluster of Ray at {quoted(self.address)}: {quoted(str(error))}.",
+                f"There is no cluster of Ray at {quote_value(self.address)}: "
+                f"{quote_value(str(error))}.",
                 "address",
             ) from error
         try:
@@ -79,7 +80,7 @@ class RayEngine:
         finally:
             ray.shutdown()
 
-    def _where(self) -> dict[str, Any]:
+    def _get_init_options(self) -> dict[str, Any]:
         if self.address is not None:
             return {"address": self.address}
         cpus = None if self.workers is None else self.workers * self.threads
@@ -90,14 +91,14 @@ class RayEngine:
             "object_store_memory": STORE_BYTES,
         }
 
-    def _in_flight(self, ray: Any) -> int:
+    def _count_in_flight(self, ray: Any) -> int:
         if self.workers is not None:
             return self.workers
         there = int(ray.cluster_resources().get("CPU", 1) // self.threads)
         return IN_FLIGHT * max(1, there)
 
 
-def imported_ray() -> Any:
+def import_ray() -> Any:
     """Import Ray; raise InputError if it is not installed."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # Suppresses Ray's notice about future versions on standard error.
@@ -111,13 +112,13 @@ def imported_ray() -> Any:
     return ray
 
 
-def done(perform: Perform, job: Job, threads: int) -> Outcome:
+def run_remote_job(perform: Perform, job: Job, threads: int) -> Outcome:
     """Run a job in a worker of Ray."""
-    bound_threads(threads)  # before the first job imports libraries that read it
+    limit_threads(threads)  # before the first job imports libraries that read it
     return perform(job)
 
 
-def outcome_of(ray: Any, reference: Any, job: Job) -> Outcome:
+def get_outcome(ray: Any, reference: Any, job: Job) -> Outcome:
     """Return the outcome of a finished task; raise any error but that of a lost worker."""
     try:
         outcome: Outcome = ray.get(reference)

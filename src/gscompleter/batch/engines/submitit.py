@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.batch.jobs import Job, Outcome, Perform
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 
 POLL_SECONDS = 2.0
 """Interval between checks of the SLURM jobs."""
@@ -32,14 +32,14 @@ class SubmititEngine:
         """Run jobs as `Engine` does."""
         listed = list(jobs)
         shares = [share for i in range(self.workers) if (share := listed[i :: self.workers])]
-        executor = self._executor()
+        executor = self._make_executor()
         with executor.batch():
             sent = [executor.submit(Share(perform, self.threads), share) for share in shares]
         waiting = dict(zip(sent, shares, strict=True))
         try:
             while waiting:
                 for job in [job for job in waiting if job.done()]:
-                    yield from outcomes_of(job, waiting.pop(job))
+                    yield from collect_outcomes(job, waiting.pop(job))
                 if waiting:
                     time.sleep(POLL_SECONDS)
         finally:
@@ -47,7 +47,7 @@ class SubmititEngine:
                 with contextlib.suppress(Exception):  # it may just have ended
                     job.cancel()
 
-    def _executor(self) -> Any:
+    def _make_executor(self) -> Any:
         try:
             import submitit
         except ImportError as error:
@@ -67,7 +67,7 @@ class SubmititEngine:
             )
         except (ValueError, NameError, TypeError) as error:
             raise InputError(
-                f"A --slurm parameter is invalid: {quoted(str(error))}; correct it."
+                f"A --slurm parameter is invalid: {quote_value(str(error))}; correct it."
             ) from error
         return executor
 
@@ -81,11 +81,11 @@ class Share:
 
     def __call__(self, share: Sequence[Job]) -> list[Outcome]:
         """Run the jobs of a share one after the other."""
-        from gscompleter.interrupts import treat_stops_alike
-        from gscompleter.threads import bound_threads
+        from gscompleter.interrupts import handle_stop_signals
+        from gscompleter.threads import limit_threads
 
-        bound_threads(self.threads)
-        treat_stops_alike()
+        limit_threads(self.threads)
+        handle_stop_signals()
         return [self.perform(job) for job in share]
 
     def checkpoint(self, share: Sequence[Job]) -> Any:
@@ -95,7 +95,7 @@ class Share:
         return submitit.helpers.DelayedSubmission(self, share)
 
 
-def outcomes_of(sent: Any, share: Sequence[Job]) -> Iterator[Outcome]:
+def collect_outcomes(sent: Any, share: Sequence[Job]) -> Iterator[Outcome]:
     """Yield the outcomes of a share; all of them are lost if its SLURM job was killed."""
     error = sent.exception()
     if error is None:

@@ -10,12 +10,12 @@ import torch
 from gscompleter.generators.diffusion.published import IncompleteWeightsError, Source
 
 
-def language_models(source: Source, dtype: torch.dtype) -> dict[str, Any]:
+def load_language_models(source: Source, dtype: torch.dtype) -> dict[str, Any]:
     """Load the parts of a pipeline that are models of transformers, by name."""
     import transformers
     from diffusers import DiffusionPipeline, pipelines
 
-    parts = DiffusionPipeline.load_config(source.place, **source.arguments)
+    parts = DiffusionPipeline.load_config(source.location, **source.load_arguments)
     models = {}
     for name, kind in parts.items():
         if not isinstance(kind, (list, tuple)) or kind[0] is None:
@@ -24,11 +24,13 @@ def language_models(source: Source, dtype: torch.dtype) -> dict[str, Any]:
         library = transformers if kind[0] == "transformers" else getattr(pipelines, kind[0], None)
         model = getattr(library, kind[1], None)
         if isinstance(model, type) and issubclass(model, transformers.PreTrainedModel):
-            models[name] = loaded(model, source, name, dtype=dtype, subfolder=name)
+            models[name] = load_transformers_model(model, source, name, dtype=dtype, subfolder=name)
     return models
 
 
-def loaded(kind: Any, source: Source, part: str, unused: str = "^$", **arguments: Any) -> Any:
+def load_transformers_model(
+    kind: Any, source: Source, part: str, unused: str = "^$", **arguments: Any
+) -> Any:
     """Load a model of transformers of class `kind`, named `part` in errors.
 
     Tensors that match `unused` may be missing.
@@ -37,7 +39,7 @@ def loaded(kind: Any, source: Source, part: str, unused: str = "^$", **arguments
         IncompleteWeightsError: A tensor is missing.
     """
     model, info = kind.from_pretrained(
-        source.place, output_loading_info=True, **{**source.arguments, **arguments}
+        source.location, output_loading_info=True, **{**source.load_arguments, **arguments}
     )
     missing = sorted(name for name in info["missing_keys"] if not re.search(unused, name))
     if missing:

@@ -13,30 +13,30 @@ from torch import Tensor
 
 from gscompleter.config.generators import DiffusersInpaintSettings
 from gscompleter.errors import InputError
-from gscompleter.generators import Synthesis
-from gscompleter.generators.agreement import checked
-from gscompleter.generators.diffusion.complete import check_parts, language_models
-from gscompleter.generators.diffusion.kontext import resized
-from gscompleter.generators.diffusion.placing import place, precision_on
+from gscompleter.generators import GeneratorOutput
+from gscompleter.generators.agreement import paint_consistently
+from gscompleter.generators.diffusion.complete import check_parts, load_language_models
+from gscompleter.generators.diffusion.kontext import resize_antialiased
+from gscompleter.generators.diffusion.placing import move_to_device, select_dtype
 from gscompleter.generators.diffusion.published import (
     Source,
     announce,
-    needs_diffusers,
-    reading,
-    source_of,
+    check_packages,
+    convert_load_errors,
+    parse_source,
 )
 from gscompleter.generators.warp import (
-    Warped,
-    background_first,
+    WarpedImage,
+    add_unexplained,
+    fill_background_first,
     warp_photographs,
-    with_unexplained,
 )
 from gscompleter.masks import dilate
-from gscompleter.types import Camera, SceneContext, View
+from gscompleter.types import Camera, GeneratorInput, View
 
-SIDE = 512
+DEFAULT_SIDE = 512
 """Default side length of the square image, in pixels."""
-MARGIN = 4
+BORDER_WIDTH = 4
 """Width in pixels around a hole that is inpainted too, for smooth borders, but not kept."""
 
 
@@ -50,13 +50,13 @@ class Painter:
     multiple: int
     """Divisor of the side lengths of all images, in pixels."""
 
-    def size_for(self, height: int, width: int) -> tuple[int, int]:
+    def compute_size(self, height: int, width: int) -> tuple[int, int]:
         """Compute a size of about `side`² pixels with the aspect ratio of the image."""
         scale = self.side / (height * width) ** 0.5
         h, w = (max(1, round(scale * n / self.multiple)) for n in (height, width))
         return h * self.multiple, w * self.multiple
 
-    def paint(
+    def fill_hole(
         self,
         image: Float[Tensor, "h w 3"],
         hole: Bool[Tensor, "h w"],
@@ -65,11 +65,11 @@ class Painter:
         steps: int | None,
     ) -> Float[Tensor, "h w 3"]:
         """Inpaint the hole; other pixels may change too."""
-        size = self.size_for(*hole.shape)
-        mask = (resized(hole[..., None].float(), size) > 0).float()
+        size = self.compute_size(*hole.shape)
+        mask = (resize_antialiased(hole[..., None].float(), size) > 0).float()
         wanted: dict[str, Any] = {
             "prompt": prompt,
-            "image": resized(image, size).permute(2, 0, 1)[None].cpu(),
+            "image": resize_antialiased(image, size).permute(2, 0, 1)[None].cpu(),
             "mask_image": mask.permute(2, 0, 1)[None].cpu(),
             "height": size[0],
             "width": size[1],
@@ -81,7 +81,7 @@ class Painter:
             wanted["num_inference_steps"] = steps
         known = inspect.signature(self.pipeline.__call__).parameters
         painted = self.pipeline(**{k: v for k, v in wanted.items() if k in known}).images[0]
-        back = resized(painted.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
+        back = resize_antialiased(painted.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
         return back.clamp(0, 1).to(image.device)
 
 
@@ -99,28 +99,28 @@ class DiffusersInpaint:
     retries: int = 0
     """Number of further seeds to try if the image is inconsistent with the warped photographs."""
 
-    def __call__(self, nearest: View, target: Camera, context: SceneContext) -> Synthesis:
+    def __call__(self, nearest: View, target: Camera, context: GeneratorInput) -> GeneratorOutput:
         """Synthesize the image at `target`; pixels outside the hole are warped photographs."""
-        observed = completed_warp(nearest, target, context)
-        hole = dilate(~observed.known, MARGIN)
+        observed = complete_warp(nearest, target, context)
+        hole = dilate(~observed.known, BORDER_WIDTH)
 
         def paint(seed: int) -> Float[Tensor, "h w 3"]:
-            return self.painter.paint(observed.image, hole, self.prompt, seed, self.steps)
+            return self.painter.fill_hole(observed.image, hole, self.prompt, seed, self.steps)
 
         compared = replace(observed, known=~hole)
         correct = context.correct_color
-        painted = checked(paint, self.seed, compared, self.retries, correct)
+        painted = paint_consistently(paint, self.seed, compared, self.retries, correct)
         known = observed.known[..., None]
         return replace(painted, image=torch.where(known, observed.image, painted.image))
 
 
-def completed_warp(nearest: View, target: Camera, context: SceneContext) -> Warped:
+def complete_warp(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
     """Warp the photographs to the target and extrapolate their colours smoothly into the holes."""
     warped = warp_photographs(nearest, target, context)
     if not warped.known.any():
         return replace(warped, image=nearest.image.mean(dim=(0, 1)).expand_as(warped.image))
-    warped = with_unexplained(warped, target, context)
-    tone, _ = background_first(warped)
+    warped = add_unexplained(warped, target, context)
+    tone, _ = fill_background_first(warped)
     return replace(warped, image=tone.clamp(0, 1).to(warped.image.device))
 
 
@@ -146,27 +146,27 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
     Raises:
         InputError: Packages, the path, or an inpainting pipeline are missing.
     """
-    needs_diffusers("diffusers-inpaint")
+    check_packages("diffusers-inpaint")
     if path is None:
         raise InputError(
             "The generator 'diffusers-inpaint' needs the path of a model; give a folder that "
             "diffusers saved or USER/NAME on the Hugging Face hub.",
             "generator_weights",
         )
-    source = source_of(path)
+    source = parse_source(path)
     announce([source])
-    with reading(source):
-        pipeline = inpainting(source, precision_on(device))
-    place(pipeline, device, offload)
-    return Painter(pipeline, *size_rules(pipeline))
+    with convert_load_errors(source):
+        pipeline = load_inpainting_pipeline(source, select_dtype(device))
+    move_to_device(pipeline, device, offload)
+    return Painter(pipeline, *get_size_rules(pipeline))
 
 
-def inpainting(source: Source, dtype: torch.dtype) -> Any:
+def load_inpainting_pipeline(source: Source, dtype: torch.dtype) -> Any:
     """Load the pipeline of a folder or repository as an inpainting pipeline."""
     from diffusers import AutoPipelineForInpainting, DiffusionPipeline
 
     pipeline = DiffusionPipeline.from_pretrained(
-        source.place, dtype=dtype, **language_models(source, dtype), **source.arguments
+        source.location, dtype=dtype, **load_language_models(source, dtype), **source.load_arguments
     )
     check_parts(pipeline)
     if {"image", "mask_image"} <= set(inspect.signature(pipeline.__call__).parameters):
@@ -174,12 +174,14 @@ def inpainting(source: Source, dtype: torch.dtype) -> Any:
     return AutoPipelineForInpainting.from_pipe(pipeline)
 
 
-def size_rules(pipeline: Any) -> tuple[int, int]:
+def get_size_rules(pipeline: Any) -> tuple[int, int]:
     """Return the side length of training images and the divisor of side lengths, in pixels."""
     latent = int(getattr(pipeline, "vae_scale_factor", 8))
     unet = getattr(pipeline, "unet", None)
     if unet is None:
-        return int(getattr(pipeline, "default_sample_size", SIDE // latent)) * latent, 2 * latent
-    side = unet.config.get("sample_size") or SIDE // latent
+        return int(
+            getattr(pipeline, "default_sample_size", DEFAULT_SIDE // latent)
+        ) * latent, 2 * latent
+    side = unet.config.get("sample_size") or DEFAULT_SIDE // latent
     side = max(side) if isinstance(side, (list, tuple)) else int(side)
     return side * latent, latent * 2 ** (len(unet.config.block_out_channels) - 1)

@@ -41,12 +41,12 @@ class Kontext:
         """Side length of a token in pixels: 16 for FLUX."""
         return 2 * int(self.pipeline.vae_scale_factor)
 
-    def size_for(self, height: int, width: int) -> tuple[int, int]:
+    def compute_size(self, height: int, width: int) -> tuple[int, int]:
         """Compute the processing size of an image of `height` x `width` pixels."""
-        h, w = nearest_size(height, width)
+        h, w = find_nearest_size(height, width)
         return h // self.token_size * self.token_size, w // self.token_size * self.token_size
 
-    def grid(self, size: tuple[int, int]) -> tuple[int, int]:
+    def compute_grid(self, size: tuple[int, int]) -> tuple[int, int]:
         """Compute height and width in tokens of an image of `size` pixels."""
         return size[0] // self.token_size, size[1] // self.token_size
 
@@ -73,26 +73,26 @@ class Kontext:
             guidance: Scale of the distilled guidance.
         """
         pipeline = self.pipeline
-        count, grid = len(photographs), self.grid(size)
+        count, grid = len(photographs), self.compute_grid(size)
         # One at a time: the VAE needs much more memory than the tokens.
-        source = torch.stack([self.encoded(photograph) for photograph in photographs])
+        source = torch.stack([self.encode_image(photograph) for photograph in photographs])
         channels = pipeline.transformer.config.in_channels // 4
         noise = torch.randn(
             (1, channels, 2 * grid[0], 2 * grid[1]),
             generator=torch.Generator().manual_seed(seed),
             dtype=self.dtype,
         )
-        latents = in_tokens(noise.to(self.device)).expand(count, -1, -1)
+        latents = pack_tokens(noise.to(self.device)).expand(count, -1, -1)
         repeated_target = target_positions.expand(count, -1, -1)
         positions = torch.cat([repeated_target, source_positions], dim=1).to(self.device)
-        for time in self.times(steps, len(target_positions)):
-            velocity = self.velocity(latents, source, positions, time, guidance)
+        for time in self.compute_timesteps(steps, len(target_positions)):
+            velocity = self.predict_velocity(latents, source, positions, time, guidance)
             latents = pipeline.scheduler.step(velocity, time, latents, return_dict=False)[0]
-        images = torch.stack([self.decoded(tokens, grid) for tokens in latents])
+        images = torch.stack([self.decode_tokens(tokens, grid) for tokens in latents])
         pipeline.maybe_free_model_hooks()
         return images
 
-    def velocity(
+    def predict_velocity(
         self,
         latents: Float[Tensor, "b n c"],
         source: Float[Tensor, "b m c"],
@@ -118,7 +118,7 @@ class Kontext:
         )
         return predicted[:, : latents.shape[1]]
 
-    def times(self, steps: int, tokens: int) -> Float[Tensor, "steps"]:
+    def compute_timesteps(self, steps: int, tokens: int) -> Float[Tensor, "steps"]:
         """Compute the denoising timesteps; more tokens shift them towards noise."""
         scheduler = self.pipeline.scheduler
         settings = scheduler.config
@@ -130,14 +130,14 @@ class Kontext:
         scheduler.set_begin_index(0)
         return scheduler.timesteps
 
-    def encoded(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "m c"]:
+    def encode_image(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "m c"]:
         """Encode an image in [0, 1] into latent tokens."""
         vae = self.pipeline.vae
         pixels = (2 * image.permute(2, 0, 1)[None] - 1).to(self.device, self.dtype)
         latents = vae.encode(pixels).latent_dist.mode()
-        return in_tokens((latents - vae.config.shift_factor) * vae.config.scaling_factor)[0]
+        return pack_tokens((latents - vae.config.shift_factor) * vae.config.scaling_factor)[0]
 
-    def decoded(
+    def decode_tokens(
         self, tokens: Float[Tensor, "n c"], grid: tuple[int, int]
     ) -> Float[Tensor, "h w 3"]:
         """Decode latent tokens into an image in [0, 1]."""
@@ -149,19 +149,19 @@ class Kontext:
         return (image[0].permute(1, 2, 0).float() / 2 + 0.5).clamp(0, 1)
 
 
-def in_tokens(latents: Float[Tensor, "b c h w"]) -> Float[Tensor, "b tokens channels"]:
+def pack_tokens(latents: Float[Tensor, "b c h w"]) -> Float[Tensor, "b tokens channels"]:
     """Pack blocks of 2 x 2 latent pixels into tokens, row by row."""
     blocks = latents.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))  # b c h/2 2 w/2 2
     return blocks.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2)
 
 
-def nearest_size(height: int, width: int) -> tuple[int, int]:
+def find_nearest_size(height: int, width: int) -> tuple[int, int]:
     """Select the entry of `SIZES` with the nearest aspect ratio."""
     aspect = width / height
     return min(SIZES, key=lambda size: (abs(aspect - size[1] / size[0]), size[1]))
 
 
-def resized(
+def resize_antialiased(
     image: Float[Tensor, "h w c"], size: tuple[int, int]
 ) -> Float[Tensor, "height width c"]:
     """Resize an image bilinearly, with antialiasing if it shrinks."""

@@ -10,19 +10,23 @@ from typing import Any
 import torch
 
 from gscompleter.errors import InputError
-from gscompleter.generators.diffusion.complete import check_complete, check_parts, language_models
+from gscompleter.generators.diffusion.complete import (
+    check_complete,
+    check_parts,
+    load_language_models,
+)
 from gscompleter.generators.diffusion.kontext import Kontext, Prompt
-from gscompleter.generators.diffusion.placing import place, precision_on
+from gscompleter.generators.diffusion.placing import move_to_device, select_dtype
 from gscompleter.generators.diffusion.published import (
     KONTEXT,
     PE_FIELD,
     Source,
     announce,
-    needs_diffusers,
-    reading,
-    source_of,
+    check_packages,
+    convert_load_errors,
+    parse_source,
 )
-from gscompleter.generators.diffusion.rotary import HEADS, with_per_head_positions
+from gscompleter.generators.diffusion.rotary import HEADS, enable_per_head_positions
 
 PROMPT = "Ensure that the picture does not change in any way"
 """Fixed prompt of the training."""
@@ -41,35 +45,35 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
     Raises:
         InputError: Packages or weights are missing, or the weights do not fit.
     """
-    needs_diffusers("pe-field")
-    base, transformer = sources(path)
+    check_packages("pe-field")
+    base, transformer = find_sources(path)
     announce([base, transformer])
-    dtype = precision_on(device)
-    with reading(base):
+    dtype = select_dtype(device)
+    with convert_load_errors(base):
         prompt = encode_prompt(base, device, dtype)
-    with reading(transformer):
+    with convert_load_errors(transformer):
         network = load_transformer(transformer, dtype)
-    with reading(base):
+    with convert_load_errors(base):
         pipeline = load_pipeline(base, network, dtype)
     heads = pipeline.transformer.config.num_attention_heads
     if heads != HEADS:
         raise InputError(
-            f"The transformer of {transformer.place} has {heads} heads, and PE-Field needs "
+            f"The transformer of {transformer.location} has {heads} heads, and PE-Field needs "
             f"{HEADS}; give that of PE-Field."
         )
-    with_per_head_positions(pipeline.transformer)
-    place(pipeline, device, offload)
+    enable_per_head_positions(pipeline.transformer)
+    move_to_device(pipeline, device, offload)
     return Kontext(pipeline, prompt, device, dtype)
 
 
-def sources(path: str | None) -> tuple[Source, Source]:
+def find_sources(path: str | None) -> tuple[Source, Source]:
     """Determine the sources of base pipeline and transformer."""
     if path is None:
         return KONTEXT, PE_FIELD
-    given = source_of(path)
-    if not given.is_local or (Path(given.place) / "model_index.json").is_file():
+    given = parse_source(path)
+    if not given.is_local or (Path(given.location) / "model_index.json").is_file():
         return given, replace(given, subfolder="transformer")
-    if (Path(given.place) / "config.json").is_file():
+    if (Path(given.location) / "config.json").is_file():
         return KONTEXT, given
     raise InputError(
         f"{path} holds neither a model_index.json (a pipeline) nor a config.json (a transformer); "
@@ -82,12 +86,12 @@ def encode_prompt(base: Source, device: str, dtype: torch.dtype) -> Prompt:
     from diffusers import FluxKontextPipeline
 
     readers = FluxKontextPipeline.from_pretrained(
-        base.place,
+        base.location,
         transformer=None,
         vae=None,
         dtype=dtype,
-        **language_models(base, dtype),
-        **base.arguments,
+        **load_language_models(base, dtype),
+        **base.load_arguments,
     ).to(device)
     with torch.inference_mode():
         tokens, pooled, _ = readers.encode_prompt(PROMPT, device=device)
@@ -98,7 +102,9 @@ def load_transformer(source: Source, dtype: torch.dtype) -> Any:
     """Load the denoising transformer."""
     from diffusers import FluxTransformer2DModel
 
-    network = FluxTransformer2DModel.from_pretrained(source.place, dtype=dtype, **source.arguments)
+    network = FluxTransformer2DModel.from_pretrained(
+        source.location, dtype=dtype, **source.load_arguments
+    )
     check_complete(network, "transformer")
     return network
 
@@ -109,7 +115,7 @@ def load_pipeline(base: Source, network: Any, dtype: torch.dtype) -> Any:
 
     unused = dict.fromkeys(("text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2"))
     pipeline = FluxKontextPipeline.from_pretrained(
-        base.place, transformer=network, dtype=dtype, **unused, **base.arguments
+        base.location, transformer=network, dtype=dtype, **unused, **base.load_arguments
     )
     check_parts(pipeline)
     return pipeline

@@ -18,11 +18,11 @@ IDS = 3 * sum(factor**2 for factor in LEVELS)
 """Numbers per token: 63."""
 FLAT_DEPTH = 0.01
 """Normalised depth of a source image with constant depth."""
-CLOSEST = 1e-3
+MIN_RELATIVE_DEPTH = 1e-3
 """Smallest z-depth for projection relative to the median; clamps points behind the camera."""
 
 
-def target_ids(
+def compute_target_ids(
     size: tuple[int, int], grid: tuple[int, int], dtype: torch.dtype = torch.bfloat16
 ) -> Float[Tensor, "tokens 63"]:
     """Compute positions of the generated tokens: integers at level 0, else cell centres; z = 0.
@@ -35,14 +35,15 @@ def target_ids(
     levels = []
     for factor in LEVELS:
         rows, columns = (
-            cell_centres(pixels, tokens, factor) for pixels, tokens in zip(size, grid, strict=True)
+            compute_cell_centers(pixels, tokens, factor)
+            for pixels, tokens in zip(size, grid, strict=True)
         )
         row, column = torch.meshgrid(rows, columns, indexing="ij")
-        levels.append(packed(torch.stack([torch.zeros_like(row), row, column], dim=-1), factor))
+        levels.append(pack_cells(torch.stack([torch.zeros_like(row), row, column], dim=-1), factor))
     return torch.cat(levels, dim=-1).to(dtype).float()
 
 
-def cell_centres(pixels: int, tokens: int, factor: int) -> Float[Tensor, "cells"]:
+def compute_cell_centers(pixels: int, tokens: int, factor: int) -> Float[Tensor, "cells"]:
     """Compute the centres of `factor` cells per token along a side, in tokens, from -0.5."""
     centres = torch.arange(pixels, dtype=torch.float32) + 0.5
     resized = torch.nn.functional.interpolate(
@@ -51,7 +52,7 @@ def cell_centres(pixels: int, tokens: int, factor: int) -> Float[Tensor, "cells"
     return resized[0, 0, 0] / pixels * tokens - 0.5
 
 
-def source_ids(
+def compute_source_ids(
     depth: Float[Tensor, "h w"],
     source: Camera,
     target: Camera,
@@ -64,7 +65,7 @@ def source_ids(
     z is normalised to [1, 2]. As in training, equal cameras give an offset of 0.46875 for tokens of
     16 pixels. Both grids are height and width in tokens.
     """
-    pixels, z = seen_from(depth, source, target)
+    pixels, z = project_to_target(depth, source, target)
     nearness = z - z.min()
     spread = nearness.max()
     if spread <= 1e-6 * depth.abs().max():
@@ -82,11 +83,11 @@ def source_ids(
         resized = torch.nn.functional.interpolate(
             positions.permute(2, 0, 1)[None], cells, mode="bilinear", align_corners=False
         )
-        levels.append(packed(resized[0].permute(1, 2, 0) * in_tokens, factor))
+        levels.append(pack_cells(resized[0].permute(1, 2, 0) * in_tokens, factor))
     return torch.cat(levels, dim=-1)
 
 
-def seen_from(
+def project_to_target(
     depth: Float[Tensor, "h w"], source: Camera, target: Camera
 ) -> tuple[Float[Tensor, "h w 2"], Float[Tensor, "h w"]]:
     """Project the pixels of `source` to pixel indices (column, row) and z-depth in `target`."""
@@ -102,13 +103,15 @@ def seen_from(
     moved = points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
     z = moved[..., 2]
     homogeneous = moved @ K_target.T
-    in_front = z.clamp_min(CLOSEST * float(depth.median()))
+    in_front = z.clamp_min(MIN_RELATIVE_DEPTH * float(depth.median()))
     pixels = homogeneous[..., :2] - K_target[:2, 2] * z[..., None]
     pixels = pixels / in_front[..., None] + K_target[:2, 2] - 0.5
     return pixels.float(), z.float()
 
 
-def packed(cells: Float[Tensor, "rows columns 3"], factor: int) -> Float[Tensor, "tokens numbers"]:
+def pack_cells(
+    cells: Float[Tensor, "rows columns 3"], factor: int
+) -> Float[Tensor, "tokens numbers"]:
     """Join the positions of the `factor` x `factor` cells of each token, in quadtree order."""
     rows, columns = cells.shape[0], cells.shape[1]
     gathered = cells

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from gscompleter.errors import InputError, quoted
-from gscompleter.weights.fetching import few_retries
+from gscompleter.errors import InputError, quote_value
+from gscompleter.weights.fetching import limit_retries
 
 PACKAGES = ("diffusers", "transformers", "accelerate")
 """Packages that the generators import."""
@@ -24,7 +24,7 @@ INSTALL = "pip install 'gscompleter[diffusion]'"
 class Source:
     """A folder in the format of diffusers, local or on the hub."""
 
-    place: str
+    location: str
     """Path of the folder, or id of the repository."""
     revision: str | None = None
     """Commit or branch of the repository, or None for a local folder."""
@@ -46,14 +46,14 @@ class Source:
         )
 
     @property
-    def arguments(self) -> dict[str, str]:
+    def load_arguments(self) -> dict[str, str]:
         """Further arguments of `from_pretrained`."""
         pairs = {"revision": self.revision, "subfolder": self.subfolder}
         return {key: value for key, value in pairs.items() if value is not None}
 
 
 KONTEXT = Source(
-    place="black-forest-labs/FLUX.1-Kontext-dev",
+    location="black-forest-labs/FLUX.1-Kontext-dev",
     revision="main",
     terms=(
         "the FLUX.1 [dev] Non-Commercial License, which must be accepted on its page and needs a "
@@ -63,7 +63,7 @@ KONTEXT = Source(
 """Base model: VAE, text encoders, tokenizers and scheduler; gated."""
 
 PE_FIELD = Source(
-    place="yunpeng1998/PE-Field",
+    location="yunpeng1998/PE-Field",
     revision="main",
     subfolder="FLUX.1-Kontext-dev/transformer",
     terms=(
@@ -104,10 +104,10 @@ class IncompleteWeightsError(ValueError):
         super().__init__(f"its {part} lacks the tensor {names[0]}{more}")
 
 
-def source_of(path: str, library: str = "diffusers") -> Source:
+def parse_source(path: str, library: str = "diffusers") -> Source:
     """Parse a user's PATH, USER/NAME or USER/NAME@COMMIT in the format of `library`."""
     if Path(path).expanduser().is_dir():
-        return Source(place=str(Path(path).expanduser()))
+        return Source(location=str(Path(path).expanduser()))
     name, _, revision = path.partition("@")
     if name.count("/") != 1 or name.startswith((".", "/", "~")) or name.endswith("/"):
         raise InputError(
@@ -116,21 +116,21 @@ def source_of(path: str, library: str = "diffusers") -> Source:
         )
     usual = next((terms for part, terms in LICENCES.items() if part in name.lower()), None)
     terms = "the licence that its page states" + (f" (usually {usual})" if usual else "")
-    return Source(place=name, revision=revision or "main", terms=terms)
+    return Source(location=name, revision=revision or "main", terms=terms)
 
 
 def announce(sources: list[Source]) -> None:
     """Print to stderr which weights are downloaded, and under which terms."""
-    once = {(source.place, source.revision): source for source in sources if not source.is_local}
+    once = {(source.location, source.revision): source for source in sources if not source.is_local}
     for source in once.values():
-        page = f"https://huggingface.co/{source.place}"
+        page = f"https://huggingface.co/{source.location}"
         pinned = f"at {source.revision!r}, which is not pinned, so the files may change"
         if source.is_pinned:
             pinned = f"at commit {source.revision}"
         print(f"Weights of {page} {pinned}. Terms: {source.terms}.", file=sys.stderr)
 
 
-def needs_diffusers(name: str) -> None:
+def check_packages(name: str) -> None:
     """Raise InputError with an install command if one of `PACKAGES` is missing."""
     missing = [package for package in PACKAGES if find_spec(package) is None]
     if missing:
@@ -141,19 +141,19 @@ def needs_diffusers(name: str) -> None:
 
 
 @contextmanager
-def reading(source: Source, setting: str = "weights") -> Iterator[None]:
+def convert_load_errors(source: Source, setting: str = "weights") -> Iterator[None]:
     """Silence the libraries and convert failures to InputErrors, which name `setting`."""
     try:
-        with silent(source.is_local), few_retries():
+        with silence_libraries(source.is_local), limit_retries():
             yield
     except InputError:
         raise
     except (OSError, ValueError, KeyError, ImportError, AttributeError, RuntimeError) as error:
-        raise cannot_load(source, error, setting) from error
+        raise create_load_error(source, error, setting) from error
 
 
 @contextmanager
-def silent(local: bool) -> Iterator[None]:
+def silence_libraries(local: bool) -> Iterator[None]:
     """Limit diffusers and transformers to errors, and to progress bars of downloads."""
     from diffusers.utils import logging as diffusers_logging
     from transformers.utils import logging as transformers_logging
@@ -174,9 +174,9 @@ def silent(local: bool) -> Iterator[None]:
             log.enable_progress_bar()
 
 
-def cannot_load(source: Source, error: Exception, setting: str) -> InputError:
+def create_load_error(source: Source, error: Exception, setting: str) -> InputError:
     """Create the error for a source that failed to load."""
-    page = f"https://huggingface.co/{source.place}"
+    page = f"https://huggingface.co/{source.location}"
     if source.is_local:
         way_out = "see that it is complete, as `save_pretrained` writes it"
     elif isinstance(error, IncompleteWeightsError):
@@ -186,8 +186,8 @@ def cannot_load(source: Source, error: Exception, setting: str) -> InputError:
             f"see that you accepted its terms at {page} and are logged in, or give a folder "
             f"as its {setting}"
         )
-    reason = f"{type(error).__name__}: {quoted(str(error), 120).rstrip('.')}"
+    reason = f"{type(error).__name__}: {quote_value(str(error), 120).rstrip('.')}"
     return InputError(
-        f"Could not load {source.place} ({reason}); {way_out}.",
+        f"Could not load {source.location} ({reason}); {way_out}.",
         f"generator_{setting}",
     )

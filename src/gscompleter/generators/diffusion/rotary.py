@@ -18,7 +18,7 @@ THETA = 10_000.0
 """Base of the frequencies, as in FLUX."""
 HEADS = 24
 """Required number of heads: six per group, on levels 0, 1, 2, 2, 2 and 2."""
-TRIPLE_OF_HEAD = tuple(
+POSITION_OF_HEAD = tuple(
     triple
     for quarter in range(4)
     for triple in (0, 1 + quarter, *(5 + 4 * quarter + inner for inner in range(4)))
@@ -43,7 +43,7 @@ class PerHeadRotary(nn.Module):
         )
         angles = angles.repeat_interleave(2, dim=-1)
         cosines, sines = angles.cos().float(), angles.sin().float()
-        heads = torch.tensor(TRIPLE_OF_HEAD, device=ids.device)
+        heads = torch.tensor(POSITION_OF_HEAD, device=ids.device)
         return cosines[:, :, heads], sines[:, :, heads]
 
     def frequencies(self, axis: int, ids: Tensor) -> Float[Tensor, "pairs"]:
@@ -66,17 +66,20 @@ class PerHeadAttention:
     ) -> Float[Tensor, "b tokens c"] | tuple[Tensor, Tensor]:
         """Attend among text and image tokens; single blocks pass both as one sequence."""
         layers = (attn.to_q, attn.to_k, attn.to_v)
-        query, key, value = projected(hidden_states, layers, (attn.norm_q, attn.norm_k))
+        query, key, value = project_qkv(hidden_states, layers, (attn.norm_q, attn.norm_k))
         if encoder_hidden_states is not None:
             layers = (attn.add_q_proj, attn.add_k_proj, attn.add_v_proj)
             norms = (attn.norm_added_q, attn.norm_added_k)
-            text_states = projected(encoder_hidden_states, layers, norms)
+            text_states = project_qkv(encoder_hidden_states, layers, norms)
             query, key, value = (
                 torch.cat([text, image], dim=1)
                 for text, image in zip(text_states, (query, key, value), strict=True)
             )
         if image_rotary_emb is not None:
-            query, key = turned(query, *image_rotary_emb), turned(key, *image_rotary_emb)
+            query, key = (
+                rotate_channel_pairs(query, *image_rotary_emb),
+                rotate_channel_pairs(key, *image_rotary_emb),
+            )
         query, key, value = (part.transpose(1, 2) for part in (query, key, value))
         mixed = nn.functional.scaled_dot_product_attention(query, key, value, attention_mask)
         joined = mixed.transpose(1, 2).flatten(2).to(query.dtype)
@@ -87,7 +90,7 @@ class PerHeadAttention:
         return image, attn.to_add_out(text)
 
 
-def projected(
+def project_qkv(
     tokens: Float[Tensor, "b n c"], layers: tuple[nn.Module, ...], norms: tuple[nn.Module, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute query, key and value [b, n, heads, d]; query and key are normalised."""
@@ -95,7 +98,7 @@ def projected(
     return norms[0](query), norms[1](key), value
 
 
-def turned(
+def rotate_channel_pairs(
     states: Float[Tensor, "b n heads d"],
     cosines: Float[Tensor, "b n heads d"],
     sines: Float[Tensor, "b n heads d"],
@@ -106,7 +109,7 @@ def turned(
     return (states.float() * cosines + quarter_rotated.float() * sines).to(states.dtype)
 
 
-def with_per_head_positions(transformer: Any) -> Any:
+def enable_per_head_positions(transformer: Any) -> Any:
     """Make a FluxTransformer2DModel of 24 heads accept ids [tokens, b * 63]."""
     heads = transformer.config.num_attention_heads
     if heads != HEADS:

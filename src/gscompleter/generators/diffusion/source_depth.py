@@ -11,22 +11,22 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.generators.diffusion.complete import loaded
+from gscompleter.generators.diffusion.complete import load_transformers_model
 from gscompleter.generators.diffusion.published import (
     announce,
-    needs_diffusers,
-    reading,
-    source_of,
+    check_packages,
+    convert_load_errors,
+    parse_source,
 )
-from gscompleter.generators.robust import robust_affine
-from gscompleter.generators.smooth import continued
+from gscompleter.generators.robust import fit_robust_affine
+from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.types import Render, View
 
-MONOCULAR = "depth-anything/Depth-Anything-V2-Small-hf"
+MONOCULAR_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"
 """Published depth model. The authors use MoGe-2, which transformers does not support."""
-METRIC = {"depth_anything": False, "dpt": False, "glpn": True}
+PREDICTS_DEPTH = {"depth_anything": False, "dpt": False, "glpn": True}
 """Supported kinds of networks, and True for those that predict depth rather than disparity."""
-NEVER_USED = r"fusion_stage\.layers\.0\.residual_layer1\."
+UNUSED_TENSORS = r"fusion_stage\.layers\.0\.residual_layer1\."
 """Pattern of DPT's unused tensors in the first fusion layer; some files omit them."""
 
 
@@ -39,21 +39,21 @@ class SourceDepth(Protocol):
         ...
 
 
-def context_depth(photograph: View, render: Render) -> Float[Tensor, "h w"]:
+def compute_context_depth(photograph: View, render: Render) -> Float[Tensor, "h w"]:
     """Return the depth of the scene, with smooth extrapolation where alpha is below 0.5.
 
     Raises:
         InputError: The camera sees nothing of the scene.
     """
-    valid = seen(render)
+    valid = find_valid_depth(render)
     depth = torch.where(valid, render.depth, torch.ones_like(render.depth)).detach().cpu()
     middle = depth[valid.cpu()].median()
     log_depth = (depth / middle).log()[..., None]
-    filled = continued(log_depth, valid.cpu().float())[..., 0].exp() * middle
+    filled = continue_smoothly(log_depth, valid.cpu().float())[..., 0].exp() * middle
     return torch.where(valid, render.depth, filled.to(render.depth.device))
 
 
-def seen(render: Render) -> Bool[Tensor, "h w"]:
+def find_valid_depth(render: Render) -> Bool[Tensor, "h w"]:
     """Return a mask of valid depth; raises InputError if it is empty."""
     valid = render.depth_map().valid & (render.depth > 0)
     if not valid.any():
@@ -83,57 +83,61 @@ class MonocularDepth:
         guess = found[0]["predicted_depth"].float().clone().to(render.depth.device)
         declared = getattr(self.network.config, "depth_estimation_type", None)
         metric = (
-            METRIC[self.network.config.model_type] if declared is None else declared == "metric"
+            PREDICTS_DEPTH[self.network.config.model_type]
+            if declared is None
+            else declared == "metric"
         )
-        return rescaled(guess, render) if metric else from_disparity(guess, render)
+        return rescale_depth(guess, render) if metric else convert_disparity(guess, render)
 
 
-def rescaled(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
+def rescale_depth(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
     """Scale depth by the median ratio to the depth of the scene."""
-    valid = seen(render)
+    valid = find_valid_depth(render)
     guess = guess.clamp_min(1e-6 * float(guess.abs().max().clamp_min(1e-12)))
     return guess * (render.depth[valid] / guess[valid]).median()
 
 
-def from_disparity(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
+def convert_disparity(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
     """Convert disparity to depth, with scale and shift fitted to the scene."""
-    valid = seen(render)
+    valid = find_valid_depth(render)
     middle = render.depth[valid].median()
     inverse = middle / render.depth[valid]
-    spread, own_spread = deviation(inverse), deviation(guess[valid])
+    spread, own_spread = compute_deviation(inverse), compute_deviation(guess[valid])
     alike = (guess - guess[valid].median()) * (spread / own_spread.clamp_min(1e-12)) + 1.0
-    gain, offset = robust_affine(alike[valid][:, None], inverse[:, None])
+    gain, offset = fit_robust_affine(alike[valid][:, None], inverse[:, None])
     least = middle / (10 * render.depth[valid].max())
     return middle / (gain * alike + offset).clamp_min(float(least))
 
 
-def deviation(values: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+def compute_deviation(values: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     """Compute the median absolute deviation."""
     return (values - values.median()).abs().median()
 
 
-def source_depth_named(name: str, device: str = "cpu") -> SourceDepth:
+def load_source_depth(name: str, device: str = "cpu") -> SourceDepth:
     """Return `context`, `monocular` (the published model), or the model of a path."""
     if name == "context":
-        return context_depth
-    return load_monocular(MONOCULAR if name == "monocular" else name, device)
+        return compute_context_depth
+    return load_monocular(MONOCULAR_MODEL if name == "monocular" else name, device)
 
 
 @lru_cache(maxsize=1)
-def load_monocular(path: str = MONOCULAR, device: str = "cpu") -> MonocularDepth:
+def load_monocular(path: str = MONOCULAR_MODEL, device: str = "cpu") -> MonocularDepth:
     """Load a depth model of transformers from a folder, USER/NAME or USER/NAME@COMMIT."""
-    needs_diffusers("pe-field")
-    source = source_of(path, "transformers")
+    check_packages("pe-field")
+    source = parse_source(path, "transformers")
     announce([source])
-    with reading(source, "depth"):
+    with convert_load_errors(source, "depth"):
         from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
-        network = loaded(AutoModelForDepthEstimation, source, "network", unused=NEVER_USED)
-        processor = AutoImageProcessor.from_pretrained(source.place, **source.arguments)
+        network = load_transformers_model(
+            AutoModelForDepthEstimation, source, "network", unused=UNUSED_TENSORS
+        )
+        processor = AutoImageProcessor.from_pretrained(source.location, **source.load_arguments)
     kind = network.config.model_type
-    if kind not in METRIC:
+    if kind not in PREDICTS_DEPTH:
         raise InputError(
             f"The depth network of {path} is of the unsupported kind {kind}; choose one of "
-            f"{', '.join(METRIC)}."
+            f"{', '.join(PREDICTS_DEPTH)}."
         )
     return MonocularDepth(network.eval().to(device), processor, device)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def forward_splat(
+def splat_forward(
     image: Float[Tensor, "h w c"], pixels: Float[Tensor, "h w 2"], size: tuple[int, int]
 ) -> Float[Tensor, "height width c"]:
     """Move each pixel of `image` to the nearest pixel of its position in a target of `size`.

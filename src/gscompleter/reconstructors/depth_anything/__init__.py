@@ -9,11 +9,14 @@ from gscompleter.reconstructors.depth_anything.config import (
     MetricDepthConfig,
     NestedConfig,
 )
-from gscompleter.reconstructors.depth_anything.inputs import Sizing
+from gscompleter.reconstructors.depth_anything.inputs import ResizeConfig
 from gscompleter.reconstructors.depth_anything.metric import MetricDepthAnything
 from gscompleter.reconstructors.depth_anything.nested import NestedDepthAnything
 from gscompleter.reconstructors.depth_anything.network import DepthAnything
-from gscompleter.reconstructors.depth_anything.normalisation import authors_units, scene_units
+from gscompleter.reconstructors.depth_anything.normalisation import (
+    compute_authors_units,
+    compute_scene_units,
+)
 from gscompleter.reconstructors.depth_anything.reconstructor import (
     AnyViewDepth,
     AnyViewGaussians,
@@ -33,7 +36,7 @@ __all__ = [
     "MetricViewDepth",
     "NestedConfig",
     "NestedDepthAnything",
-    "Sizing",
-    "authors_units",
-    "scene_units",
+    "ResizeConfig",
+    "compute_authors_units",
+    "compute_scene_units",
 ]

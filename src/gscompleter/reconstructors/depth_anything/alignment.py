@@ -11,11 +11,11 @@ from gscompleter.errors import InputError
 
 Points = Float[np.ndarray, "n 3"]
 
-MANY = 10
+MIN_RANSAC_CAMERAS = 10
 """Smallest number of cameras for which RANSAC rejects outliers."""
-DRAWS = 10
+NUM_RANSAC_SAMPLES = 10
 """Number of random samples, each of half of the cameras."""
-SEED = 42
+RANSAC_SEED = 42
 """Seed of the samples, as in the authors' code."""
 
 
@@ -32,7 +32,7 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.shift
 
 
-def similarity_between(given: Points, found: Points) -> Similarity:
+def fit_center_similarity(given: Points, found: Points) -> Similarity:
     """Fit the similarity from `given` to `found` by least squares; it needs two distinct points."""
     x, y = given.astype(np.float64), found.astype(np.float64)
     middle_x, middle_y = x.mean(0), y.mean(0)
@@ -50,17 +50,19 @@ def similarity_between(given: Points, found: Points) -> Similarity:
     return Similarity(scale, rotation, middle_y - scale * rotation @ middle_x)
 
 
-def similarity_of_most(given: Points, found: Points) -> Similarity:
+def fit_robust_similarity(given: Points, found: Points) -> Similarity:
     """Fit a similarity, with RANSAC from ten points on."""
-    every = similarity_between(given, found)
-    if len(given) < MANY:
+    every = fit_center_similarity(given, found)
+    if len(given) < MIN_RANSAC_CAMERAS:
         return every
-    threshold = float(np.median(distances_to_nearest(every(given), found)))
+    threshold = float(np.median(measure_nearest_distances(every(given), found)))
     best, least = None, (0, np.inf)
-    for half in halves(len(given)):
+    for half in sample_halves(len(given)):
         if np.ptp(given[half], axis=0).max() == 0:
             continue
-        error = np.linalg.norm(similarity_between(given[half], found[half])(given) - found, axis=1)
+        error = np.linalg.norm(
+            fit_center_similarity(given[half], found[half])(given) - found, axis=1
+        )
         inliers = error <= threshold
         count = int(inliers.sum())
         mean = float(error[inliers].mean()) if count else np.inf
@@ -68,16 +70,16 @@ def similarity_of_most(given: Points, found: Points) -> Similarity:
             best, least = inliers, (count, mean)
     if best is None or least[0] < 3:
         return every
-    return similarity_between(given[best], found[best])
+    return fit_center_similarity(given[best], found[best])
 
 
-def halves(count: int) -> list[Int[np.ndarray, "_"]]:
+def sample_halves(count: int) -> list[Int[np.ndarray, "_"]]:
     """Sample random halves of `count` points."""
-    generator = np.random.default_rng(SEED)
+    generator = np.random.default_rng(RANSAC_SEED)
     size = max(3, (count + 1) // 2)
-    return [generator.choice(count, size, replace=False) for _ in range(DRAWS)]
+    return [generator.choice(count, size, replace=False) for _ in range(NUM_RANSAC_SAMPLES)]
 
 
-def distances_to_nearest(points: Points, others: Points) -> Float[np.ndarray, "n"]:
+def measure_nearest_distances(points: Points, others: Points) -> Float[np.ndarray, "n"]:
     """Measure the distance from each point to the nearest of the others."""
     return np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from gscompleter.reconstructors.depth_anything.vit import Block
 from gscompleter.reconstructors.feed_forward.dino import Attention, Mlp
 
-HEADS = 16
+NUM_CAMERA_HEADS = 16
 """Number of attention heads of the camera encoder, for all network sizes."""
-LAYERS = 4
+NUM_CAMERA_LAYERS = 4
 """Number of layers of the camera encoder."""
 
 
@@ -38,8 +38,8 @@ class CameraEncoder(nn.Module):
         self.token_norm = nn.LayerNorm(channels)
         self.trunk = nn.Sequential(
             *(
-                Block(channels, Attention(channels, HEADS), Mlp(channels), eps=1e-5)
-                for _ in range(LAYERS)
+                Block(channels, Attention(channels, NUM_CAMERA_HEADS), Mlp(channels), eps=1e-5)
+                for _ in range(NUM_CAMERA_LAYERS)
             )
         )
         self.trunk_norm = nn.LayerNorm(channels)

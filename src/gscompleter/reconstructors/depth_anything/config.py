@@ -15,17 +15,17 @@ class VitConfig:
     channels: int = 384
     heads: int = 6
     blocks: int = 12
-    outputs: tuple[int, int, int, int] = (5, 7, 9, 11)
+    output_block_ids: tuple[int, int, int, int] = (5, 7, 9, 11)
     """Indices of the blocks that output tokens."""
-    alternates_from: int | None = 4
+    first_multi_view_block: int | None = 4
     """Index of the first multi-view block, or None for a network of single views."""
-    gated: bool = False
+    is_gated: bool = False
     """Use SwiGLU in the MLPs."""
 
     @property
-    def described(self) -> int:
+    def num_output_channels(self) -> int:
         """Number of output channels per patch."""
-        return self.channels if self.alternates_from is None else 2 * self.channels
+        return self.channels if self.first_multi_view_block is None else 2 * self.channels
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class DepthAnythingConfig:
     features: int = 64
     widths: tuple[int, int, int, int] = (48, 96, 192, 384)
     """Channels of the four levels, finest first."""
-    gaussians: bool = False
+    has_gaussian_head: bool = False
     image_size: tuple[int, int] = (504, 504)
     """Height and width of the training images, in pixels; the longer side is relevant."""
 
@@ -71,7 +71,7 @@ class NestedConfig:
 
 WIDE = (256, 512, 1024, 1024)
 GIANT = DepthAnythingConfig(
-    VitConfig(1536, 24, 40, (19, 27, 33, 39), 13, gated=True), 256, WIDE, gaussians=True
+    VitConfig(1536, 24, 40, (19, 27, 33, 39), 13, is_gated=True), 256, WIDE, has_gaussian_head=True
 )
 
 VARIANTS: Mapping[str, DepthAnythingConfig | MetricDepthConfig | NestedConfig] = {

@@ -12,14 +12,14 @@ from gscompleter.reconstructors.depth_anything.dpt import (
     HIDDEN,
     Dpt,
     ImageScratch,
-    with_position,
+    add_position_encoding,
 )
-from gscompleter.reconstructors.feed_forward.dpt import Coarsest, Fusion, fused
-from gscompleter.reconstructors.feed_forward.resampling import resized
+from gscompleter.reconstructors.feed_forward.dpt import Coarsest, Fusion, fuse_levels
+from gscompleter.reconstructors.feed_forward.resampling import resize_bilinear
 
-LEVELS = 4
+NUM_LEVELS = 4
 """Number of pyramid levels; rays come from the last one."""
-NORM = 2
+NORM_INDEX = 2
 """Index of the norm in `RayLayers`."""
 
 Pyramid = Sequence[Float[Tensor, "n _ _ _"]]
@@ -33,7 +33,7 @@ class ChannelNorm(nn.LayerNorm):
         return super().forward(x.movedim(1, -1)).movedim(-1, 1)
 
 
-def five_convolutions(features: int) -> nn.Sequential:
+def create_five_convolutions(features: int) -> nn.Sequential:
     """Create five consecutive convolutions."""
     widths = pairwise([features, features // 2] * 3)
     return nn.Sequential(*(nn.Conv2d(a, b, 3, 1, 1) for a, b in widths))
@@ -47,7 +47,9 @@ class RayLayers(nn.Sequential):
         norm = nn.Identity() if level else ChannelNorm(HIDDEN)
         super().__init__(first, nn.Identity(), norm, nn.Identity(), nn.ReLU(), last)
 
-    def through(self, x: Float[Tensor, "n c h w"], norm: nn.Module) -> Float[Tensor, "n 7 h w"]:
+    def apply_with_norm(
+        self, x: Float[Tensor, "n c h w"], norm: nn.Module
+    ) -> Float[Tensor, "n 7 h w"]:
         """Apply the layers with the norm of another level."""
         first, _, _, _, relu, last = self
         return last(relu(norm(first(x))))
@@ -62,19 +64,21 @@ class DualScratch(ImageScratch):
         self.refinenet2_aux = Fusion(features)
         self.refinenet3_aux = Fusion(features)
         self.refinenet4_aux = Coarsest(features)
-        self.output_conv1_aux = nn.ModuleList(five_convolutions(features) for _ in range(LEVELS))
-        last = [RayLayers(features // 2, level) for level in range(LEVELS)]
+        self.output_conv1_aux = nn.ModuleList(
+            create_five_convolutions(features) for _ in range(NUM_LEVELS)
+        )
+        last = [RayLayers(features // 2, level) for level in range(NUM_LEVELS)]
         self.output_conv2_aux = nn.ModuleList(last)
 
-    def rays(self, pyramid: Pyramid, aspect: float) -> Float[Tensor, "n 7 h w"]:
+    def fuse_rays(self, pyramid: Pyramid, aspect: float) -> Float[Tensor, "n 7 h w"]:
         """Fuse the maps, finest first, into rays; `aspect` is image width divided by height."""
         fusions = (self.refinenet1_aux, self.refinenet2_aux, self.refinenet3_aux)
-        x = fused(self.levels(pyramid), *fusions, self.refinenet4_aux)
-        x = with_position(self.output_conv1_aux[-1](x), aspect)
+        x = fuse_levels(self.project_levels(pyramid), *fusions, self.refinenet4_aux)
+        x = add_position_encoding(self.output_conv1_aux[-1](x), aspect)
         shared, last = self.output_conv2_aux[0], self.output_conv2_aux[-1]
         assert isinstance(shared, RayLayers)
         assert isinstance(last, RayLayers)
-        return last.through(x, shared[NORM])
+        return last.apply_with_norm(x, shared[NORM_INDEX])
 
 
 class DualDpt(Dpt):
@@ -87,21 +91,21 @@ class DualDpt(Dpt):
         self.norm = nn.LayerNorm(channels)
         self.scratch = DualScratch(widths, features)
 
-    def normed(self, patches: Float[Tensor, "b v p c"]) -> Float[Tensor, "b v p c"]:
+    def normalize_patches(self, patches: Float[Tensor, "b v p c"]) -> Float[Tensor, "b v p c"]:
         """Normalise the patches."""
         return self.norm(patches)
 
-    def depth(
+    def predict_depth(
         self, pyramid: Pyramid, size: tuple[int, int]
     ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
         """Predict depth up to scale, and its confidence from 1 upwards."""
-        x = resized(self.scratch.output_conv1(self.scratch(pyramid)), size)
-        raw = self.scratch.output_conv2(with_position(x, size[1] / size[0]))
+        x = resize_bilinear(self.scratch.output_conv1(self.scratch(pyramid)), size)
+        raw = self.scratch.output_conv2(add_position_encoding(x, size[1] / size[0]))
         return raw[:, 0].exp(), 1 + raw[:, 1].exp()
 
-    def rays(
+    def predict_rays(
         self, pyramid: Pyramid, size: tuple[int, int]
     ) -> tuple[Float[Tensor, "n p q 6"], Float[Tensor, "n p q"]]:
         """Predict direction, origin and confidence of each ray; unused with given cameras."""
-        raw = self.scratch.rays(pyramid, size[1] / size[0])
+        raw = self.scratch.fuse_rays(pyramid, size[1] / size[0])
         return raw[:, :6].movedim(1, -1), 1 + raw[:, 6].exp()

@@ -10,14 +10,14 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gscompleter.geometry import quats_from, quats_product
-from gscompleter.reconstructors.depth_anything.dpt import Dpt, ImageScratch, with_position
-from gscompleter.reconstructors.depth_anything.harmonics import turned_harmonics
+from gscompleter.geometry import multiply_quats, rotations_to_quats
+from gscompleter.reconstructors.depth_anything.dpt import Dpt, ImageScratch, add_position_encoding
+from gscompleter.reconstructors.depth_anything.harmonics import rotate_3dgs_sh
 from gscompleter.reconstructors.depth_anything.poses import Poses
 from gscompleter.reconstructors.depth_anything.vit import Tokens
 from gscompleter.reconstructors.feed_forward.dino import PATCH
-from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians, damped
-from gscompleter.reconstructors.feed_forward.resampling import resized
+from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians, damp_sh
+from gscompleter.reconstructors.feed_forward.resampling import resize_bilinear
 
 SH = 9
 """SH coefficients per colour (degree 2)."""
@@ -27,7 +27,7 @@ SCALES = (1e-5, 30.0)
 """Smallest and largest standard deviation, in tenths of the sum of pixel width and height."""
 
 
-def merged_images(features: int) -> nn.Sequential:
+def create_image_merger(features: int) -> nn.Sequential:
     """Create the layers that add image features to the fused map."""
     widths = pairwise([3, features // 8, features // 4, features // 2])
     layers = [(nn.Conv2d(a, b, 3, 1, 1), nn.GELU()) for a, b in widths]
@@ -42,21 +42,21 @@ class GaussianDpt(Dpt):
     def __init__(self, channels: int, widths: Sequence[int], features: int) -> None:
         super().__init__(channels, widths, coded=True)
         self.scratch = ImageScratch(widths, features, sum(CHANNELS))
-        self.images_merger = merged_images(features)
+        self.images_merger = create_image_merger(features)
 
     def forward(
         self, tokens: Sequence[Tokens], images: Float[Tensor, "b v 3 h w"]
     ) -> Float[Tensor, "b v h w c"]:
         """Predict raw channels from tokens and normalised images."""
         size = (images.shape[3], images.shape[4])
-        pyramid = self.pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
-        x = resized(self.scratch.output_conv1(self.scratch(pyramid)), size)
+        pyramid = self.compute_pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
+        x = resize_bilinear(self.scratch.output_conv1(self.scratch(pyramid)), size)
         x = x + self.images_merger(images.flatten(0, 1))
-        raw = self.scratch.output_conv2(with_position(x, size[1] / size[0]))
+        raw = self.scratch.output_conv2(add_position_encoding(x, size[1] / size[0]))
         return raw.movedim(1, -1).unflatten(0, images.shape[:2])
 
 
-def gaussians_from(
+def create_camera_gaussians(
     raw: Float[Tensor, "b v h w c"],
     depth: Float[Tensor, "b v h w"],
     poses: Poses,
@@ -70,19 +70,21 @@ def gaussians_from(
     factor = factors[:, None, None, None]
     distance = (depth + closer[..., 0]) * factor
     turns = poses.c2w[..., :3, :3]
-    rays = F.normalize(torch.einsum("bvij,bvhwj->bvhwi", turns, z_rays(offset, poses.K)), dim=-1)
+    rays = F.normalize(
+        torch.einsum("bvij,bvhwj->bvhwi", turns, compute_offset_rays(offset, poses.K)), dim=-1
+    )
     centers = factor[..., None] * poses.centers[:, :, None, None]
     return PixelGaussians(
         distance,
         centers + rays * distance[..., None],
-        turned_quats(rotation, turns),
-        sizes(scale, poses.K) * distance[..., None],
+        rotate_quats_as_trained(rotation, turns),
+        compute_pixel_scales(scale, poses.K) * distance[..., None],
         opacity[..., 0].sigmoid(),
-        turned_harmonics(damped(sh), turns),
+        rotate_3dgs_sh(damp_sh(sh), turns),
     )
 
 
-def z_rays(
+def compute_offset_rays(
     offsets: Float[Tensor, "b v h w 2"], K: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w 3"]:
     """Compute directions in camera axes, `offsets` pixels from each pixel centre."""
@@ -94,7 +96,7 @@ def z_rays(
     return torch.einsum("bvij,bvhwj->bvhwi", torch.linalg.inv(K), points)
 
 
-def sizes(
+def compute_pixel_scales(
     scale: Float[Tensor, "b v h w 3"], K: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w 3"]:
     """Compute standard deviations at a distance of 1."""
@@ -103,7 +105,7 @@ def sizes(
     return (low + (high - low) * scale.sigmoid()) * pixel[..., None, None, None]
 
 
-def turned_quats(
+def rotate_quats_as_trained(
     raw: Float[Tensor, "b v h w 4"], turns: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w 4"]:
     """Rotate Gaussians with their cameras; returns wxyz quaternions.
@@ -112,5 +114,5 @@ def turned_quats(
     """
     x, y, z, w = F.normalize(raw, dim=-1, eps=1e-8).unbind(-1)
     misread = torch.stack([z, w, x, y], dim=-1)  # (w, x, y, z) misread as xyzw, in our order
-    rotated = quats_product(quats_from(turns)[:, :, None, None], misread)
+    rotated = multiply_quats(rotations_to_quats(turns)[:, :, None, None], misread)
     return torch.where(rotated[..., :1] < 0, -rotated, rotated).roll(-1, -1)

@@ -23,27 +23,27 @@ Fit = Literal["resized", "cropped"]
 """Method to obtain whole patches."""
 
 
-def normalised_images(images: UInt8[Tensor, "*n h w 3"]) -> Float[Tensor, "*n 3 h w"]:
+def normalize_colors(images: UInt8[Tensor, "*n h w 3"]) -> Float[Tensor, "*n 3 h w"]:
     """Normalise colours and move channels first."""
     colours = images.float() / 255
     normalized = (colours - colours.new_tensor(MEAN)) / colours.new_tensor(DEVIATION)
     return normalized.movedim(-1, -3)
 
 
-def scaled_to(image: Image, resolution: int, side: Side) -> Image:
+def scale_side(image: Image, resolution: int, side: Side) -> Image:
     """Scale the longer or shorter side of `image` to `resolution` pixels."""
     h, w = image.shape[:2]
     factor = resolution / (max(h, w) if side == "longer" else min(h, w))
-    return resized_to(image, max(1, round(h * factor)), max(1, round(w * factor)))
+    return resize_photograph(image, max(1, round(h * factor)), max(1, round(w * factor)))
 
 
-def whole_patches(side: int, fit: Fit) -> int:
+def round_to_patches(side: int, fit: Fit) -> int:
     """Round `side` to whole patches: to the nearest if resized (ties up), down if cropped."""
     patches = (2 * side + PATCH) // (2 * PATCH) if fit == "resized" else side // PATCH
     return max(1, patches) * PATCH
 
 
-def resized_to(image: Image, height: int, width: int) -> Image:
+def resize_photograph(image: Image, height: int, width: int) -> Image:
     """Resize an image, bicubically if a side grows, else by area averaging."""
     h, w = image.shape[:2]
     if (h, w) == (height, width):

@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from gscompleter.reconstructors.depth_anything.config import MetricDepthConfig
-from gscompleter.reconstructors.depth_anything.dpt import Dpt, ImageScratch, last_convolutions
+from gscompleter.reconstructors.depth_anything.dpt import Dpt, ImageScratch, create_output_layers
 from gscompleter.reconstructors.depth_anything.vit import AnyViewVit
-from gscompleter.reconstructors.feed_forward.cameras import full_precision
+from gscompleter.reconstructors.feed_forward.cameras import disable_autocast
 from gscompleter.reconstructors.feed_forward.dino import PATCH
-from gscompleter.reconstructors.feed_forward.resampling import resized
+from gscompleter.reconstructors.feed_forward.resampling import resize_bilinear
 
-FOCAL = 300.0
+METRIC_FOCAL = 300.0
 """Focal length in pixels for which the network predicts metres."""
 MAX_SKY = 0.3
 """Largest sky output of a pixel that does not count as sky."""
@@ -35,14 +35,14 @@ class MetricDepth:
     sky: Float[Tensor, "b v h w"]
 
     @property
-    def solid(self) -> Bool[Tensor, "b v h w"]:
+    def solid_mask(self) -> Bool[Tensor, "b v h w"]:
         """True outside the sky."""
         return self.sky < MAX_SKY
 
-    def in_metres(self, K: Float[Tensor, "b v 3 3"]) -> Float[Tensor, "b v h w"]:
+    def convert_to_metres(self, K: Float[Tensor, "b v 3 3"]) -> Float[Tensor, "b v h w"]:
         """Compute z-depth in metres for intrinsics in pixels."""
         focal = (K[..., 0, 0] + K[..., 1, 1]) / 2
-        return self.depth * (focal / FOCAL)[..., None, None]
+        return self.depth * (focal / METRIC_FOCAL)[..., None, None]
 
 
 class SkyScratch(ImageScratch):
@@ -50,7 +50,7 @@ class SkyScratch(ImageScratch):
 
     def __init__(self, widths: Sequence[int], features: int) -> None:
         super().__init__(widths, features, out=1)
-        self.sky_output_conv2 = last_convolutions(features // 2, 1)
+        self.sky_output_conv2 = create_output_layers(features // 2, 1)
 
 
 class MetricDpt(Dpt):
@@ -70,34 +70,34 @@ class MetricDepthAnything(nn.Module):
         super().__init__()
         self.config = config
         self.backbone = nn.ModuleDict({"pretrained": AnyViewVit(config.vit)})
-        self.head = MetricDpt(config.vit.described, config.widths, config.features)
+        self.head = MetricDpt(config.vit.num_output_channels, config.widths, config.features)
 
     def forward(self, images: Float[Tensor, "b v 3 h w"]) -> MetricDepth:
         """Predict depth and sky of normalised images with sides divisible by 14."""
         size = (images.shape[3], images.shape[4])
         tokens = [tokens.float() for tokens in self.backbone["pretrained"](images)]
-        with full_precision(images):
+        with disable_autocast(images):
             scratch = self.head.scratch
-            pyramid = self.head.pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
-            x = resized(scratch.output_conv1(scratch(pyramid)), size)
+            pyramid = self.head.compute_pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
+            x = resize_bilinear(scratch.output_conv1(scratch(pyramid)), size)
             depth = scratch.output_conv2(x)[:, 0].exp()
             sky = scratch.sky_output_conv2(x)[:, 0].relu()
         views = images.shape[:2]
         return MetricDepth(depth.unflatten(0, views), sky.unflatten(0, views))
 
 
-def with_far_sky(
-    depth: Float[Tensor, "b v h w"], solid: Bool[Tensor, "b v h w"], farthest: float = torch.inf
+def set_sky_depth(
+    depth: Float[Tensor, "b v h w"], solid: Bool[Tensor, "b v h w"], max_depth: float = torch.inf
 ) -> Float[Tensor, "b v h w"]:
     """Set the sky to the depth of the far foreground, at most `farthest`, as the authors do."""
     if min(int(solid.sum()), int((~solid).sum())) <= MIN_PIXELS:
         return depth
-    far = quantile(depth[solid], FAR_QUANTILE).clamp_max(farthest)
+    far = interpolate_quantile(depth[solid], FAR_QUANTILE).clamp_max(max_depth)
     return torch.where(solid, depth, far)
 
 
-def quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
-    """Compute a quantile; `torch.quantile` is limited to 16 million values."""
+def interpolate_quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
+    """Compute a quantile; `torch.interpolate_quantile` is limited to 16 million values."""
     place = share * (len(values) - 1)
     ordered = values.sort().values
     below, above = ordered[int(place)], ordered[min(int(place) + 1, len(values) - 1)]

@@ -13,18 +13,18 @@ from gscompleter.reconstructors.depth_anything.metric import (
     MIN_PIXELS,
     MetricDepth,
     MetricDepthAnything,
-    quantile,
-    with_far_sky,
+    interpolate_quantile,
+    set_sky_depth,
 )
 from gscompleter.reconstructors.depth_anything.network import DepthAnything, Prediction
 from gscompleter.reconstructors.depth_anything.poses import Poses
-from gscompleter.reconstructors.feed_forward.cameras import full_precision
+from gscompleter.reconstructors.feed_forward.cameras import disable_autocast
 
 MIN_METRES = 0.01
 """Smallest depth of pixels that determine the scale, in metres."""
 MIN_DEPTH = 1e-3
 """Smallest depth of pixels that determine the scale, in the unit of the any-view network."""
-FARTHEST = 200.0
+MAX_SKY_DEPTH = 200.0
 """Largest depth of the sky, in metres."""
 
 
@@ -40,12 +40,14 @@ class NestedPrediction:
     @property
     def depth(self) -> Float[Tensor, "1 v h w"]:
         """The z-depth in metres; the sky lies behind the foreground, at most at 200 m."""
-        return with_far_sky(self.any_view.depth * self.scale, self.metric.solid, FARTHEST)
+        return set_sky_depth(
+            self.any_view.depth * self.scale, self.metric.solid_mask, MAX_SKY_DEPTH
+        )
 
     @property
     def confidence(self) -> Float[Tensor, "1 v h w"]:
         """The confidence, from 1 upwards; 1 in the sky."""
-        return self.any_view.confidence.where(self.metric.solid, 1.0)
+        return self.any_view.confidence.where(self.metric.solid_mask, 1.0)
 
 
 class NestedDepthAnything(nn.Module):
@@ -63,26 +65,28 @@ class NestedDepthAnything(nn.Module):
         """Predict like `DepthAnything`, and the scale to metres."""
         prediction = self.da3(images, poses)
         metric = self.da3_metric(images)
-        with full_precision(images):
-            return NestedPrediction(prediction, metric, metres_per_unit(prediction, metric))
+        with disable_autocast(images):
+            return NestedPrediction(prediction, metric, fit_metres_per_unit(prediction, metric))
 
 
-def metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
+def fit_metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
     """Fit the scale from any-view to metric depth on the more confident half of the foreground."""
-    metres = metric.in_metres(prediction.poses.K)
-    counts = counted(prediction, metric, metres)
+    metres = metric.convert_to_metres(prediction.poses.K)
+    counts = select_scale_pixels(prediction, metric, metres)
     if int(counts.sum()) <= MIN_PIXELS:
         return 1.0
     a, b = metres[counts].double(), prediction.depth[counts].double()
     return float((a * b).sum() / (b * b).sum())
 
 
-def counted(
+def select_scale_pixels(
     prediction: Prediction, metric: MetricDepth, metres: Float[Tensor, "b v h w"]
 ) -> Bool[Tensor, "b v h w"]:
     """Select the pixels that determine the scale."""
-    if not metric.solid.any():
-        return torch.zeros_like(metric.solid)
-    sure = prediction.confidence >= quantile(prediction.confidence[metric.solid], 0.5)
+    if not metric.solid_mask.any():
+        return torch.zeros_like(metric.solid_mask)
+    sure = prediction.confidence >= interpolate_quantile(
+        prediction.confidence[metric.solid_mask], 0.5
+    )
     deep = (metres > MIN_METRES) & (prediction.depth > MIN_DEPTH)
-    return sure & deep & metric.solid
+    return sure & deep & metric.solid_mask

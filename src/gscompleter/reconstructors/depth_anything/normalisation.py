@@ -9,21 +9,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.reconstructors.depth_anything.poses import Poses, inverse_of
+from gscompleter.reconstructors.depth_anything.poses import Poses, invert_rigid
 
 MIN_UNIT = 0.1
 """Smallest unit in the authors' code, in scene units."""
 
 
-def seen_from_first(poses: Poses, units: Float[Tensor, "b"]) -> Poses:
+def normalize_poses(poses: Poses, units: Float[Tensor, "b"]) -> Poses:
     """Transform each scene to the axes of its first camera and to `units` (in scene units)."""
     c2w = poses.c2w.double()
-    relative = inverse_of(c2w[:, :1]) @ c2w
+    relative = invert_rigid(c2w[:, :1]) @ c2w
     relative[..., :3, 3] /= units.double()[:, None, None]
     return replace(poses, c2w=relative.to(poses.c2w.dtype))
 
 
-def scene_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
+def compute_scene_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
     """Compute the lower median distance from the first camera; of two views, their distance.
 
     It scales with the scene, unlike the authors' own unit (`compute_authors_units`).
@@ -31,7 +31,7 @@ def scene_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
     Raises:
         InputError: All cameras of a scene are at one position, or one is not finite.
     """
-    apart = distances_from_first(centers)
+    apart = measure_first_distances(centers)
     if not apart.isfinite().all():
         raise InputError("The position of a camera is not finite; correct its pose.")
     least = apart.where(apart > 0, torch.inf).amin(dim=1)
@@ -43,11 +43,11 @@ def scene_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
     return torch.maximum(apart.median(dim=1).values, least)
 
 
-def authors_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
+def compute_authors_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
     """Compute the same median, but at least 0.1 scene units, as in the authors' inference."""
-    return distances_from_first(centers).median(dim=1).values.clamp_min(MIN_UNIT)
+    return measure_first_distances(centers).median(dim=1).values.clamp_min(MIN_UNIT)
 
 
-def distances_from_first(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b v"]:
+def measure_first_distances(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b v"]:
     """Measure the distance of each camera from the first camera of its scene."""
     return (centers.double() - centers[:, :1].double()).norm(dim=-1).to(centers.dtype)

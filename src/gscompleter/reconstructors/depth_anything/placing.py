@@ -8,12 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import quats_from, quats_product
-from gscompleter.reconstructors.depth_anything.harmonics import turned_harmonics
+from gscompleter.geometry import multiply_quats, rotations_to_quats
+from gscompleter.reconstructors.depth_anything.harmonics import rotate_3dgs_sh
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
 
 
-def placed(gaussians: PixelGaussians, first: Float[Tensor, "b 4 4"]) -> PixelGaussians:
+def move_from_first_camera(
+    gaussians: PixelGaussians, first: Float[Tensor, "b 4 4"]
+) -> PixelGaussians:
     """Transform Gaussians from the axes of cameras `first` to the world, without scaling."""
     views = gaussians.depth.shape[1]
     turns = first[:, None, :3, :3].expand(-1, views, -1, -1)
@@ -21,6 +23,6 @@ def placed(gaussians: PixelGaussians, first: Float[Tensor, "b 4 4"]) -> PixelGau
     return replace(
         gaussians,
         means=torch.einsum("bvij,bvhwj->bvhwi", turns, gaussians.means) + shift,
-        quats=quats_product(quats_from(turns)[:, :, None, None], gaussians.quats),
-        sh=turned_harmonics(gaussians.sh, turns),
+        quats=multiply_quats(rotations_to_quats(turns)[:, :, None, None], gaussians.quats),
+        sh=rotate_3dgs_sh(gaussians.sh, turns),
     )

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import quats_from, rotations_from
+from gscompleter.geometry import quats_to_rotations, rotations_to_quats
 
 MIN_TANGENT = 1e-6
 """Smallest tangent of half a field of view."""
@@ -31,10 +31,10 @@ class Poses:
     @property
     def w2c(self) -> Float[Tensor, "b v 4 4"]:
         """World-to-camera transforms."""
-        return inverse_of(self.c2w)
+        return invert_rigid(self.c2w)
 
 
-def inverse_of(transforms: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
+def invert_rigid(transforms: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
     """Invert rigid transforms."""
     rotations = transforms[..., :3, :3].transpose(-1, -2)
     inverse = transforms.clone()
@@ -43,19 +43,19 @@ def inverse_of(transforms: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
     return inverse
 
 
-def encoded(poses: Poses, size: tuple[int, int]) -> Float[Tensor, "b v 9"]:
+def encode_poses(poses: Poses, size: tuple[int, int]) -> Float[Tensor, "b v 9"]:
     """Encode centre, xyzw quaternion with w >= 0, and vertical and horizontal field of view."""
-    quats = quats_from(poses.c2w[..., :3, :3])
+    quats = rotations_to_quats(poses.c2w[..., :3, :3])
     quats = torch.where(quats[..., :1] < 0, -quats, quats).roll(-1, -1)
     focal = torch.stack([poses.K[..., 1, 1], poses.K[..., 0, 0]], dim=-1)
     angles = 2 * torch.atan(focal.new_tensor(size) / 2 / focal)
     return torch.cat([poses.centers, quats, angles], dim=-1)
 
 
-def decoded(numbers: Float[Tensor, "b v 9"], size: tuple[int, int]) -> Poses:
+def decode_poses(numbers: Float[Tensor, "b v 9"], size: tuple[int, int]) -> Poses:
     """Decode nine parameters into cameras with central principal points."""
     centers, quats, angles = numbers.split([3, 4, 2], dim=-1)
-    c2w = F.pad(rotations_from(quats.roll(1, -1)), (0, 1, 0, 1))
+    c2w = F.pad(quats_to_rotations(quats.roll(1, -1)), (0, 1, 0, 1))
     c2w[..., :3, 3] = centers
     c2w[..., 3, 3] = 1
     half = numbers.new_tensor(size) / 2

@@ -10,25 +10,32 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import z_depths
+from gscompleter.geometry import compute_z_depths
 from gscompleter.reconstructors.depth_anything.alignment import (
-    similarity_between,
-    similarity_of_most,
+    fit_center_similarity,
+    fit_robust_similarity,
 )
-from gscompleter.reconstructors.depth_anything.inputs import Batch, Sizing, batch_of
-from gscompleter.reconstructors.depth_anything.metric import MetricDepthAnything, with_far_sky
+from gscompleter.reconstructors.depth_anything.inputs import (
+    Batch,
+    ResizeConfig,
+    create_any_view_batch,
+)
+from gscompleter.reconstructors.depth_anything.metric import MetricDepthAnything, set_sky_depth
 from gscompleter.reconstructors.depth_anything.nested import NestedDepthAnything, NestedPrediction
 from gscompleter.reconstructors.depth_anything.network import DepthAnything, Prediction
-from gscompleter.reconstructors.depth_anything.normalisation import scene_units, seen_from_first
-from gscompleter.reconstructors.depth_anything.placing import placed
+from gscompleter.reconstructors.depth_anything.normalisation import (
+    compute_scene_units,
+    normalize_poses,
+)
+from gscompleter.reconstructors.depth_anything.placing import move_from_first_camera
 from gscompleter.reconstructors.depth_anything.poses import Poses
-from gscompleter.reconstructors.depth_anything.scene_scale import units_per_metre
+from gscompleter.reconstructors.depth_anything.scene_scale import estimate_units_per_metre
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
 from gscompleter.reconstructors.feed_forward.precision import check_precision, lower_precision
-from gscompleter.reconstructors.feed_forward.reconstructor import gaussians_of
+from gscompleter.reconstructors.feed_forward.reconstructor import flatten_gaussians
 from gscompleter.types import DepthMap, Reconstruction, View
 
-UnitOf = Callable[[Float[Tensor, "b v 3"]], Float[Tensor, "b"]]
+UnitFunction = Callable[[Float[Tensor, "b v 3"]], Float[Tensor, "b"]]
 """Function from camera centres to the unit of the poses, in scene units."""
 
 
@@ -36,8 +43,8 @@ UnitOf = Callable[[Float[Tensor, "b v 3"]], Float[Tensor, "b"]]
 class Inference:
     """Settings of a network's inference."""
 
-    sizing: Sizing = Sizing()
-    unit_of: UnitOf = scene_units
+    sizing: ResizeConfig = ResizeConfig()
+    compute_units: UnitFunction = compute_scene_units
     """Unit of the poses for the network; `compute_authors_units` is the authors' choice."""
     dtype: torch.dtype = torch.float32
     """Precision of the transformer under autocast; bfloat16 and float16 need a GPU (untested)."""
@@ -51,7 +58,7 @@ class AnyViewDepth:
     inference: Inference = Inference()
 
     def __post_init__(self) -> None:
-        check_precision(device_of(self.network), self.inference.dtype)
+        check_precision(get_device(self.network), self.inference.dtype)
 
     def __call__(self, views: Sequence[View]) -> list[DepthMap]:
         """Predict z-depths and confidence, scaled from predicted to given camera distances.
@@ -59,12 +66,14 @@ class AnyViewDepth:
         Raises:
             InputError: Fewer than two views, or all at one position.
         """
-        batch = batch_of(views, self.inference.sizing, fewest=2)
-        predicted = predict(self.network, batch, self.inference)
+        batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
+        predicted = run_network(self.network, batch, self.inference)
         assert isinstance(predicted, Prediction)
-        (given,), (found,) = centers_of(batch.poses), centers_of(predicted.poses)
-        depth = predicted.depth[0] / similarity_of_most(given, found).scale
-        return depth_maps(depth, certainty(predicted.confidence[0]), batch, views)
+        (given,), (found,) = get_camera_centers(batch.poses), get_camera_centers(predicted.poses)
+        depth = predicted.depth[0] / fit_robust_similarity(given, found).scale
+        return resample_depth_maps(
+            depth, normalize_confidence(predicted.confidence[0]), batch, views
+        )
 
 
 @dataclass(frozen=True)
@@ -75,7 +84,7 @@ class MetricViewDepth:
     inference: Inference = Inference()
 
     def __post_init__(self) -> None:
-        check_precision(device_of(self.network), self.inference.dtype)
+        check_precision(get_device(self.network), self.inference.dtype)
 
     def __call__(self, views: Sequence[View]) -> list[DepthMap]:
         """Predict z-depths, invalid in the sky.
@@ -83,14 +92,14 @@ class MetricViewDepth:
         Raises:
             InputError: Fewer than two views, all at one position, or too few common features.
         """
-        batch = batch_of(views, self.inference.sizing, fewest=2)
-        device = device_of(self.network)
+        batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
+        device = get_device(self.network)
         with torch.no_grad(), lower_precision(device, self.inference.dtype):
             found = self.network(batch.images.to(device))
-        metres = found.in_metres(batch.poses.K.to(device))
-        depth = with_far_sky(metres, found.solid)[0]
-        maps = depth_maps(depth, found.solid[0].float(), batch, views)
-        factor = units_per_metre(views, maps)
+        metres = found.convert_to_metres(batch.poses.K.to(device))
+        depth = set_sky_depth(metres, found.solid)[0]
+        maps = resample_depth_maps(depth, found.solid[0].float(), batch, views)
+        factor = estimate_units_per_metre(views, maps)
         return [replace(known, depth=factor * known.depth) for known in maps]
 
 
@@ -102,7 +111,7 @@ class AnyViewGaussians:
     inference: Inference = Inference()
 
     def __post_init__(self) -> None:
-        check_precision(device_of(self.network), self.inference.dtype)
+        check_precision(get_device(self.network), self.inference.dtype)
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Reconstruct a Gaussian per pixel of the resized photographs, and their z-depths.
@@ -112,43 +121,45 @@ class AnyViewGaussians:
         Raises:
             InputError: Fewer than two views, or all at one position.
         """
-        batch = batch_of(views, self.inference.sizing, fewest=2)
-        predicted = predict(self.network, batch, self.inference)
+        batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
+        predicted = run_network(self.network, batch, self.inference)
         if isinstance(predicted, NestedPrediction):
-            any_view, solid = predicted.any_view, predicted.metric.solid
+            any_view, solid = predicted.any_view, predicted.metric.solid_mask
         else:
             any_view, solid = predicted, torch.ones_like(predicted.depth, dtype=torch.bool)
-        sure = certainty(any_view.confidence) * solid
-        return reconstruction_of(in_world(any_view, batch.poses), sure[0], batch, views)
+        sure = normalize_confidence(any_view.confidence) * solid
+        return create_any_view_reconstruction(
+            move_to_given_frame(any_view, batch.poses), sure[0], batch, views
+        )
 
 
-def device_of(network: torch.nn.Module) -> torch.device:
+def get_device(network: torch.nn.Module) -> torch.device:
     """Return the device of a network."""
     return next(network.parameters()).device
 
 
-def predict(
+def run_network(
     network: DepthAnything | NestedDepthAnything, batch: Batch, inference: Inference
 ) -> Prediction | NestedPrediction:
     """Run a network on a batch, with poses in normalised units."""
-    device = device_of(network)
-    poses = seen_from_first(batch.poses, inference.unit_of(batch.poses.centers))
+    device = get_device(network)
+    poses = normalize_poses(batch.poses, inference.compute_units(batch.poses.centers))
     # Not torch.inference_mode: later stages optimise these tensors.
     with torch.no_grad(), lower_precision(device, inference.dtype):
         return network(batch.images.to(device), Poses(poses.c2w.to(device), poses.K.to(device)))
 
 
-def centers_of(poses: Poses) -> Float[np.ndarray, "b v 3"]:
+def get_camera_centers(poses: Poses) -> Float[np.ndarray, "b v 3"]:
     """Return the camera centres of each scene."""
     return poses.centers.double().cpu().numpy()
 
 
-def certainty(confidence: Float[Tensor, "*n h w"]) -> Float[Tensor, "*n h w"]:
+def normalize_confidence(confidence: Float[Tensor, "*n h w"]) -> Float[Tensor, "*n h w"]:
     """Map confidence from [1, ∞) to [0, 1)."""
     return 1 - 1 / confidence
 
 
-def depth_maps(
+def resample_depth_maps(
     depth: Float[Tensor, "v h w"],
     confidence: Float[Tensor, "v h w"],
     batch: Batch,
@@ -157,18 +168,18 @@ def depth_maps(
     """Resample depth maps from the windows to the photographs, on their device."""
     device = views[0].image.device
     maps = zip(batch.windows, depth.to(device), confidence.to(device), views, strict=True)
-    return [window.depth_map(z, sure, view.camera) for window, z, sure, view in maps]
+    return [window.resample_depth_map(z, sure, view.camera) for window, z, sure, view in maps]
 
 
-def in_world(predicted: Prediction, given: Poses) -> PixelGaussians:
+def move_to_given_frame(predicted: Prediction, given: Poses) -> PixelGaussians:
     """Transform the Gaussians to the frame and unit of the given cameras."""
-    pairs = zip(centers_of(predicted.poses), centers_of(given), strict=True)
-    factors = [similarity_between(*pair).scale for pair in pairs]
+    pairs = zip(get_camera_centers(predicted.poses), get_camera_centers(given), strict=True)
+    factors = [fit_center_similarity(*pair).scale for pair in pairs]
     first = given.c2w[:, 0].to(predicted.depth)
-    return placed(predicted.gaussians(first.new_tensor(factors)), first)
+    return move_from_first_camera(predicted.create_gaussians(first.new_tensor(factors)), first)
 
 
-def reconstruction_of(
+def create_any_view_reconstruction(
     gaussians: PixelGaussians,
     confidence: Float[Tensor, "v h w"],
     batch: Batch,
@@ -178,14 +189,16 @@ def reconstruction_of(
     device = views[0].image.device
     means = gaussians.means[0].to(device)
     per_view = zip(means.flatten(1, 2), views, strict=True)
-    z = torch.stack([z_depths(m, view.camera) for m, view in per_view]).view(means.shape[:3])
+    z = torch.stack([compute_z_depths(m, view.camera) for m, view in per_view]).view(
+        means.shape[:3]
+    )
     ahead = z > 0
     sure = confidence.to(device) * ahead
-    depths = depth_maps(z.where(ahead, z.abs().max()), sure, batch, views)
-    pixels = [w.pixel_index(v.camera) for w, v in zip(batch.windows, views, strict=True)]
+    depths = resample_depth_maps(z.where(ahead, z.abs().max()), sure, batch, views)
+    pixels = [w.compute_pixel_indices(v.camera) for w, v in zip(batch.windows, views, strict=True)]
     numbers = torch.arange(len(views)).repeat_interleave(z[0].numel())
     return Reconstruction(
-        gaussians_of(gaussians).to(device),
+        flatten_gaussians(gaussians).to(device),
         tuple(depths),
         numbers.to(device),
         torch.cat(pixels).to(device),

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
-def balanced_view(tokens: Float[Tensor, "b v c"]) -> Int[Tensor, "b"]:
+def select_reference_view(tokens: Float[Tensor, "b v c"]) -> Int[Tensor, "b"]:
     """Select the view whose token is least extreme in similarity, norm and variance."""
     unit = F.normalize(tokens, dim=-1)
     likeness = (unit @ unit.transpose(1, 2)).sum(-1) - 1
@@ -19,7 +19,7 @@ def balanced_view(tokens: Float[Tensor, "b v c"]) -> Int[Tensor, "b"]:
     return (ranked - 0.5).abs().sum(0).argmin(-1)
 
 
-def order_from(reference: Int[Tensor, "b"], views: int) -> Int[Tensor, "b v"]:
+def order_views(reference: Int[Tensor, "b"], views: int) -> Int[Tensor, "b v"]:
     """Order view indices with the reference first."""
     numbers = torch.arange(views, device=reference.device).expand(len(reference), -1)
     first = (numbers != reference[:, None]).int()

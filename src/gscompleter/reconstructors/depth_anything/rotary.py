@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-PAIRS = 16
+NUM_PAIRS = 16
 """Number of channel pairs rotated by the row of a patch, and by its column."""
-BASE = 100.0
+FREQUENCY_BASE = 100.0
 """Approximate ratio of the highest to the lowest frequency."""
 
 
 @dataclass(frozen=True)
-class Turns:
+class RotaryEmbedding:
     """Cosines and sines of the rotation of each token's channel pairs."""
 
     cos: Float[Tensor, "t 2 pairs"]
@@ -23,25 +23,25 @@ class Turns:
 
     def __call__(self, x: Float[Tensor, "n heads t c"]) -> Float[Tensor, "n heads t c"]:
         """Rotate channel pairs k and k + 16 of each half."""
-        u, v = x.unflatten(-1, (2, 2, PAIRS)).unbind(-2)
+        u, v = x.unflatten(-1, (2, 2, NUM_PAIRS)).unbind(-2)
         rotated = (u * self.cos - v * self.sin, v * self.cos + u * self.sin)
         return torch.stack(rotated, dim=-2).flatten(-3)
 
 
-def turns_at(places: Int[Tensor, "t 2"]) -> Turns:
+def compute_rotary_embedding(places: Int[Tensor, "t 2"]) -> RotaryEmbedding:
     """Compute the rotations of tokens at rows and columns."""
-    k = torch.arange(PAIRS, device=places.device)
-    angles = places[..., None] * BASE ** (-k / PAIRS)
-    return Turns(angles.cos(), angles.sin())
+    k = torch.arange(NUM_PAIRS, device=places.device)
+    angles = places[..., None] * FREQUENCY_BASE ** (-k / NUM_PAIRS)
+    return RotaryEmbedding(angles.cos(), angles.sin())
 
 
-def places_in_view(rows: int, columns: int, device: torch.device) -> Int[Tensor, "t 2"]:
+def list_view_positions(rows: int, columns: int, device: torch.device) -> Int[Tensor, "t 2"]:
     """List the row and column of each token: 0, 0 for the class token, patches from 1."""
     grid = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)) + 1
     return torch.cat([torch.zeros(1, 2, dtype=torch.long), grid]).to(device)
 
 
-def places_among_views(views: int, patches: int, device: torch.device) -> Int[Tensor, "t 2"]:
+def list_shared_positions(views: int, patches: int, device: torch.device) -> Int[Tensor, "t 2"]:
     """List positions that only distinguish patches (1) from other tokens (0)."""
     view_tokens = torch.ones(1 + patches, 2, dtype=torch.long, device=device)
     view_tokens[0] = 0

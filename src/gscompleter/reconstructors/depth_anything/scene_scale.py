@@ -11,27 +11,27 @@ from jaxtyping import Float
 from gscompleter.errors import InputError
 from gscompleter.geometry import sample
 from gscompleter.matching.depth_range import MIN_MATCHES
-from gscompleter.matching.neighbours import neighbours_among
-from gscompleter.matching.stereo_image import stereo_images
+from gscompleter.matching.neighbours import find_neighbours
+from gscompleter.matching.stereo_image import make_stereo_images
 from gscompleter.matching.triangulation import triangulate
 from gscompleter.types import DepthMap, View
 
 
-def units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) -> float:
+def estimate_units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) -> float:
     """Estimate scene units per metre: the median over features that two photographs share.
 
     Raises:
         InputError: Too few features have a depth in `metres`.
     """
-    images, unit = stereo_images(views)
-    neighbours = neighbours_among(images)
+    images, unit = make_stereo_images(views)
+    neighbours = find_neighbours(images)
     ratios = [np.zeros(0)]
     for i, j in neighbours.pairs:
         a, b = neighbours.matches[i, j]
         if len(a):
             for one, two, at, to in ((i, j, a, b), (j, i, b, a)):
                 inverse, good = triangulate(images[one], images[two], at, to)
-                known = depths_at(metres[one], at)
+                known = sample_depths(metres[one], at)
                 good &= known > 0
                 ratios.append(unit / (inverse[good] * known[good]))
     found = np.concatenate(ratios)
@@ -43,7 +43,7 @@ def units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) -> float:
     return float(np.median(found))
 
 
-def depths_at(depth: DepthMap, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:
+def sample_depths(depth: DepthMap, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:
     """Sample z-depth at pixel coordinates; 0 if invalid."""
     known = (depth.depth * depth.valid).cpu()[..., None]
     return sample(known, torch.from_numpy(pixels).float(), "nearest")[..., 0].double().numpy()

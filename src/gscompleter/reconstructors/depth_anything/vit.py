@@ -10,12 +10,15 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gscompleter.reconstructors.depth_anything.config import VitConfig
-from gscompleter.reconstructors.depth_anything.reference_view import balanced_view, order_from
+from gscompleter.reconstructors.depth_anything.reference_view import (
+    order_views,
+    select_reference_view,
+)
 from gscompleter.reconstructors.depth_anything.rotary import (
-    Turns,
-    places_among_views,
-    places_in_view,
-    turns_at,
+    RotaryEmbedding,
+    compute_rotary_embedding,
+    list_shared_positions,
+    list_view_positions,
 )
 from gscompleter.reconstructors.feed_forward import dino
 from gscompleter.reconstructors.feed_forward.dino import (
@@ -24,7 +27,7 @@ from gscompleter.reconstructors.feed_forward.dino import (
     LayerScale,
     Mlp,
     PatchEmbedding,
-    resized_positions,
+    resize_position_embeddings,
 )
 
 
@@ -40,7 +43,7 @@ class Tokens:
         return Tokens(self.patches.float(), self.camera.float())
 
 
-class PlacedAttention(dino.Attention):
+class RotaryAttention(dino.Attention):
     """Self-attention with rotary position embedding."""
 
     def __init__(self, channels: int, heads: int) -> None:
@@ -49,7 +52,7 @@ class PlacedAttention(dino.Attention):
         self.k_norm = nn.LayerNorm(channels // heads)
 
     def forward(  # type: ignore[override]
-        self, x: Float[Tensor, "n t c"], turns: Turns
+        self, x: Float[Tensor, "n t c"], turns: RotaryEmbedding
     ) -> Float[Tensor, "n t c"]:
         """Apply self-attention to tokens rotated by `turns`."""
         q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
@@ -84,7 +87,7 @@ class Block(nn.Module):
         self.mlp = mlp
         self.ls2 = LayerScale(channels)
 
-    def forward(self, x: Float[Tensor, "n t c"], *turns: Turns) -> Float[Tensor, "n t c"]:
+    def forward(self, x: Float[Tensor, "n t c"], *turns: RotaryEmbedding) -> Float[Tensor, "n t c"]:
         """Apply attention, then the MLP."""
         x = x + self.ls1(self.attn(self.norm1(x), *turns))
         return x + self.ls2(self.mlp(self.norm2(x)))
@@ -100,25 +103,25 @@ class AnyViewVit(nn.Module):
     def __init__(self, config: VitConfig) -> None:
         super().__init__()
         self.config = config
-        channels, start = config.channels, config.alternates_from
+        channels, start = config.channels, config.first_multi_view_block
         self.cls_token = nn.Parameter(torch.zeros(1, 1, channels))
         if start is not None:
             self.camera_token = nn.Parameter(torch.zeros(1, 2, channels))
         self.pos_embed = nn.Parameter(torch.zeros(1, GRID**2 + 1, channels))
         self.patch_embed = PatchEmbedding(channels)
-        self.blocks = nn.ModuleList(self.block(i) for i in range(config.blocks))
+        self.blocks = nn.ModuleList(self.create_block(i) for i in range(config.blocks))
         self.norm = nn.LayerNorm(channels)
 
-    def block(self, number: int) -> Block:
+    def create_block(self, number: int) -> Block:
         """Create a block, with rotary embedding in the multi-view part."""
         c = self.config
-        attention = PlacedAttention if self.alternates(number) else dino.Attention
-        mlp = GatedMlp(c.channels) if c.gated else Mlp(c.channels)
+        attention = RotaryAttention if self.is_multi_view_block(number) else dino.Attention
+        mlp = GatedMlp(c.channels) if c.is_gated else Mlp(c.channels)
         return Block(c.channels, attention(c.channels, c.heads), mlp, eps=1e-6)
 
-    def alternates(self, number: int) -> bool:
+    def is_multi_view_block(self, number: int) -> bool:
         """Return True for blocks of the multi-view part."""
-        start = self.config.alternates_from
+        start = self.config.first_multi_view_block
         return start is not None and number >= start
 
     def forward(
@@ -126,39 +129,43 @@ class AnyViewVit(nn.Module):
     ) -> list[Tokens]:
         """Compute the tokens of the four output blocks; `cameras` is None if poses are unknown."""
         scenes, views = images.shape[:2]
-        x = self.embedded(images)
+        x = self.embed_views(images)
         size = (images.shape[3] // PATCH, images.shape[4] // PATCH)
-        within = turns_at(places_in_view(*size, images.device))
-        among = turns_at(places_among_views(views, size[0] * size[1], images.device))
+        within = compute_rotary_embedding(list_view_positions(*size, images.device))
+        among = compute_rotary_embedding(
+            list_shared_positions(views, size[0] * size[1], images.device)
+        )
         order = torch.arange(views, device=images.device).expand(scenes, -1)
-        start = self.config.alternates_from
+        start = self.config.first_multi_view_block
         outputs, local = [], x
         for number, block in enumerate(self.blocks):
             if start is not None and number == start - 1 and cameras is None and views > 2:
-                order = order_from(balanced_view(x[:, :, 0].float()), views)
-                x, local = reordered(x, order), reordered(local, order)
+                order = order_views(select_reference_view(x[:, :, 0].float()), views)
+                x, local = reorder_views(x, order), reorder_views(local, order)
             if number == start:
-                x = torch.cat([self.camera_tokens(cameras, scenes, views), x[:, :, 1:]], dim=2)
-            if not self.alternates(number):
+                x = torch.cat(
+                    [self.select_camera_tokens(cameras, scenes, views), x[:, :, 1:]], dim=2
+                )
+            if not self.is_multi_view_block(number):
                 local = x = block(x.flatten(0, 1)).unflatten(0, (scenes, views))
             elif number % 2:
                 x = block(x.flatten(1, 2), among).unflatten(1, (views, -1))
             else:
                 local = x = block(x.flatten(0, 1), within).unflatten(0, (scenes, views))
-            if number in self.config.outputs:
+            if number in self.config.output_block_ids:
                 back = order.argsort(dim=1)
-                outputs.append(self.handed_on(reordered(local, back), reordered(x, back)))
+                outputs.append(self.join_tokens(reorder_views(local, back), reorder_views(x, back)))
         return outputs
 
-    def embedded(self, images: Float[Tensor, "b v 3 h w"]) -> Float[Tensor, "b v t c"]:
+    def embed_views(self, images: Float[Tensor, "b v 3 h w"]) -> Float[Tensor, "b v t c"]:
         """Embed class token and patches of each view, with positions."""
         patches = self.patch_embed(images.flatten(0, 1))
         size = (images.shape[3] // PATCH, images.shape[4] // PATCH)
         tokens = torch.cat([self.cls_token.expand(len(patches), -1, -1), patches], 1)
-        tokens = tokens + resized_positions(self.pos_embed, *size)
+        tokens = tokens + resize_position_embeddings(self.pos_embed, *size)
         return tokens.unflatten(0, images.shape[:2])
 
-    def camera_tokens(
+    def select_camera_tokens(
         self, cameras: Float[Tensor, "b v c"] | None, scenes: int, views: int
     ) -> Float[Tensor, "b v 1 c"]:
         """Return the given tokens, or learned ones for the first view and for all others."""
@@ -169,15 +176,17 @@ class AnyViewVit(nn.Module):
             scenes, -1, -1, -1
         )
 
-    def handed_on(self, local: Float[Tensor, "b v t c"], x: Float[Tensor, "b v t c"]) -> Tokens:
+    def join_tokens(self, local: Float[Tensor, "b v t c"], x: Float[Tensor, "b v t c"]) -> Tokens:
         """Join the tokens of a block with those of the last single-view block."""
         normed = self.norm(x)
-        if self.config.alternates_from is None:
+        if self.config.first_multi_view_block is None:
             return Tokens(normed[:, :, 1:], x[:, :, 0])
         patches = torch.cat([local[:, :, 1:], normed[:, :, 1:]], -1)
         return Tokens(patches, torch.cat([local[:, :, 0], x[:, :, 0]], -1))
 
 
-def reordered(x: Float[Tensor, "b v t c"], order: Int[Tensor, "b v"]) -> Float[Tensor, "b v t c"]:
+def reorder_views(
+    x: Float[Tensor, "b v t c"], order: Int[Tensor, "b v"]
+) -> Float[Tensor, "b v t c"]:
     """Reorder the views of each scene."""
     return x.take_along_dim(order[:, :, None, None], dim=1)

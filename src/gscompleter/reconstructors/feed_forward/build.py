@@ -26,15 +26,15 @@ from gscompleter.reconstructors.feed_forward.reconstructor import FeedForward
 from gscompleter.reconstructors.feed_forward.volsplat import VolSplat
 from gscompleter.reconstructors.from_depth import FromDepth
 from gscompleter.weights import PUBLISHED, PublishedWeights, fetch, load_strictly, read_state_dict
-from gscompleter.weights.fitting import shapes_of
+from gscompleter.weights.fitting import get_shapes
 
-DepthAnythings = DepthAnything | MetricDepthAnything | NestedDepthAnything
-Network = MVSplat | DepthSplat | VolSplat | DepthAnythings
-Reconstructs = FeedForward | FromDepth | AnyViewGaussians
+DepthAnythingNetwork = DepthAnything | MetricDepthAnything | NestedDepthAnything
+Network = MVSplat | DepthSplat | VolSplat | DepthAnythingNetwork
+LearnedReconstructor = FeedForward | FromDepth | AnyViewGaussians
 
 
 @lru_cache(maxsize=1)
-def build(name: str, weights: Path | None = None, device: str = "cpu") -> Reconstructs:
+def build(name: str, weights: Path | None = None, device: str = "cpu") -> LearnedReconstructor:
     """Load the reconstructor with the published weights `name`; the last one is cached.
 
     Args:
@@ -48,12 +48,12 @@ def build(name: str, weights: Path | None = None, device: str = "cpu") -> Recons
     published = PUBLISHED[name]
     path = fetch(published, weights)
     state = read_state_dict(path, published)
-    network = network_of(published)
-    load_strictly(network, state, path, shapes_of_all)
-    return around(network.eval().requires_grad_(False).to(device))
+    network = create_network(published)
+    load_strictly(network, state, path, collect_all_shapes)
+    return wrap_network(network.eval().requires_grad_(False).to(device))
 
 
-def around(network: Network, dtype: torch.dtype = torch.float32) -> Reconstructs:
+def wrap_network(network: Network, dtype: torch.dtype = torch.float32) -> LearnedReconstructor:
     """Wrap a network as a reconstructor; any `dtype` but float32 needs a GPU."""
     inference = Inference(dtype=dtype)
     if isinstance(network, MetricDepthAnything):
@@ -67,16 +67,18 @@ def around(network: Network, dtype: torch.dtype = torch.float32) -> Reconstructs
     return FeedForward(network, dtype)
 
 
-def network_of(published: PublishedWeights) -> Network:
+def create_network(published: PublishedWeights) -> Network:
     """Create the network that fits a file of weights, with random parameters."""
     if published.name in depth_anything.VARIANTS:
-        return network_with(depth_anything.VARIANTS[published.name])
+        return create_depth_anything(depth_anything.VARIANTS[published.name])
     if published.model == "DepthSplat":
-        return DepthSplat(VARIANTS[variant_of(published)])
+        return DepthSplat(VARIANTS[get_variant_name(published)])
     return MVSplat() if published.model == "MVSplat" else VolSplat()
 
 
-def network_with(config: DepthAnythingConfig | MetricDepthConfig | NestedConfig) -> DepthAnythings:
+def create_depth_anything(
+    config: DepthAnythingConfig | MetricDepthConfig | NestedConfig,
+) -> DepthAnythingNetwork:
     """Create a Depth Anything 3 network with random parameters."""
     if isinstance(config, NestedConfig):
         return NestedDepthAnything(config)
@@ -85,17 +87,17 @@ def network_with(config: DepthAnythingConfig | MetricDepthConfig | NestedConfig)
     return DepthAnything(config)
 
 
-def variant_of(published: PublishedWeights) -> str:
+def get_variant_name(published: PublishedWeights) -> str:
     """Return the key of `VARIANTS`; published names omit a size of 256x256."""
     key = published.name.removeprefix("depthsplat-")
     return key if key in VARIANTS else f"{key}-256x256"
 
 
-def shapes_of_all() -> dict[str, dict[str, tuple[int, ...]]]:
+def collect_all_shapes() -> dict[str, dict[str, tuple[int, ...]]]:
     """Collect the tensor shapes of every supported network by the name of its weights."""
     with torch.device("meta"):
         return {
-            name: shapes_of(network_of(published).state_dict())
+            name: get_shapes(create_network(published).state_dict())
             for name, published in PUBLISHED.items()
             if published.is_reconstructor
         }

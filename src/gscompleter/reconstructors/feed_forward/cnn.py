@@ -45,7 +45,7 @@ class ImageEncoder(nn.Module):
         return [first, second, self.conv2(self.layer3(second))]
 
 
-def normalised(images: Float[Tensor, "*n 3 h w"]) -> Float[Tensor, "*n 3 h w"]:
+def normalize_images(images: Float[Tensor, "*n 3 h w"]) -> Float[Tensor, "*n 3 h w"]:
     """Normalise images in [0, 1] by the mean and standard deviation of ImageNet."""
     mean = images.new_tensor([0.485, 0.456, 0.406])[:, None, None]
     deviation = images.new_tensor([0.229, 0.224, 0.225])[:, None, None]

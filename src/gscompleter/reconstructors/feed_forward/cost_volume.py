@@ -7,13 +7,13 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gscompleter.reconstructors.feed_forward.cameras import Cameras, full_precision
+from gscompleter.reconstructors.feed_forward.cameras import Cameras, disable_autocast
 
 MIN_DEPTH = 1e-3
 """Smallest z-depth in a source view, in scene units; nearer points are clamped to it."""
 
 
-def evenly_spaced(
+def space_evenly(
     first: Float[Tensor, "n 1 h w"], last: Float[Tensor, "n 1 h w"], number: int
 ) -> Float[Tensor, "n {number} h w"]:
     """Space `number` candidates evenly from `first` to `last` at each pixel."""
@@ -21,7 +21,7 @@ def evenly_spaced(
     return first + steps * (last - first)
 
 
-def cost_volume(
+def compute_cost_volume(
     features: Float[Tensor, "n c h w"],
     cameras: Cameras,
     sources: Int[Tensor, "b v s"],
@@ -34,8 +34,8 @@ def cost_volume(
     given per view or per pixel, and processed `depth_chunk` at a time to bound the memory.
     """
     n, _, h, w = features.shape
-    K = cameras.intrinsics(h, w).flatten(0, 1)
-    transforms = cameras.sources_from_views(sources).flatten(0, 1)
+    K = cameras.scale_intrinsics(h, w).flatten(0, 1)
+    transforms = cameras.compute_sources_from_views(sources).flatten(0, 1)
     depths = (1 / inverse_depths).expand(n, -1, h, w)
     first = torch.arange(len(sources), device=sources.device)[:, None, None] * sources.shape[1]
     numbers = (first + sources).flatten(0, 1).tolist()
@@ -44,7 +44,7 @@ def cost_volume(
         chunks = []
         for chunk in depths[view].split(depth_chunk):
             matches = [
-                correlation(features[view], features[source], K[view], transform, chunk)
+                correlate_features(features[view], features[source], K[view], transform, chunk)
                 for source, transform in zip(numbers[view], transforms[view], strict=True)
             ]
             chunks.append(torch.stack(matches).mean(0))
@@ -52,7 +52,7 @@ def cost_volume(
     return torch.stack(volumes)
 
 
-def correlation(
+def correlate_features(
     reference: Float[Tensor, "c h w"],
     source: Float[Tensor, "c h w"],
     K: Float[Tensor, "3 3"],
@@ -60,7 +60,7 @@ def correlation(
     depths: Float[Tensor, "d h w"],
 ) -> Float[Tensor, "d h w"]:
     """Correlate the reference with the source sampled at `depths`; 0 outside the source."""
-    grid = sampling_grid(K, source_from_reference, depths)
+    grid = compute_sampling_grid(K, source_from_reference, depths)
     sampled = F.grid_sample(
         source[None], grid.flatten(0, 1)[None], mode="bilinear", align_corners=True
     )
@@ -69,7 +69,7 @@ def correlation(
     )
 
 
-def sampling_grid(
+def compute_sampling_grid(
     K: Float[Tensor, "3 3"],
     source_from_reference: Float[Tensor, "4 4"],
     depths: Float[Tensor, "d h w"],
@@ -79,7 +79,7 @@ def sampling_grid(
     As in training, pixel centres have integer coordinates and `K` serves for both views.
     """
     _, h, w = depths.shape
-    with full_precision(K):
+    with disable_autocast(K):
         x, y = torch.arange(w, device=K.device), torch.arange(h, device=K.device)
         columns, rows = torch.meshgrid(x, y, indexing="xy")
         pixels = torch.stack([columns, rows, torch.ones_like(rows)]).flatten(1).to(K)

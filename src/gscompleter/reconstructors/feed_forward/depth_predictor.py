@@ -10,33 +10,37 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gscompleter.reconstructors.feed_forward.cameras import Cameras, nearest_views, other_views
-from gscompleter.reconstructors.feed_forward.cnn import ImageEncoder, normalised
-from gscompleter.reconstructors.feed_forward.cost_volume import cost_volume, evenly_spaced
+from gscompleter.reconstructors.feed_forward.cameras import (
+    Cameras,
+    find_nearest_views,
+    list_other_views,
+)
+from gscompleter.reconstructors.feed_forward.cnn import ImageEncoder, normalize_images
+from gscompleter.reconstructors.feed_forward.cost_volume import compute_cost_volume, space_evenly
 from gscompleter.reconstructors.feed_forward.dino import PATCH, DinoV2
 from gscompleter.reconstructors.feed_forward.dpt import (
     CHANNELS,
     DptHead,
     Layout,
-    padded_conv3x3,
-    two_padded_convolutions,
+    create_padded_conv3x3,
+    create_padded_conv_block,
 )
-from gscompleter.reconstructors.feed_forward.resampling import enlarged, resized
+from gscompleter.reconstructors.feed_forward.resampling import enlarge, resize_bilinear
 from gscompleter.reconstructors.feed_forward.transformer import MultiViewTransformer
-from gscompleter.reconstructors.feed_forward.unet import UNet, conv3x3, refiner
+from gscompleter.reconstructors.feed_forward.unet import UNet, create_conv3x3, create_refiner
 
 MAX_SOURCES = 2
 """Number of nearest source views for more than three views; else all others are used."""
 
 
 @dataclass(frozen=True)
-class Vit:
+class VitSizes:
     """Sizes that depend on the vision transformer, and channels of its two DPT heads."""
 
     channels: int
     num_blocks: int
     heads: int
-    tapped: tuple[int, int, int, int]
+    feature_blocks: tuple[int, int, int, int]
     """Indices of the blocks that provide features."""
     widths: tuple[int, int, int, int]
     """Channels of the four levels of the DPT heads, finest first."""
@@ -45,9 +49,9 @@ class Vit:
 
 
 VITS = {
-    "vits": Vit(384, 12, 6, (2, 5, 8, 11), (48, 96, 192, 384), 32, 64),
-    "vitb": Vit(768, 12, 12, (2, 5, 8, 11), (96, 192, 384, 768), 48, 96),
-    "vitl": Vit(1024, 24, 16, (4, 11, 17, 23), (128, 256, 512, 1024), 64, 128),
+    "vits": VitSizes(384, 12, 6, (2, 5, 8, 11), (48, 96, 192, 384), 32, 64),
+    "vitb": VitSizes(768, 12, 12, (2, 5, 8, 11), (96, 192, 384, 768), 48, 96),
+    "vitl": VitSizes(1024, 24, 16, (4, 11, 17, 23), (128, 256, 512, 1024), 64, 128),
 }
 
 LAYOUTS: Mapping[tuple[int, int], Layout] = {
@@ -109,7 +113,7 @@ class Pyramid(nn.Module):
         if num_scales == 2:
             half = channels // 2
             upsampling = nn.ConvTranspose2d(channels, half, 2, 2)
-            self.stages.append(nn.Sequential(upsampling, nn.GELU(), conv3x3(half, half)))
+            self.stages.append(nn.Sequential(upsampling, nn.GELU(), create_conv3x3(half, half)))
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> list[Float[Tensor, "n _ _ _"]]:
         """Compute the maps, coarsest first."""
@@ -134,7 +138,9 @@ class DepthPredictor(nn.Module):
         for scale in range(config.num_scales):
             self.add_scale(scale)
         features = self.vit.depth_features
-        self.upsampler = dpt_head(config, features, with_disparity=True, out=to_residual(features))
+        self.upsampler = create_dpt_head(
+            config, features, with_disparity=True, out=create_residual_layers(features)
+        )
 
     def add_scale(self, scale: int) -> None:
         """Add the layers from the cost volume of `scale` (0 is coarsest) to probabilities."""
@@ -142,47 +148,56 @@ class DepthPredictor(nn.Module):
         image_channels, vit_channels = CHANNELS[f"cnn{2 - scale}"], self.vit.channels // 2**scale
         channels = candidates + image_channels + width + vit_channels
         unet = UNet(width, levels=3 + scale, attention_level=2 + scale, pre_norm=True)
-        self.regressor.append(refiner(channels, width, unet))
+        self.regressor.append(create_refiner(channels, width, unet))
         self.regressor_residual.append(nn.Conv2d(channels, width, 1))
-        self.depth_head.append(two_padded_convolutions(width, 2 * width, candidates))
+        self.depth_head.append(create_padded_conv_block(width, 2 * width, candidates))
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> DepthPrediction:
         """Predict depth for at least two images in [0, 1], with sides divisible by `patch`."""
         b, v = images.shape[:2]
         few = v <= MAX_SOURCES + 1
-        sources = other_views(b, v, images.device) if few else nearest_views(cameras, MAX_SOURCES)
-        flat = normalised(images.flatten(0, 1))
+        sources = (
+            list_other_views(b, v, images.device)
+            if few
+            else find_nearest_views(cameras, MAX_SOURCES)
+        )
+        flat = normalize_images(images.flatten(0, 1))
         encoded = self.backbone(flat)
         matching = self.mv_pyramid(self.transformer(encoded[-1], sources))
-        vit_maps = self.vit_features(flat)
-        deepest = resized(vit_maps[-1], encoded[-1].shape[2:])
+        vit_maps = self.compute_vit_features(flat)
+        deepest = resize_bilinear(vit_maps[-1], encoded[-1].shape[2:])
         contexts = list(zip(encoded[::-1], matching, self.mono_pyramid(deepest), strict=False))
 
-        low, high = cameras.inverse_range()
-        candidates = evenly_spaced(low, high, self.config.num_candidates)
-        disparity, probability = self.match(0, contexts[0], cameras, sources, candidates)
+        low, high = cameras.compute_inverse_range()
+        candidates = space_evenly(low, high, self.config.num_candidates)
+        disparity, probability = self.match_sources(0, contexts[0], cameras, sources, candidates)
         for scale in range(1, self.config.num_scales):
             number = self.config.num_candidates // 4**scale
             interval = (high - low) / (self.config.num_candidates - 1) / 2**scale
-            candidates = candidates_around(enlarged(disparity, 2), interval, number, low, high)
-            disparity, probability = self.match(
+            candidates = sample_candidates(enlarge(disparity, 2), interval, number, low, high)
+            disparity, probability = self.match_sources(
                 scale, contexts[scale], cameras, sources, candidates
             )
 
         maps = {f"cnn{i}": x for i, x in enumerate(encoded)}
         maps |= {f"matching{i}": x for i, x in enumerate(matching)}
         residual = self.upsampler(vit_maps, {**maps, "disparity": disparity})
-        full = enlarged(disparity, self.config.upsample_factor) + residual
+        full = enlarge(disparity, self.config.upsample_factor) + residual
         certainty = probability.amax(1, keepdim=True)
         return DepthPrediction(1 / full.clamp(low, high), certainty, maps, vit_maps)
 
-    def vit_features(self, images: Float[Tensor, "n 3 h w"]) -> list[Float[Tensor, "n c p q"]]:
+    def compute_vit_features(
+        self, images: Float[Tensor, "n 3 h w"]
+    ) -> list[Float[Tensor, "n c p q"]]:
         """Compute four feature maps of the vision transformer at 1/8 resolution."""
         h, w = images.shape[2:]
-        patches = resized(images, (h // PATCH * PATCH, w // PATCH * PATCH))
-        return [resized(x, (h // 8, w // 8)) for x in self.pretrained(patches, self.vit.tapped)]
+        patches = resize_bilinear(images, (h // PATCH * PATCH, w // PATCH * PATCH))
+        return [
+            resize_bilinear(x, (h // 8, w // 8))
+            for x in self.pretrained(patches, self.vit.feature_blocks)
+        ]
 
-    def match(
+    def match_sources(
         self,
         scale: int,
         context: tuple[Float[Tensor, "n _ h w"], ...],
@@ -192,7 +207,7 @@ class DepthPredictor(nn.Module):
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n d h w"]]:
         """Estimate inverse depth and the probability of each candidate from features `context`."""
         _, to_match, _ = context
-        costs = cost_volume(to_match, cameras, sources, candidates, self.config.depth_chunk)
+        costs = compute_cost_volume(to_match, cameras, sources, candidates, self.config.depth_chunk)
         joined = torch.cat([costs, *context], 1)
         refined = self.regressor[scale](joined, sources.shape[1])
         logits = self.depth_head[scale](refined + self.regressor_residual[scale](joined))
@@ -200,7 +215,7 @@ class DepthPredictor(nn.Module):
         return (probability * candidates).sum(1, keepdim=True), probability
 
 
-def dpt_head(
+def create_dpt_head(
     config: DepthConfig, features: int, with_disparity: bool, out: nn.Module | None = None
 ) -> DptHead:
     """Create a DPT head that fuses the maps of a `DepthPrediction`."""
@@ -210,18 +225,18 @@ def dpt_head(
     return DptHead(vit.channels, vit.widths, features, layout, out)
 
 
-def to_residual(features: int) -> nn.Sequential:
+def create_residual_layers(features: int) -> nn.Sequential:
     """Create the layers that map fused features to a correction of inverse depth."""
     return nn.Sequential(
-        padded_conv3x3(features, features // 2),
+        create_padded_conv3x3(features, features // 2),
         nn.GELU(),
-        padded_conv3x3(features // 2, 16),
+        create_padded_conv3x3(features // 2, 16),
         nn.GELU(),
         nn.Conv2d(16, 1, 1),
     )
 
 
-def candidates_around(
+def sample_candidates(
     disparity: Float[Tensor, "n 1 h w"],
     interval: Float[Tensor, "n 1 1 1"],
     number: int,
@@ -231,4 +246,4 @@ def candidates_around(
     """Sample inverse depths around `disparity`; only the ends are clamped to [`low`, `high`]."""
     start = (disparity - number // 2 * interval).clamp(low, high)
     stop = (disparity + (number // 2 - 1) * interval).clamp(low, high)
-    return evenly_spaced(start, stop, number)
+    return space_evenly(start, stop, number)

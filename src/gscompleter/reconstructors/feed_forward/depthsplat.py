@@ -10,11 +10,11 @@ from torch import Tensor
 
 from gscompleter.reconstructors.feed_forward.cameras import Cameras
 from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
-from gscompleter.reconstructors.feed_forward.dpt import two_padded_convolutions
+from gscompleter.reconstructors.feed_forward.dpt import create_padded_conv_block
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import (
     DEPTHSPLAT_CHANNELS,
     PixelGaussians,
-    depthsplat_gaussians,
+    create_depthsplat_gaussians,
 )
 from gscompleter.reconstructors.feed_forward.pixel_features import PixelFeatures
 
@@ -61,13 +61,15 @@ class DepthSplat(PixelFeatures):
     def __init__(self, config: DepthSplatConfig = DepthSplatConfig()) -> None:
         super().__init__(config.depth)
         self.config = config
-        self.gaussian_head = two_padded_convolutions(
+        self.gaussian_head = create_padded_conv_block(
             self.channels, DEPTHSPLAT_CHANNELS, DEPTHSPLAT_CHANNELS
         )
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
         """Predict a Gaussian for each pixel; see `DepthPredictor` for the images."""
-        depth, features = self.describe(images, cameras)
+        depth, features = self.compute_pixel_features(images, cameras)
         raw = self.gaussian_head(features)
         flat = images.flatten(0, 1)
-        return depthsplat_gaussians(raw, depth, flat, cameras, self.config.gaussian_scale_max)
+        return create_depthsplat_gaussians(
+            raw, depth, flat, cameras, self.config.gaussian_scale_max
+        )

@@ -102,7 +102,9 @@ class DinoV2(nn.Module):
         """Compute feature maps after `blocks`, for normalised images with sides divisible by 14."""
         size = (images.shape[2] // PATCH, images.shape[3] // PATCH)
         class_token = self.cls_token.expand(len(images), -1, -1)
-        tokens = torch.cat([class_token, self.patch_embed(images)], 1) + self.positions(*size)
+        tokens = torch.cat(
+            [class_token, self.patch_embed(images)], 1
+        ) + self.get_position_embeddings(*size)
         maps = []
         for i, block in enumerate(self.blocks):
             tokens = block(tokens)
@@ -110,12 +112,12 @@ class DinoV2(nn.Module):
                 maps.append(self.norm(tokens)[:, 1:].transpose(1, 2).unflatten(2, size))
         return maps
 
-    def positions(self, rows: int, columns: int) -> Float[Tensor, "1 t c"]:
+    def get_position_embeddings(self, rows: int, columns: int) -> Float[Tensor, "1 t c"]:
         """Return position embeddings for `rows` x `columns` patches."""
-        return resized_positions(self.pos_embed, rows, columns)
+        return resize_position_embeddings(self.pos_embed, rows, columns)
 
 
-def resized_positions(
+def resize_position_embeddings(
     stored: Float[Tensor, "1 s c"], rows: int, columns: int
 ) -> Float[Tensor, "1 t c"]:
     """Resize position embeddings to `rows` x `columns`, with the original's 0.1 size offset."""

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gscompleter.reconstructors.feed_forward.resampling import resized
+from gscompleter.reconstructors.feed_forward.resampling import resize_bilinear
 
 VIT = "vit"
 """Name of the transformer's own map in a `Layout`."""
@@ -19,14 +19,16 @@ Layout = Sequence[Sequence[str]]
 """Names of the maps joined at 1/2, 1/4 and 1/8 resolution, in this order."""
 
 
-def padded_conv3x3(channels: int, out: int) -> nn.Conv2d:
+def create_padded_conv3x3(channels: int, out: int) -> nn.Conv2d:
     """Create a 3x3 convolution that replicates the image border."""
     return nn.Conv2d(channels, out, 3, 1, 1, padding_mode="replicate")
 
 
-def two_padded_convolutions(channels: int, width: int, out: int) -> nn.Sequential:
+def create_padded_conv_block(channels: int, width: int, out: int) -> nn.Sequential:
     """Create two such convolutions with a GELU between them."""
-    return nn.Sequential(padded_conv3x3(channels, width), nn.GELU(), padded_conv3x3(width, out))
+    return nn.Sequential(
+        create_padded_conv3x3(channels, width), nn.GELU(), create_padded_conv3x3(width, out)
+    )
 
 
 class ResidualUnit(nn.Module):
@@ -54,7 +56,7 @@ class Coarsest(nn.Module):
         self, x: Float[Tensor, "n c h w"], size: tuple[int, int]
     ) -> Float[Tensor, "n c p q"]:
         """Refine `x` and resize it to `size`."""
-        return self.out_conv(resized(self.resConfUnit2(x), size))
+        return self.out_conv(resize_bilinear(self.resConfUnit2(x), size))
 
 
 class Fusion(Coarsest):
@@ -64,7 +66,7 @@ class Fusion(Coarsest):
         super().__init__(channels)
         self.resConfUnit1 = ResidualUnit(channels)
 
-    def fused(
+    def fuse(
         self,
         coarse: Float[Tensor, "n c h w"],
         fine: Float[Tensor, "n c h w"],
@@ -92,15 +94,17 @@ class Scratch(nn.Module):
     def forward(self, pyramid: Sequence[Float[Tensor, "n _ _ _"]]) -> Float[Tensor, "n c h w"]:
         """Fuse the four levels."""
         fusions = (self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4)
-        return self.output_conv(fused(self.levels(pyramid), *fusions))
+        return self.output_conv(fuse_levels(self.project_levels(pyramid), *fusions))
 
-    def levels(self, pyramid: Sequence[Float[Tensor, "n _ _ _"]]) -> list[Float[Tensor, "n c _ _"]]:
+    def project_levels(
+        self, pyramid: Sequence[Float[Tensor, "n _ _ _"]]
+    ) -> list[Float[Tensor, "n c _ _"]]:
         """Map all levels to the same number of channels."""
         layers = (self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn)
         return [layer(x) for layer, x in zip(layers, pyramid, strict=True)]
 
 
-def fused(
+def fuse_levels(
     levels: Sequence[Float[Tensor, "n c _ _"]],
     finest: Fusion,
     finer: Fusion,
@@ -109,23 +113,23 @@ def fused(
 ) -> Float[Tensor, "n c h w"]:
     """Fuse four levels, finest first, to twice the size of the finest."""
     a, b, c, d = levels
-    x = coarsest(d, size_of(c))
-    x = coarser.fused(x, c, size_of(b))
-    x = finer.fused(x, b, size_of(a))
-    return finest.fused(x, a, (2 * a.shape[2], 2 * a.shape[3]))
+    x = coarsest(d, get_map_size(c))
+    x = coarser.fuse(x, c, get_map_size(b))
+    x = finer.fuse(x, b, get_map_size(a))
+    return finest.fuse(x, a, (2 * a.shape[2], 2 * a.shape[3]))
 
 
-def size_of(x: Float[Tensor, "n c h w"]) -> tuple[int, int]:
+def get_map_size(x: Float[Tensor, "n c h w"]) -> tuple[int, int]:
     """Return height and width of a map."""
     return x.shape[2], x.shape[3]
 
 
-def projections(channels: int, widths: Sequence[int]) -> nn.ModuleList:
+def create_projections(channels: int, widths: Sequence[int]) -> nn.ModuleList:
     """Create the layers from transformer channels to those of the four levels, finest first."""
     return nn.ModuleList(nn.Conv2d(channels, width, 1) for width in widths)
 
 
-def resizers(widths: Sequence[int]) -> nn.ModuleList:
+def create_resizers(widths: Sequence[int]) -> nn.ModuleList:
     """Create the layers to 4, 2, 1 and 1/2 times the resolution of the transformer maps."""
     return nn.ModuleList(
         [
@@ -150,8 +154,8 @@ class DptHead(nn.Module):
     ) -> None:
         super().__init__()
         self.layout = layout
-        self.projects = projections(vit_channels, widths)
-        self.resize_layers = resizers(widths)
+        self.projects = create_projections(vit_channels, widths)
+        self.resize_layers = create_resizers(widths)
         self.concat_projects = nn.ModuleList(
             nn.Conv2d(sum(width if name == VIT else CHANNELS[name] for name in names), width, 1)
             for names, width in zip(layout, widths[:3], strict=True)

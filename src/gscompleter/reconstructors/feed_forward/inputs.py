@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.matching.depth_range import depth_range_of
+from gscompleter.matching.depth_range import get_depth_range
 from gscompleter.reconstructors.feed_forward.cameras import Cameras
 from gscompleter.types import Camera, DepthMap, View
 
@@ -34,7 +34,7 @@ class Crop:
         """The columns of the crop."""
         return slice(self.left, self.left + self.width)
 
-    def padded(
+    def pad_depth(
         self, depth: Float[Tensor, "{self.height} {self.width}"], camera: Camera
     ) -> DepthMap:
         """Place the z-depth of the crop in the image of `camera`; pixels outside are invalid."""
@@ -44,13 +44,13 @@ class Crop:
         within[self.rows, self.columns] = True
         return DepthMap(whole, within)
 
-    def pixel_index(self, width: int) -> Int[Tensor, "n"]:
+    def compute_pixel_indices(self, width: int) -> Int[Tensor, "n"]:
         """Compute the row-major indices of the crop's pixels in an image of `width` columns."""
         rows = torch.arange(self.height)[:, None] + self.top
         return (rows * width + torch.arange(self.width) + self.left).flatten()
 
 
-def central_crops(cameras: Sequence[Camera], patch: int) -> list[Crop]:
+def compute_central_crops(cameras: Sequence[Camera], patch: int) -> list[Crop]:
     """Compute the largest central crops of one size for all images, in whole patches.
 
     Images are not resized, so a padded target is cropped to the size of the other views.
@@ -69,7 +69,7 @@ def central_crops(cameras: Sequence[Camera], patch: int) -> list[Crop]:
     ]
 
 
-def batch_of(
+def create_batch(
     views: Sequence[View], patch: int, near: float, far: float
 ) -> tuple[Float[Tensor, "1 v 3 h w"], Cameras, list[Crop]]:
     """Create a batch of one scene from the central crops of `views`.
@@ -83,20 +83,20 @@ def batch_of(
         raise InputError(
             f"{len(views)} view was given, and the model matches at least 2; name more frames."
         )
-    crops = central_crops([view.camera for view in views], patch)
+    crops = compute_central_crops([view.camera for view in views], patch)
     pairs = list(zip(views, crops, strict=True))
-    ranges = [depth_range_of([view], lambda _: (near, far)) for view in views]
+    ranges = [get_depth_range([view], lambda _: (near, far)) for view in views]
     images = torch.stack([v.image[c.rows, c.columns].movedim(-1, 0) for v, c in pairs])
     cameras = Cameras(
         c2w=torch.stack([view.camera.c2w for view in views])[None].float(),
-        K=torch.stack([cropped_intrinsics(v.camera, c) for v, c in pairs])[None],
+        K=torch.stack([crop_intrinsics(v.camera, c) for v, c in pairs])[None],
         near=images.new_tensor([[low for low, _ in ranges]]),
         far=images.new_tensor([[high for _, high in ranges]]),
     )
     return images[None], cameras, crops
 
 
-def cropped_intrinsics(camera: Camera, crop: Crop) -> Float[Tensor, "3 3"]:
+def crop_intrinsics(camera: Camera, crop: Crop) -> Float[Tensor, "3 3"]:
     """Compute the intrinsics of the crop, in units of its width and height."""
     # The authors' loaders keep (cx, cy), which is the same for central principal points.
     K = camera.K.float().clone()

@@ -12,13 +12,13 @@ from gscompleter.reconstructors.feed_forward.depth_predictor import (
     VITS,
     DepthConfig,
     DepthPredictor,
-    dpt_head,
+    create_dpt_head,
 )
-from gscompleter.reconstructors.feed_forward.unet import two_convolutions
+from gscompleter.reconstructors.feed_forward.unet import create_conv_block
 
-REGRESSED = 64
+NUM_REGRESSED = 64
 """Number of channels regressed from all others; they come first."""
-COLOUR = slice(REGRESSED, REGRESSED + 3)
+COLOR_CHANNELS = slice(NUM_REGRESSED, NUM_REGRESSED + 3)
 """The colour channels of the pixel."""
 
 
@@ -28,12 +28,12 @@ class PixelFeatures(nn.Module):
     def __init__(self, config: DepthConfig) -> None:
         super().__init__()
         features = VITS[config.vit].gaussian_features
-        self.channels = REGRESSED + 3 + features + 1
+        self.channels = NUM_REGRESSED + 3 + features + 1
         self.depth_predictor = DepthPredictor(config)
-        self.feature_upsampler = dpt_head(config, features, with_disparity=False)
-        self.gaussian_regressor = two_convolutions(features + 5, REGRESSED, REGRESSED)
+        self.feature_upsampler = create_dpt_head(config, features, with_disparity=False)
+        self.gaussian_regressor = create_conv_block(features + 5, NUM_REGRESSED, NUM_REGRESSED)
 
-    def describe(
+    def compute_pixel_features(
         self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n c h w"]]:
         """Compute z-depth in scene units and `channels` features of n = b v views."""

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import z_depths
+from gscompleter.geometry import compute_z_depths
 from gscompleter.reconstructors.feed_forward.depthsplat import DepthSplat
 from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
-from gscompleter.reconstructors.feed_forward.inputs import Crop, batch_of
+from gscompleter.reconstructors.feed_forward.inputs import Crop, create_batch
 from gscompleter.reconstructors.feed_forward.mvsplat import MVSplat
 from gscompleter.reconstructors.feed_forward.precision import check_precision, lower_precision
 from gscompleter.reconstructors.feed_forward.volsplat import VolSplat, VoxelGaussians
-from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, observed
+from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, make_observed
 
 MAX_COEFFICIENTS = 16
 """SH coefficients up to degree 3, the most that renderers of 3DGS use."""
@@ -50,43 +50,45 @@ class FeedForward:
                 or a scene too large for the voxels of VolSplat.
         """
         config = self.network.config
-        images, cameras, crops = batch_of(views, config.patch, config.near, config.far)
+        images, cameras, crops = create_batch(views, config.patch, config.near, config.far)
         # Not torch.inference_mode: later stages optimise these tensors.
         with torch.no_grad(), lower_precision(self.device, self.dtype):
             predicted = self.network(images.to(self.device), cameras.to(self.device))
         if isinstance(predicted, VoxelGaussians):
-            return reconstruction_of_voxels(predicted, views, crops)
-        return reconstruction_of(predicted, views, crops)
+            return create_voxel_reconstruction(predicted, views, crops)
+        return create_pixel_reconstruction(predicted, views, crops)
 
 
-def reconstruction_of(
+def create_pixel_reconstruction(
     predicted: PixelGaussians, views: Sequence[View], crops: Sequence[Crop]
 ) -> Reconstruction:
     """Create the reconstruction of one scene; z-depths follow from the means."""
     device = views[0].image.device
-    gaussians = gaussians_of(predicted).to(device)
+    gaussians = flatten_gaussians(predicted).to(device)
     per_view = crops[0].height * crops[0].width
-    depths = map(depth_map_of, gaussians.means.split(per_view), views, crops)
-    pixels = [crop.pixel_index(v.camera.width) for v, crop in zip(views, crops, strict=True)]
+    depths = map(compute_depth_map, gaussians.means.split(per_view), views, crops)
+    pixels = [
+        crop.compute_pixel_indices(v.camera.width) for v, crop in zip(views, crops, strict=True)
+    ]
     numbers = torch.arange(len(views), device=device).repeat_interleave(per_view)
     return Reconstruction(gaussians, tuple(depths), numbers, torch.cat(pixels).to(device))
 
 
-def reconstruction_of_voxels(
+def create_voxel_reconstruction(
     predicted: VoxelGaussians, views: Sequence[View], crops: Sequence[Crop]
 ) -> Reconstruction:
     """Create the reconstruction of one scene, without source pixels."""
     device = views[0].image.device
     depths = [
-        crop.padded(depth, view.camera)
+        crop.pad_depth(depth, view.camera)
         for depth, view, crop in zip(predicted.depth.to(device), views, crops, strict=True)
     ]
-    return Reconstruction(gaussians_of(predicted).to(device), tuple(depths))
+    return Reconstruction(flatten_gaussians(predicted).to(device), tuple(depths))
 
 
-def gaussians_of(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
+def flatten_gaussians(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
     """Flatten the Gaussians view by view and row by row, with at most `MAX_COEFFICIENTS`."""
-    return observed(
+    return make_observed(
         predicted.means.flatten(0, -2),
         predicted.quats.flatten(0, -2),
         predicted.scales.flatten(0, -2),
@@ -95,7 +97,7 @@ def gaussians_of(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
     )
 
 
-def depth_map_of(means: Float[Tensor, "n 3"], view: View, crop: Crop) -> DepthMap:
+def compute_depth_map(means: Float[Tensor, "n 3"], view: View, crop: Crop) -> DepthMap:
     """Compute the z-depth of the Gaussians of the crop, in the whole image."""
-    z = z_depths(means, view.camera)
-    return crop.padded(z.view(crop.height, crop.width), view.camera)
+    z = compute_z_depths(means, view.camera)
+    return crop.pad_depth(z.view(crop.height, crop.width), view.camera)

@@ -7,11 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def resized(x: Float[Tensor, "n c h w"], size: tuple[int, int]) -> Float[Tensor, "n c p q"]:
+def resize_bilinear(x: Float[Tensor, "n c h w"], size: tuple[int, int]) -> Float[Tensor, "n c p q"]:
     """Resize a map bilinearly; the centres of the corner pixels stay in place."""
     return F.interpolate(x, size=size, mode="bilinear", align_corners=True)
 
 
-def enlarged(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c p q"]:
+def enlarge(x: Float[Tensor, "n c h w"], factor: int) -> Float[Tensor, "n c p q"]:
     """Enlarge a map by `factor` in both directions."""
-    return resized(x, (factor * x.shape[2], factor * x.shape[3]))
+    return resize_bilinear(x, (factor * x.shape[2], factor * x.shape[3]))

@@ -27,7 +27,7 @@ class Packing:
     spans: tuple[int, int, int]
 
     @staticmethod
-    def around(cells: Int64[Tensor, "n 4"]) -> Packing:
+    def enclose(cells: Int64[Tensor, "n 4"]) -> Packing:
         """Enclose `cells` in a box with a border of one cell for their neighbours."""
         if len(cells) == 0:
             raise InputError("A sparse grid has no cells; it needs at least one.")
@@ -42,14 +42,14 @@ class Packing:
             )
         return Packing((low[1] - 1, low[2] - 1, low[3] - 1), (x, y, z))
 
-    def keys(self, cells: Int64[Tensor, "n 4"]) -> Int64[Tensor, "n"]:
+    def number_cells(self, cells: Int64[Tensor, "n 4"]) -> Int64[Tensor, "n"]:
         """Compute the number of each cell (batch, x, y, z)."""
         batch, x, y, z = cells.unbind(1)
         key = batch * self.spans[0] + (x - self.low[0])
         key = key * self.spans[1] + (y - self.low[1])
         return key * self.spans[2] + (z - self.low[2])
 
-    def step(self, offset: Offset) -> int:
+    def compute_step(self, offset: Offset) -> int:
         """Compute the difference of numbers that corresponds to an offset in cells."""
         x, y, z = offset
         return (x * self.spans[1] + y) * self.spans[2] + z
@@ -70,16 +70,16 @@ class Grid:
     @cached_property
     def packing(self) -> Packing:
         """The numbering of the cells of this grid."""
-        return Packing.around(self._cells(self.coordinates))
+        return Packing.enclose(self._to_cells(self.coordinates))
 
-    def keys_of(self, coordinates: Int64[Tensor, "m 4"]) -> Int64[Tensor, "m"]:
+    def number_coordinates(self, coordinates: Int64[Tensor, "m 4"]) -> Int64[Tensor, "m"]:
         """Compute the numbers of cells in or next to this grid, occupied or not."""
-        return self.packing.keys(self._cells(coordinates))
+        return self.packing.number_cells(self._to_cells(coordinates))
 
     @cached_property
     def keys(self) -> Int64[Tensor, "n"]:
         """The number of each row, ascending."""
-        keys = self.keys_of(self.coordinates)
+        keys = self.number_coordinates(self.coordinates)
         if not (keys[1:] > keys[:-1]).all():
             raise ValueError("the rows of a grid must be unique and in ascending order")
         return keys
@@ -92,14 +92,14 @@ class Grid:
         found = (self.keys[rows] == keys).nonzero()[:, 0]
         return found, rows[found]
 
-    def coarser(self) -> Grid:
+    def coarsen(self) -> Grid:
         """Merge the cells into cells of twice the side length."""
         stride = 2 * self.stride
         parents = self.coordinates.clone()
         parents[:, 1:] = parents[:, 1:].div(stride, rounding_mode="floor") * stride
         return Grid(unique_rows(parents)[0], stride)
 
-    def _cells(self, coordinates: Int64[Tensor, "m 4"]) -> Int64[Tensor, "m 4"]:
+    def _to_cells(self, coordinates: Int64[Tensor, "m 4"]) -> Int64[Tensor, "m 4"]:
         batch, position = coordinates[:, :1], coordinates[:, 1:]
         return torch.cat([batch, position.div(self.stride, rounding_mode="floor")], dim=1)
 
@@ -108,7 +108,7 @@ def unique_rows(
     coordinates: Int64[Tensor, "n 4"],
 ) -> tuple[Int64[Tensor, "m 4"], Int64[Tensor, "n"]]:
     """Return the unique rows (batch, x, y, z), ascending, and the index of each row in them."""
-    keys = Packing.around(coordinates).keys(coordinates)
+    keys = Packing.enclose(coordinates).number_cells(coordinates)
     unique, inverse = torch.unique(keys, return_inverse=True)
     rows = coordinates.new_empty((len(unique), 4))
     rows[inverse] = coordinates
@@ -124,32 +124,32 @@ class Neighbours:
     num_sources: int
     num_targets: int
 
-    def transposed(self) -> Neighbours:
+    def transpose_pairs(self) -> Neighbours:
         """Swap input and output, for the transposed convolution."""
         return Neighbours(self.targets, self.sources, self.num_targets, self.num_sources)
 
 
-def neighbours_within(grid: Grid) -> Neighbours:
+def find_neighbours_within(grid: Grid) -> Neighbours:
     """Find the pairs of a convolution of stride 1."""
     # If `b` is at an offset from `a`, `a` is at the opposite offset from `b`: 13 of 27 suffice.
-    half = [grid.find(grid.keys + grid.packing.step(offset)) for offset in OFFSETS[:13]]
+    half = [grid.find(grid.keys + grid.packing.compute_step(offset)) for offset in OFFSETS[:13]]
     itself = torch.arange(len(grid), device=grid.coordinates.device)
     targets = [a for a, _ in half] + [itself] + [b for _, b in reversed(half)]
     sources = [b for _, b in half] + [itself] + [a for a, _ in reversed(half)]
     return Neighbours(tuple(sources), tuple(targets), len(grid), len(grid))
 
 
-def neighbours_between(fine: Grid, coarse: Grid) -> Neighbours:
+def find_neighbours_between(fine: Grid, coarse: Grid) -> Neighbours:
     """Find the pairs of a convolution of stride 2, centred on the lower corners of coarse cells."""
     if coarse.stride != 2 * fine.stride:
         raise ValueError(f"the coarse grid must have stride {2 * fine.stride}, not {coarse.stride}")
     odd = (fine.coordinates[:, 1:].div(fine.stride, rounding_mode="floor") & 1).bool()
-    pairs = [_rows_at(offset, odd, fine, coarse) for offset in OFFSETS]
+    pairs = [_find_rows_at(offset, odd, fine, coarse) for offset in OFFSETS]
     sources, targets = zip(*pairs, strict=True)
     return Neighbours(sources, targets, len(fine), len(coarse))
 
 
-def _rows_at(
+def _find_rows_at(
     offset: Offset, odd: Bool[Tensor, "n 3"], fine: Grid, coarse: Grid
 ) -> tuple[Int64[Tensor, "m"], Int64[Tensor, "m"]]:
     """Find the pairs of fine and coarse rows at `offset` from the corner of the coarse cell."""
@@ -157,7 +157,7 @@ def _rows_at(
     rows = (odd == (away != 0)).all(dim=1).nonzero()[:, 0]
     corners = fine.coordinates[rows]
     corners[:, 1:] -= away * fine.stride
-    found, targets = coarse.find(coarse.keys_of(corners))
+    found, targets = coarse.find(coarse.number_coordinates(corners))
     return rows[found], targets
 
 
@@ -206,11 +206,11 @@ class PointwiseConv(nn.Module):
         return features @ self.kernel
 
 
-def hierarchy_over(grid: Grid, num_levels: int) -> tuple[list[Neighbours], Neighbours]:
+def build_hierarchy(grid: Grid, num_levels: int) -> tuple[list[Neighbours], Neighbours]:
     """Find the pairs between `num_levels` halvings of `grid`, and those in the coarsest grid."""
     downward = []
     for _ in range(num_levels):
-        coarse = grid.coarser()
-        downward.append(neighbours_between(grid, coarse))
+        coarse = grid.coarsen()
+        downward.append(find_neighbours_between(grid, coarse))
         grid = coarse
-    return downward, neighbours_within(grid)
+    return downward, find_neighbours_within(grid)

@@ -12,7 +12,7 @@ from gscompleter.reconstructors.feed_forward.sparse import (
     Neighbours,
     PointwiseConv,
     SparseConv,
-    hierarchy_over,
+    build_hierarchy,
 )
 
 CHANNELS = (64, 128, 256, 512)
@@ -58,7 +58,7 @@ class UpBlock(nn.Module):
         self, features: Float[Tensor, "m channels_in"], downward: Neighbours
     ) -> Float[Tensor, "n channels_out"]:
         """Apply the block along the transpose of `downward`."""
-        return F.relu(self.norm(self.upconv(features, downward.transposed())))
+        return F.relu(self.norm(self.upconv(features, downward.transpose_pairs())))
 
 
 class DecoderBlock(nn.ModuleList):
@@ -91,7 +91,7 @@ class SparseUNet(nn.Module):
 
     def forward(self, features: Float[Tensor, "n c"], grid: Grid) -> Float[Tensor, "n c"]:
         """Refine the features of the cells of `grid`."""
-        tables, coarsest = hierarchy_over(grid, len(CHANNELS))
+        tables, coarsest = build_hierarchy(grid, len(CHANNELS))
         x, encoded = features, []
         for encoder, downward in zip(self.encoders, tables[:-1], strict=True):
             x = encoder(x, downward)

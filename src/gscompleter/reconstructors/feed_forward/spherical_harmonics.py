@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from gscompleter.reconstructors.feed_forward.cameras import full_precision
+from gscompleter.reconstructors.feed_forward.cameras import disable_autocast
 
 NUM_DIRECTIONS = 64
 """Number of sample directions for the least-squares fit; 2 * degree + 1 is the minimum."""
@@ -25,34 +25,36 @@ def rotate_sh(
 ) -> Float[Tensor, "b v h w k 3"]:
     """Rotate k = (degree + 1)² SH coefficients in the basis of e3nn."""
     rotated = [sh[..., :1, :]]
-    with full_precision(sh):
+    with disable_autocast(sh):
         for degree in range(1, isqrt(sh.shape[-2])):
             part = sh[..., degree**2 : (degree + 1) ** 2, :]
-            matrices = rotation_of_degree(degree, rotations)
+            matrices = compute_wigner_matrices(degree, rotations)
             rotated.append(torch.einsum("bvij,bvhwjc->bvhwic", matrices, part))
     return torch.cat(rotated, dim=-2)
 
 
-def rotation_of_degree(degree: int, rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n m m"]:
+def compute_wigner_matrices(
+    degree: int, rotations: Float[Tensor, "*n 3 3"]
+) -> Float[Tensor, "*n m m"]:
     """Compute Wigner matrices D with `Y(R d) = D Y(d)` for all directions d, by least squares."""
-    directions, inverse = sampled_harmonics(degree)
+    directions, inverse = sample_harmonics(degree)
     rotated = directions.to(rotations.device) @ rotations.double().transpose(-1, -2)
-    matrices = inverse.to(rotations.device) @ harmonics(degree, rotated)
+    matrices = inverse.to(rotations.device) @ evaluate_harmonics(degree, rotated)
     return matrices.transpose(-1, -2).to(rotations.dtype)
 
 
 @cache
-def sampled_harmonics(degree: int) -> tuple[Float64[Tensor, "d 3"], Float64[Tensor, "m d"]]:
+def sample_harmonics(degree: int) -> tuple[Float64[Tensor, "d 3"], Float64[Tensor, "m d"]]:
     """Sample directions on the sphere, with the pseudo-inverse of the SH at them."""
     number = torch.arange(NUM_DIRECTIONS, dtype=torch.float64)
     y = 1 - (2 * number + 1) / NUM_DIRECTIONS
     azimuth = number * pi * (3 - sqrt(5))
     radius = (1 - y * y).sqrt()
     directions = torch.stack([radius * azimuth.sin(), y, radius * azimuth.cos()], dim=-1)
-    return directions, torch.linalg.pinv(harmonics(degree, directions))
+    return directions, torch.linalg.pinv(evaluate_harmonics(degree, directions))
 
 
-def harmonics(degree: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n m"]:
+def evaluate_harmonics(degree: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n m"]:
     """Evaluate real SH of orders -degree to degree at unit directions, with polar axis y."""
     x, y, z = directions.unbind(-1)
     values = {}
@@ -60,13 +62,13 @@ def harmonics(degree: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "
     for order in range(degree + 1):
         ratio = factorial(degree - order) / factorial(degree + order)
         norm = sqrt((2 * degree + 1) / (4 * pi) * ratio * (2 if order else 1))
-        polar = norm * associated_legendre(degree, order, y)
+        polar = norm * evaluate_legendre(degree, order, y)
         values[-order], values[order] = polar * sine, polar * cosine
         cosine, sine = z * cosine - x * sine, z * sine + x * cosine
     return torch.stack([values[order] for order in range(-degree, degree + 1)], dim=-1)
 
 
-def associated_legendre(degree: int, order: int, t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+def evaluate_legendre(degree: int, order: int, t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Evaluate `P(t) / (1 - t²)^(order / 2)` without the Condon-Shortley sign."""
     before, value = torch.zeros_like(t), torch.full_like(t, prod(range(1, 2 * order, 2)))
     for n in range(order + 1, degree + 1):

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gscompleter.reconstructors.feed_forward.cameras import select
+from gscompleter.reconstructors.feed_forward.cameras import select_sources
 
 SPLITS = 2
 """Number of windows along each side of a feature map."""
@@ -36,15 +36,15 @@ class WindowAttention(nn.Module):
         _, h, w, _ = x.shape
         shift = (0, 0) if mask is None else (h // SPLITS // 2, w // SPLITS // 2)
         back = (-shift[0], -shift[1])
-        query = to_windows(self.q_proj(x[:, None].roll(back, (2, 3))))
+        query = split_windows(self.q_proj(x[:, None].roll(back, (2, 3))))
         sources = sources.roll(back, (2, 3))
-        key, value = to_windows(self.k_proj(sources)), to_windows(self.v_proj(sources))
+        key, value = split_windows(self.k_proj(sources)), split_windows(self.v_proj(sources))
         if mask is not None:
             # The keys are ordered pixel by pixel, but the mask is repeated view by view, as in
             # the training of the published models. It matters with two or more source views.
             mask = mask.repeat(1, 1, sources.shape[1])
         attended = F.scaled_dot_product_attention(query, key, value, mask)
-        return self.norm1(self.merge(from_windows(attended, h, w).roll(shift, (1, 2))))
+        return self.norm1(self.merge(merge_windows(attended, h, w).roll(shift, (1, 2))))
 
 
 class WindowAttentionAndMlp(WindowAttention):
@@ -85,7 +85,7 @@ class TransformerLayer(nn.Module):
         mask: Float[Tensor, "windows p p"] | None,
     ) -> Float[Tensor, "b v h w c"]:
         """Apply self-attention, then cross-attention."""
-        source_maps = select(x, sources).flatten(0, 1)
+        source_maps = select_sources(x, sources).flatten(0, 1)
         own = x.flatten(0, 1)
         own = own + self.self_attn(own, own[:, None], mask)
         return (own + self.cross_attn_ffn(own, source_maps, mask)).view_as(x)
@@ -102,22 +102,22 @@ class MultiViewTransformer(nn.Module):
         self, features: Float[Tensor, "n c h w"], sources: Int[Tensor, "b v s"]
     ) -> Float[Tensor, "n c h w"]:
         """Enrich the features of n = b v views with those of their `sources`."""
-        x = (features + position_in_window(features)).unflatten(0, sources.shape[:2])
+        x = (features + encode_window_positions(features)).unflatten(0, sources.shape[:2])
         x = x.permute(0, 1, 3, 4, 2)
         height, width = x.shape[2:4]
-        mask = shifted_window_mask(height, width, features.device)
+        mask = create_shifted_window_mask(height, width, features.device)
         for i, layer in enumerate(self.layers):
             x = layer(x, sources, mask if i % 2 else None)
         return x.permute(0, 1, 4, 2, 3).flatten(0, 1)
 
 
-def to_windows(x: Float[Tensor, "n s h w c"]) -> Float[Tensor, "n windows p c"]:
+def split_windows(x: Float[Tensor, "n s h w c"]) -> Float[Tensor, "n windows p c"]:
     """Split maps into windows of p pixels of s views; the view index changes fastest."""
     x = x.unflatten(3, (SPLITS, -1)).unflatten(2, (SPLITS, -1))
     return x.permute(0, 2, 4, 3, 5, 1, 6).flatten(3, 5).flatten(1, 2)
 
 
-def from_windows(
+def merge_windows(
     windows: Float[Tensor, "n windows p c"], height: int, width: int
 ) -> Float[Tensor, "n {height} {width} c"]:
     """Invert `split_windows` for a single view."""
@@ -125,7 +125,7 @@ def from_windows(
     return x.permute(0, 1, 3, 2, 4, 5).flatten(3, 4).flatten(1, 2)
 
 
-def shifted_window_mask(
+def create_shifted_window_mask(
     height: int, width: int, device: torch.device
 ) -> Float[Tensor, "windows p p"]:
     """Create the attention bias of shifted windows: -100 between opposite image borders."""
@@ -138,11 +138,11 @@ def shifted_window_mask(
         return band
 
     regions = 3 * bands(height)[:, None] + bands(width)
-    ids = to_windows(regions[None, None, :, :, None])[0, ..., 0]
+    ids = split_windows(regions[None, None, :, :, None])[0, ..., 0]
     return (ids[:, None, :] != ids[:, :, None]).float() * -100.0
 
 
-def position_in_window(features: Float[Tensor, "n c h w"]) -> Float[Tensor, "c h w"]:
+def encode_window_positions(features: Float[Tensor, "n c h w"]) -> Float[Tensor, "c h w"]:
     """Encode row and column within each window by sines and cosines (as in DETR)."""
     _, channels, height, width = features.shape
     order = torch.arange(channels // 2, device=features.device)

@@ -14,12 +14,12 @@ HEAD = 32
 """Channels of an attention head."""
 
 
-def conv3x3(channels: int, out: int, stride: int = 1) -> nn.Conv2d:
+def create_conv3x3(channels: int, out: int, stride: int = 1) -> nn.Conv2d:
     """Create a 3x3 convolution with zero padding."""
     return nn.Conv2d(channels, out, 3, stride, 1)
 
 
-def group_norm(channels: int) -> nn.GroupNorm:
+def create_group_norm(channels: int) -> nn.GroupNorm:
     """Create a norm over 8 groups of channels."""
     return nn.GroupNorm(8, channels)
 
@@ -30,14 +30,20 @@ class ResidualBlock(nn.Module):
     def __init__(self, channels: int, out: int, pre_norm: bool) -> None:
         super().__init__()
         if pre_norm:
-            self.in_layers = nn.Sequential(group_norm(channels), nn.SiLU(), conv3x3(channels, out))
+            self.in_layers = nn.Sequential(
+                create_group_norm(channels), nn.SiLU(), create_conv3x3(channels, out)
+            )
             # The dropout has no effect but keeps the indices in the keys of the weights.
             self.out_layers = nn.Sequential(
-                group_norm(out), nn.SiLU(), nn.Dropout(0.0), conv3x3(out, out)
+                create_group_norm(out), nn.SiLU(), nn.Dropout(0.0), create_conv3x3(out, out)
             )
         else:
-            self.in_layers = nn.Sequential(conv3x3(channels, out), group_norm(out), nn.SiLU())
-            self.out_layers = nn.Sequential(conv3x3(out, out), group_norm(out), nn.SiLU())
+            self.in_layers = nn.Sequential(
+                create_conv3x3(channels, out), create_group_norm(out), nn.SiLU()
+            )
+            self.out_layers = nn.Sequential(
+                create_conv3x3(out, out), create_group_norm(out), nn.SiLU()
+            )
         self.skip_connection = nn.Identity() if channels == out else nn.Conv2d(channels, out, 1)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
@@ -51,7 +57,7 @@ class ViewAttention(nn.Module):
     def __init__(self, channels: int, pre_norm: bool) -> None:
         super().__init__()
         self.pre_norm = pre_norm
-        self.norm = group_norm(channels)
+        self.norm = create_group_norm(channels)
         self.qkv = nn.Conv1d(channels, 3 * channels, 1)
         self.proj_out = nn.Conv1d(channels, channels, 1)
 
@@ -59,11 +65,11 @@ class ViewAttention(nn.Module):
         """Apply attention across the views of a scene; the norm treats each view separately."""
         y = self.norm(x) if self.pre_norm else x
         y = y.flatten(2).unflatten(0, (-1, views)).transpose(1, 2).flatten(2)
-        y = self.proj_out(self.attended(self.qkv(y)))
+        y = self.proj_out(self.attend(self.qkv(y)))
         y = y.unflatten(2, (views, -1)).transpose(1, 2).reshape(x.shape)
         return x + (y if self.pre_norm else self.norm(y))
 
-    def attended(self, qkv: Float[Tensor, "b three_c t"]) -> Float[Tensor, "b c t"]:
+    def attend(self, qkv: Float[Tensor, "b three_c t"]) -> Float[Tensor, "b c t"]:
         """Attend among t tokens; each head has its q, k and v as consecutive channels."""
         q, k, v = qkv.unflatten(1, (-1, 3, HEAD)).transpose(-1, -2).unbind(2)
         return F.scaled_dot_product_attention(q, k, v).transpose(-1, -2).flatten(1, 2)
@@ -74,7 +80,7 @@ class Downsample(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.op = conv3x3(channels, channels, stride=2)
+        self.op = create_conv3x3(channels, channels, stride=2)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c p q"]:
         """Downsample the map."""
@@ -86,7 +92,7 @@ class Upsample(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.conv = conv3x3(channels, channels)
+        self.conv = create_conv3x3(channels, channels)
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c 2*h 2*w"]:
         """Upsample the map."""
@@ -103,15 +109,15 @@ class Steps(nn.ModuleList):
         return x
 
 
-def refiner(channels: int, width: int, unet: UNet) -> Steps:
+def create_refiner(channels: int, width: int, unet: UNet) -> Steps:
     """Create a U-Net of `width` channels between two convolutions."""
-    before = [conv3x3(channels, width), group_norm(width), nn.GELU()]
-    return Steps([*before, unet, conv3x3(width, width)])
+    before = [create_conv3x3(channels, width), create_group_norm(width), nn.GELU()]
+    return Steps([*before, unet, create_conv3x3(width, width)])
 
 
-def two_convolutions(channels: int, width: int, out: int) -> nn.Sequential:
+def create_conv_block(channels: int, width: int, out: int) -> nn.Sequential:
     """Create two 3x3 convolutions with a GELU between them."""
-    return nn.Sequential(conv3x3(channels, width), nn.GELU(), conv3x3(width, out))
+    return nn.Sequential(create_conv3x3(channels, width), nn.GELU(), create_conv3x3(width, out))
 
 
 class UNet(nn.Module):
@@ -126,7 +132,7 @@ class UNet(nn.Module):
                 return [residual]
             return [residual, ViewAttention(channels, pre_norm)]
 
-        self.input_blocks = nn.ModuleList([Steps([conv3x3(channels, channels)])])
+        self.input_blocks = nn.ModuleList([Steps([create_conv3x3(channels, channels)])])
         for level in range(levels):
             self.input_blocks.append(Steps(block(channels, level)))
             if level < levels - 1:
@@ -141,7 +147,7 @@ class UNet(nn.Module):
             self.output_blocks.append(Steps(block(2 * channels, level)))
             upsample = [Upsample(channels)] if level > 0 else []
             self.output_blocks.append(Steps([*block(2 * channels, level), *upsample]))
-        norm, conv = group_norm(channels), conv3x3(channels, channels)
+        norm, conv = create_group_norm(channels), create_conv3x3(channels, channels)
         out = [norm, nn.SiLU(), conv] if pre_norm else [conv, norm, nn.SiLU()]
         self.out = nn.Sequential(*out)
 

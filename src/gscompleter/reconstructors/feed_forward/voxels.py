@@ -41,11 +41,11 @@ def voxelize(
     coordinates = torch.round(points / resolution).long()
     rows, voxel = unique_rows(torch.nn.functional.pad(coordinates, (1, 0)))
     return Voxels(
-        Grid(rows), mean_rows(points, voxel, len(rows)), mean_rows(features, voxel, len(rows))
+        Grid(rows), average_rows(points, voxel, len(rows)), average_rows(features, voxel, len(rows))
     )
 
 
-def mean_rows(
+def average_rows(
     rows: Float[Tensor, "p c"], group: Int64[Tensor, "p"], num_groups: int
 ) -> Float[Tensor, "groups c"]:
     """Average the rows of each group; no group may be empty."""

@@ -11,23 +11,16 @@ from jaxtyping import Float32
 
 from gscompleter.kernels import stereo
 from gscompleter.reconstructors.plane_sweep.aggregation import aggregate
-from gscompleter.reconstructors.plane_sweep.bands import around, every_plane
-from gscompleter.reconstructors.plane_sweep.confidence import confidence_of, consistent
-from gscompleter.reconstructors.plane_sweep.matching import (
-    inverse_depth_planes,
-    matched_costs,
-)
-from gscompleter.reconstructors.plane_sweep.occlusion import (
-    UNKNOWN,
-    Neighbour,
-    hidden_from_others,
-)
+from gscompleter.reconstructors.plane_sweep.bands import make_full_bands, make_guided_bands
+from gscompleter.reconstructors.plane_sweep.confidence import compute_confidence, find_consistent
+from gscompleter.reconstructors.plane_sweep.matching import compute_costs, place_planes
+from gscompleter.reconstructors.plane_sweep.occlusion import UNKNOWN, Neighbour, find_hidden
 from gscompleter.reconstructors.plane_sweep.rig import Rig
 
 Map = Float32[np.ndarray, "_ _"]
 Planes = Float32[np.ndarray, "d"]
 """Inverse depths from far to near, evenly spaced."""
-GUIDED_FROM = 192
+MIN_GUIDED_SIDE = 192
 """Shortest image side, in pixels, from which a half-size sweep narrows the search."""
 BACKGROUND_WEIGHT = np.float32(0.3)
 """Weight of a background depth at pixels occluded in the other views."""
@@ -46,11 +39,11 @@ class Sweep:
     @cached_property
     def inverse(self) -> Map:
         """Inverse depths of the best planes."""
-        return inverse_at(self.planes, self.index)
+        return compute_inverse_depth(self.planes, self.index)
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurement:
     """The plane of each pixel of one view, with weights."""
 
     planes: Planes
@@ -60,96 +53,98 @@ class Measured:
     confidence: Map
     """Like `weight`, but 0 for depths taken from surrounding pixels."""
 
-    def at_size(self, size: tuple[int, int]) -> Measured:
+    def resize_to(self, size: tuple[int, int]) -> Measurement:
         """Upsample to `size` if the image was halved."""
         if self.index.shape == size:
             return self
         index, weight, confidence = (
-            doubled(values, size) for values in (self.index, self.weight, self.confidence)
+            repeat_pixels(values, size) for values in (self.index, self.weight, self.confidence)
         )
         return replace(self, index=index, weight=weight, confidence=confidence)
 
 
-def measured(rig: Rig, near: float, far: float) -> list[Measured]:
+def measure_depths(rig: Rig, near: float, far: float) -> list[Measurement]:
     """Measure the depth of each view, between two z-depths in scene units."""
-    sweeps = sweeps_of(rig, near / rig.unit, far / rig.unit)
-    confidences = confidences_of(sweeps, rig)
+    sweeps = sweep_views(rig, near / rig.unit, far / rig.unit)
+    confidences = compute_confidences(sweeps, rig)
     sure = [
         np.where(confidence > 0, sweep.inverse, UNKNOWN)
         for sweep, confidence in zip(sweeps, confidences, strict=True)
     ]
     return [
-        with_background(i, sweep, confidence, sure, rig)
+        add_background(i, sweep, confidence, sure, rig)
         for i, (sweep, confidence) in enumerate(zip(sweeps, confidences, strict=True))
     ]
 
 
-def sweeps_of(rig: Rig, near: float, far: float) -> list[Sweep]:
+def sweep_views(rig: Rig, near: float, far: float) -> list[Sweep]:
     """Sweep all views, coarse to fine; `near` and `far` are in widest baselines."""
     numbers = range(len(rig.images))
-    if min(min(image.size) for image in rig.images) < GUIDED_FROM:
-        return [swept(i, rig, near, far) for i in numbers]
-    guesses = sweeps_of(rig.halved(), near, far)
-    return [swept(i, rig, near, far, guesses[i]) for i in numbers]
+    if min(min(image.size) for image in rig.images) < MIN_GUIDED_SIDE:
+        return [sweep_view(i, rig, near, far) for i in numbers]
+    guesses = sweep_views(rig.halve(), near, far)
+    return [sweep_view(i, rig, near, far, guesses[i]) for i in numbers]
 
 
-def swept(number: int, rig: Rig, near: float, far: float, guess: Sweep | None = None) -> Sweep:
+def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | None = None) -> Sweep:
     """Find the best planes of one view, near the half-size `guess` if there is one."""
     image = rig.images[number]
-    sources = [(rig.images[i], rig.transforms[number, i]) for i in rig.neighbours.of[number]]
-    planes = inverse_depth_planes(image, sources, near, far)
-    bands = every_plane(image.size, len(planes))
+    sources = [
+        (rig.images[i], rig.transforms[number, i]) for i in rig.neighbours.neighbours_of[number]
+    ]
+    planes = place_planes(image, sources, near, far)
+    bands = make_full_bands(image.size, len(planes))
     if guess is not None:
-        likely = fractions(planes, guess.inverse)
-        bands = around(likely, 2, image.size, len(planes))
-    costs = matched_costs(image, sources, planes, bands)
-    index, margin = stereo.winners(aggregate(costs, bands, image), bands, *image.size)
+        likely = compute_plane_index(planes, guess.inverse)
+        bands = make_guided_bands(likely, 2, image.size, len(planes))
+    costs = compute_costs(image, sources, planes, bands)
+    index, margin = stereo.select_planes(aggregate(costs, bands, image), bands, *image.size)
     if guess is not None:
-        margin = np.minimum(margin, doubled(guess.margin, image.size))
+        margin = np.minimum(margin, repeat_pixels(guess.margin, image.size))
     return Sweep(planes, index, margin)
 
 
-def confidences_of(sweeps: Sequence[Sweep], rig: Rig) -> list[Map]:
+def compute_confidences(sweeps: Sequence[Sweep], rig: Rig) -> list[Map]:
     """Compute the confidence of each view; 0 for pixels that no other view confirms."""
     inverses = [sweep.inverse for sweep in sweeps]
     confidences = []
     for i, sweep in enumerate(sweeps):
         agrees = np.zeros(inverses[i].shape, bool)
-        for j in rig.neighbours.either_way(i):
+        for j in rig.neighbours.find_partners(i):
             there, back = rig.transforms[i, j], rig.transforms[j, i]
-            agrees |= consistent(inverses[i], inverses[j], there, back)
-        confidences.append(confidence_of(sweep.index, sweep.margin, agrees))
+            agrees |= find_consistent(inverses[i], inverses[j], there, back)
+        confidences.append(compute_confidence(sweep.index, sweep.margin, agrees))
     return confidences
 
 
-def with_background(
+def add_background(
     number: int, sweep: Sweep, confidence: Map, sure: Sequence[Map], rig: Rig
-) -> Measured:
+) -> Measurement:
     """Give pixels occluded in the other views (inverse depths `sure`) the background depth."""
-    background = stereo.background(sweep.index, confidence > 0)
+    background = stereo.fill_background(sweep.index, confidence > 0)
     neighbours = [
         Neighbour(sure[i], rig.transforms[number, i], rig.transforms[i, number])
-        for i in rig.neighbours.either_way(number)
+        for i in rig.neighbours.find_partners(number)
     ]
-    behind = inverse_at(sweep.planes, background)
-    occluded = (confidence == 0) & hidden_from_others(behind, neighbours)
+    behind = compute_inverse_depth(sweep.planes, background)
+    occluded = (confidence == 0) & find_hidden(behind, neighbours)
     weight = np.where(occluded, BACKGROUND_WEIGHT, confidence)
     index = np.where(occluded, background, sweep.index)
-    return Measured(sweep.planes, index, weight, confidence)
+    return Measurement(sweep.planes, index, weight, confidence)
 
 
-def inverse_at(planes: Planes, index: Map) -> Map:
+def compute_inverse_depth(planes: Planes, index: Map) -> Map:
     """Convert plane indices to inverse depths, at most twice as far as the last plane."""
     step = planes[1] - planes[0]
     within = index.clip(-0.5, len(planes) - 0.5)
     return np.maximum(planes[0] + within * step, planes[0] / 2).astype(np.float32)
 
 
-def fractions(planes: Planes, inverse: Map) -> Map:
+def compute_plane_index(planes: Planes, inverse: Map) -> Map:
     """Convert inverse depths to plane indices."""
     return ((inverse - planes[0]) / (planes[1] - planes[0])).astype(np.float32)
 
 
-def doubled(values: Map, size: tuple[int, int]) -> Map:
+def repeat_pixels(values: Map, size: tuple[int, int]) -> Map:
     """Repeat each pixel 2 x 2 and crop to `size`."""
     return np.ascontiguousarray(values.repeat(2, axis=0).repeat(2, axis=1)[: size[0], : size[1]])

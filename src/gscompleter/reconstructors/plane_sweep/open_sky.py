@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from gscompleter.matching.stereo_image import StereoImage, contrast, largest
-from gscompleter.reconstructors.plane_sweep.measuring import Measured
+from gscompleter.matching.stereo_image import StereoImage, compute_contrast, take_largest_channel
+from gscompleter.reconstructors.plane_sweep.measuring import Measurement
 from gscompleter.reconstructors.plane_sweep.rig import Rig
 
 Map = Float32[np.ndarray, "h w"]
@@ -24,13 +24,13 @@ Mask = Bool[np.ndarray, "h w"]
 OtherMask = Bool[np.ndarray, "a b"]
 Plane = Float64[np.ndarray, "3"]
 
-EVEN = 0.012
+MAX_SKY_GRADIENT = 0.012
 """Largest colour gradient inside a sky, per pixel, for colours in [0, 1]."""
-LIKE = 0.06
+MAX_SKY_DIFFERENCE = 0.06
 """Largest colour difference of an edge pixel to the sky beside it."""
-EDGE = 3
+EDGE_RADIUS = 3
 """Distance in pixels at which an edge still raises the gradient of the sky."""
-OUTLINE = 3
+OUTLINE_WIDTH = 3
 """Width of the outline of a sky, in pixels."""
 MIN_WIDTH = 0.4
 """Smallest fraction of the top image row that a sky covers."""
@@ -38,7 +38,7 @@ MIN_HEIGHT = 0.1
 """Smallest mean height of a sky over its columns, as a fraction of the image height."""
 MIN_UNBROKEN = 0.6
 """Smallest fraction of a sky that is directly connected to the top of the image."""
-LOWEST, MOST = 0.55, 0.95
+LOWEST, MIN_ABOVE = 0.55, 0.95
 """Image height fraction, and the smallest fraction of a sky that lies above it."""
 MIN_OUTLINE = 64
 """Fewest measured outline pixels for a decision."""
@@ -60,56 +60,56 @@ PLANE_TOLERANCE = 2.0
 """Largest distance of a pixel from a plane it lies on, in sweep planes."""
 ROUNDS = 20
 """Iterations of reweighted least squares."""
-AGREEMENT = 0.5
+MIN_SKY_AGREEMENT = 0.5
 """Fraction of a sky that must also be sky in the other views."""
 
 
-def skies(rig: Rig, found: Sequence[Measured]) -> list[Mask]:
+def find_skies(rig: Rig, found: Sequence[Measurement]) -> list[Mask]:
     """Find the sky of each view that the other views confirm."""
-    own = [sky_above(image, f) for image, f in zip(rig.images, found, strict=True)]
+    own = [find_sky(image, f) for image, f in zip(rig.images, found, strict=True)]
     return [
-        sky if confirmed(number, sky, own, rig) else np.zeros_like(sky)
+        sky if is_confirmed(number, sky, own, rig) else np.zeros_like(sky)
         for number, sky in enumerate(own)
     ]
 
 
-def sky_shown(rig: Rig, sky_of_second: OtherMask) -> Mask:
+def transfer_sky(rig: Rig, sky_of_second: OtherMask) -> Mask:
     """Find the sky of the first view of a pair in the directions of the second view's sky."""
     first = rig.images[0]
-    return even_above(first) & (at_infinity(first.size, sky_of_second, rig, 0, 1) == 1)
+    return find_even_region(first) & (sample_at_infinity(first.size, sky_of_second, rig, 0, 1) == 1)
 
 
-def without(found: Measured, where: Mask) -> Measured:
+def exclude_pixels(found: Measurement, exclude_mask: Mask) -> Measurement:
     """Set the weight and confidence to 0 at the pixels of a mask, such as the sky."""
-    full = found.at_size(where.shape)
+    full = found.resize_to(exclude_mask.shape)
     weight, confidence = (
-        np.where(where, np.float32(0), share) for share in (full.weight, full.confidence)
+        np.where(exclude_mask, np.float32(0), share) for share in (full.weight, full.confidence)
     )
     return replace(full, weight=weight, confidence=confidence)
 
 
-def sky_above(image: StereoImage, found: Measured) -> Mask:
+def find_sky(image: StereoImage, found: Measurement) -> Mask:
     """Find the uniform region at the top of the image if its outline is that of a sky."""
-    region = even_above(image)
+    region = find_even_region(image)
     return region if is_open(image, found, region) else np.zeros_like(region)
 
 
-def is_open(image: StereoImage, found: Measured, region: Mask) -> bool:
+def is_open(image: StereoImage, found: Measurement, region: Mask) -> bool:
     """Test the outline of `region` for an open sky."""
-    full = found.at_size(image.size)
+    full = found.resize_to(image.size)
     measured = full.confidence > 0
-    outline = dilated(region, OUTLINE) & ~region & measured
+    outline = dilate_square(region, OUTLINE_WIDTH) & ~region & measured
     if not is_overhead(region) or outline.sum() < MIN_OUTLINE:
         return False
     heights = full.index + full.planes[0] / (full.planes[1] - full.planes[0])
     bright = bool(np.median(image.image[region]) > np.median(image.image[outline]))
     far_plane = float(heights.min() - full.index.min())
-    if not bright or not reaches_far(heights[outline], heights[measured & ~region], far_plane):
+    if not bright or not is_distant(heights[outline], heights[measured & ~region], far_plane):
         return False
     near = outline & (heights > max(NEAR_PLANES, 2 * np.quantile(heights[outline], END_SHARE)))
     return (
-        on_one_plane(outline, heights) < MAX_ON_PLANE
-        and on_one_plane(near, heights) < MAX_NEAR_ON_PLANE
+        measure_planarity(outline, heights) < MAX_ON_PLANE
+        and measure_planarity(near, heights) < MAX_NEAR_ON_PLANE
     )
 
 
@@ -120,37 +120,43 @@ def is_overhead(region: Mask) -> bool:
         return False
     unbroken = np.logical_and.accumulate(region, axis=0).sum() / region.sum()
     above = region[: round(LOWEST * len(region))].sum() / region.sum()
-    return bool(unbroken >= MIN_UNBROKEN and above >= MOST)
+    return bool(unbroken >= MIN_UNBROKEN and above >= MIN_ABOVE)
 
 
-def even_above(image: StereoImage) -> Mask:
+def find_even_region(image: StereoImage) -> Mask:
     """Find the uniform region connected to the top of the image, up to its edges."""
-    even = cv2.erode((slope_of(image) < EVEN).astype(np.uint8), np.ones((3, 3), np.uint8))
+    even = cv2.erode(
+        (compute_color_gradient(image) < MAX_SKY_GRADIENT).astype(np.uint8),
+        np.ones((3, 3), np.uint8),
+    )
     _, labels = cv2.connectedComponents(even, connectivity=4)
     top = labels[0][labels[0] > 0]
     core = np.isin(labels, top)
-    return core | (dilated(core, EDGE) & (difference_from(core, image) < LIKE))
+    return core | (
+        dilate_square(core, EDGE_RADIUS)
+        & (compute_color_difference(core, image) < MAX_SKY_DIFFERENCE)
+    )
 
 
-def slope_of(image: StereoImage) -> Map:
+def compute_color_gradient(image: StereoImage) -> Map:
     """Compute the largest colour gradient of each pixel."""
     smooth = cv2.GaussianBlur(image.image.astype(np.float32), (0, 0), 1.0)
     across, down = (
         cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1))
     )
-    return largest(cv2.magnitude(across, down))
+    return take_largest_channel(cv2.magnitude(across, down))
 
 
-def difference_from(core: Mask, image: StereoImage) -> Map:
+def compute_color_difference(core: Mask, image: StereoImage) -> Map:
     """Compute the largest channel difference to the mean colour of `core` nearby."""
     colour, weight = image.image.astype(np.float32), core.astype(np.float32)
-    size = (4 * EDGE + 1, 4 * EDGE + 1)
+    size = (4 * EDGE_RADIUS + 1, 4 * EDGE_RADIUS + 1)
     total = cv2.boxFilter(weight, -1, size)
     mean = cv2.boxFilter(colour * weight[..., None], -1, size) / np.maximum(total, 1e-6)[..., None]
-    return contrast(colour, mean)
+    return compute_contrast(colour, mean)
 
 
-def reaches_far(
+def is_distant(
     outline: Float32[np.ndarray, "n"], measured: Float32[np.ndarray, "m"], far_plane: float
 ) -> bool:
     """Test if an outline is near infinity and far behind the scene (planes from infinity)."""
@@ -159,7 +165,7 @@ def reaches_far(
     return bool(is_far and far * FAR_RATIO <= np.median(measured))
 
 
-def on_one_plane(outline: Mask, heights: Map) -> float:
+def measure_planarity(outline: Mask, heights: Map) -> float:
     """Compute the fraction of an outline on its best plane; 0 if there are too few pixels."""
     if outline.sum() < MIN_OUTLINE:
         return 0.0
@@ -173,19 +179,19 @@ def on_one_plane(outline: Mask, heights: Map) -> float:
     return float((np.abs(sites @ plane - values) < PLANE_TOLERANCE).mean())
 
 
-def confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig) -> bool:
+def is_confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig) -> bool:
     """Test if most of `sky` is sky in the other views that show its direction."""
     shown = [
-        at_infinity(sky.shape, other, rig, number, i)[sky]
+        sample_at_infinity(sky.shape, other, rig, number, i)[sky]
         for i, other in enumerate(others)
         if i != number
     ]
     answers = np.concatenate(shown) if shown else np.zeros(0)
     seen = answers >= 0
-    return bool(seen.any()) and float(answers[seen].mean()) > AGREEMENT
+    return bool(seen.any()) and float(answers[seen].mean()) > MIN_SKY_AGREEMENT
 
 
-def at_infinity(
+def sample_at_infinity(
     size: tuple[int, ...], mask: OtherMask, rig: Rig, this: int, other: int
 ) -> Float32[np.ndarray, "h w"]:
     """Sample the mask of another view in each pixel's direction; -1 if outside."""
@@ -200,6 +206,6 @@ def at_infinity(
     return np.where(seen, mask[at], -1).astype(np.float32)
 
 
-def dilated(mask: Mask, radius: int) -> Mask:
+def dilate_square(mask: Mask, radius: int) -> Mask:
     """Dilate `mask` by a square of `radius` pixels."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
