@@ -135,7 +135,7 @@ class Pass:
 
     predicted: PixelGaussians
     inputs: dict[str, tuple]
-    output_block_ids: dict[str, object]
+    outputs: dict[str, object]
 
     @staticmethod
     def through(network: nn.Module, images: Tensor, cameras: Cameras) -> Pass:

@@ -77,7 +77,7 @@ class Outcome:
 
     name: str
     command: list[str]
-    refusal: bool
+    refused: bool
     finding: str | None
     """Problem in one line, if any."""
 

@@ -379,12 +379,12 @@ def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
     options = parse_command(
         [str(w) for w in complete(scene, tmp_path, *words, "--generator-offload")]
     )
-    assert options.synthesis.settings() == PEFieldSettings("a/b", 2, True, 8, "monocular", 3)
+    assert options.synthesis.make_settings() == PEFieldSettings("a/b", 2, True, 8, "monocular", 3)
     words = ("--generator", "diffusers-inpaint", "--generator-prompt", "a quiet street")
     options = parse_command([str(word) for word in complete(scene, tmp_path, *words)])
-    assert options.synthesis.settings() == DiffusersInpaintSettings(prompt="a quiet street")
+    assert options.synthesis.make_settings() == DiffusersInpaintSettings(prompt="a quiet street")
     options = parse_command([str(word) for word in complete(scene, tmp_path)])
-    assert options.synthesis.settings() == WarpInpaintSettings()
+    assert options.synthesis.make_settings() == WarpInpaintSettings()
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ from gscompleter.reconstructors.depth_anything import (
     MetricViewDepth,
     NestedConfig,
     NestedDepthAnything,
-    Sizing,
+    ResizeConfig,
 )
 from gscompleter.reconstructors.depth_anything.alignment import (
     fit_center_similarity,
@@ -225,7 +225,7 @@ def check_images(path: Path) -> None:
     for number in numbers:
         bound, fit = str(case.values[f"in_method_{number}"]).split("_bound_")
         side, fit = {"upper": "longer", "lower": "shorter"}[bound], {"resize": "resized"}.get(fit)
-        sizing = Sizing(int(case.values[f"in_res_{number}"]), side, fit or "cropped")
+        sizing = ResizeConfig(int(case.values[f"in_res_{number}"]), side, fit or "cropped")
         image, expected = case.values[f"in_image_{number}"], case.values[f"out_image_{number}"]
         seen, window = crop_to_patches(image, sizing)
         assert seen.shape == expected.shape
@@ -329,7 +329,7 @@ TINY = DepthAnythingConfig(VitConfig(64, 1, 4, (0, 1, 2, 3), 1), 32, (16, 16, 16
 TINY_GAUSSIANS = replace(TINY, has_gaussian_head=True)
 TINY_METRIC = MetricDepthConfig(VitConfig(64, 1, 4, (0, 1, 2, 3), None), 32, (16, 16, 16, 16))
 SIZE = 56
-QUICK = Inference(Sizing(SIZE))
+QUICK = Inference(ResizeConfig(SIZE))
 
 
 class Knowing(DepthAnything):
@@ -458,7 +458,7 @@ def test_metres_are_brought_to_the_unit_that_shared_features_tell():
     metres = torch.stack([view.depth for view in views]) / 3.7
     network = KnowingMetric(metres, float(views[0].camera.K[0, 0]))
     for found, view in zip(
-        MetricViewDepth(network, Inference(Sizing(size)))(views), views, strict=True
+        MetricViewDepth(network, Inference(ResizeConfig(size)))(views), views, strict=True
     ):
         ratio = found.depth[4:] / view.depth[4:]
         assert torch.allclose(ratio, torch.ones(()), rtol=0.05)
@@ -496,7 +496,7 @@ def test_maps_of_a_resized_window_are_read_where_their_pixels_lie():
 
 def test_each_pixel_of_the_window_belongs_to_the_pixel_it_lies_in():
     views = photographs(size=40)
-    (image,) = create_any_view_batch(views[:1], Sizing(56), 1).windows
+    (image,) = create_any_view_batch(views[:1], ResizeConfig(56), 1).windows
     numbers = image.compute_pixel_indices(views[0].camera).view(56, 56)
     assert numbers[0, 0] == 0
     assert numbers[55, 55] == 40 * 40 - 1

@@ -28,7 +28,7 @@ from gscompleter.reconstructors.depth_anything import (
     DepthAnything,
     DepthAnythingConfig,
     Inference,
-    Sizing,
+    ResizeConfig,
 )
 from gscompleter.reconstructors.depth_anything.config import VitConfig
 from gscompleter.reconstructors.feed_forward import (
@@ -120,7 +120,7 @@ def test_depth_anything_reconstructs_where_the_views_lie(elsewhere, gaussians):
     there = [view.to(DEVICE) for view in pair]
 
     def psi() -> Reconstructor:
-        inference = Inference(Sizing(56))
+        inference = Inference(ResizeConfig(56))
         if gaussians:
             return AnyViewGaussians(network, inference)
         return FromDepth(model=AnyViewDepth(network, inference))

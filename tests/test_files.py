@@ -208,13 +208,13 @@ def test_a_linked_folder_stays_a_link(tmp_path):
 
 WRITES = """
 import os, signal, sys, time
-from gscompleter.interrupts import treat_stops_alike
+from gscompleter.interrupts import handle_stop_signals
 from gscompleter.io.files import output_folder, replacing
 
 for number in (signal.SIGTERM, signal.SIGHUP):
     signal.signal(number, signal.SIG_DFL)  # nohup and shells in the background ignore some
 signal.signal(signal.SIGINT, signal.default_int_handler)
-treat_stops_alike()
+handle_stop_signals()
 out, renames = sys.argv[1], int(sys.argv[2])
 rename = os.rename
 def waits(a, b):
@@ -278,11 +278,11 @@ def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, number):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, number):
     code = (
-        "import os, shutil, sys\nfrom gscompleter.interrupts import treat_stops_alike\n"
+        "import os, shutil, sys\nfrom gscompleter.interrupts import handle_stop_signals\n"
         "from gscompleter.io import unfinished\nfrom gscompleter.io.files import output_folder\n"
         "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
         "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\ntreat_stops_alike()\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\nhandle_stop_signals()\n"
         "rmtree = shutil.rmtree\n"
         "def stopped(*words, **others):\n"
         "    os.kill(os.getpid(), int(sys.argv[2]))\n"

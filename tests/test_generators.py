@@ -12,7 +12,7 @@ from gscompleter.generators.harmonize import match_exposures
 from gscompleter.generators.oracle import Oracle
 from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
 from gscompleter.generators.warp import WarpedImage, warp_photographs
-from gscompleter.generators.warp_inpaint import WarpInpaint, background_first, remove_cracks
+from gscompleter.generators.warp_inpaint import WarpInpaint, fill_background_first, remove_cracks
 from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patches
 from gscompleter.metrics.image import psnr
 from gscompleter.types import Camera, GeneratorInput, Render, View, merge
@@ -151,7 +151,7 @@ def test_the_background_fills_what_an_object_uncovers():
     known = torch.ones(32, 48, dtype=torch.bool)
     known[:, 16:32] = False
     depth = torch.where(torch.arange(48) < 24, 1.0, 4.0).expand(32, 48).contiguous()
-    tone, log_depth = background_first(WarpedImage(image, known, depth, ()))
+    tone, log_depth = fill_background_first(WarpedImage(image, known, depth, ()))
     middle = tone[16, 24]
     assert middle[2] > 5 * middle[0]
     assert log_depth[16, 24].exp() > 3

@@ -236,10 +236,10 @@ def test_an_extended_view_is_the_frozen_view_of_both(renderer, antialiased):
     extended = renderer.freeze(context, CAMERA).extend(new)
     frozen = renderer.freeze(merge([context, new]), CAMERA)
     for ours, truth in (
-        (extended.context, frozen.context),
+        (extended.render, frozen.render),
         (extended.composite(last), frozen.composite(last)),
-        (extended.plan(last)(last.opacities), frozen.plan(last)(last.opacities)),
-        (extended.extend(last).context, frozen.extend(last).context),
+        (extended.vary_opacities(last)(last.opacities), frozen.vary_opacities(last)(last.opacities)),
+        (extended.extend(last).render, frozen.extend(last).render),
     ):
         for name in DRAWN:
             assert torch.equal(getattr(ours, name), getattr(truth, name)), name
@@ -308,7 +308,7 @@ def opacity_gradient(function, opacities: torch.Tensor) -> tuple[Render, torch.T
 def test_a_plan_is_the_composite_with_other_opacities(renderer, antialiased):
     context, new = context_and_new(antialiased)
     frozen = renderer.freeze(context, CAMERA)
-    plan = frozen.plan(new)
+    plan = frozen.vary_opacities(new)
     for opacities in (new.opacities, 1 - new.opacities):
         planned, grad = opacity_gradient(plan, opacities)
         truth, expected = opacity_gradient(
@@ -571,7 +571,7 @@ def check_frozen(view, plain, new: Gaussians, bound: float) -> None:
 
     leaves = {name: getattr(new, name) for name in PARAMETERS}
     pairs = [(composited(view), composited(plain), leaves)]
-    plans = view.plan(new), plain.plan(new)
+    plans = view.vary_opacities(new), plain.vary_opacities(new)
     for opacities in (new.opacities, 1 - new.opacities):
         ours, theirs = ((lambda ls, p=plan: p(ls["opacities"])) for plan in plans)
         pairs.append((ours, theirs, {"opacities": opacities}))
@@ -642,12 +642,12 @@ def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name
     assert_close(ours.depth, truth.depth, "depth", 1e-5)
     assert_close(ours.image, truth.image, "image", 1e-5)
     view = cuda.freeze(context, CAMERA)
-    assert 0 < len(view.seen) < len(context)
+    assert 0 < len(view.visible_scene) < len(context)
     check_frozen(view, REFERENCE.freeze(context, CAMERA), new, 1e-4)
     more = replace(random_gaussians(30, seed=6), is_antialiased=context.is_antialiased)
     check_frozen(view.extend(new), REFERENCE.freeze(merge([context, new]), CAMERA), more, 1e-4)
     assert not cuda.render(new[:0], CAMERA).image.any()
-    assert len(cuda.freeze(new[:0], CAMERA).seen) == 0
+    assert len(cuda.freeze(new[:0], CAMERA).visible_scene) == 0
 
 
 on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU")
@@ -681,5 +681,5 @@ def test_a_frozen_view_on_a_gpu_draws_what_drawing_everything_anew_does(name):
     new = random_gaussians(200, seed=5, sh_degree=1).to("cuda")
     new = replace(new, is_antialiased=context.is_antialiased)
     view = cuda.freeze(context, camera)
-    assert 0 < len(view.seen) < len(context) / 2 + 1
+    assert 0 < len(view.visible_scene) < len(context) / 2 + 1
     check_frozen(view, ReferenceFrozenScene(cuda, context, camera), new, 1e-3)

@@ -80,7 +80,7 @@ class Page(HTMLParser):
     def all(self, tag: str) -> list[dict[str, str | None]]:
         return [attributes for name, attributes in self.tags if name == tag]
 
-    def frame_description(self) -> str:
+    def said(self) -> str:
         return " ".join(" ".join(self.words).split())
 
 

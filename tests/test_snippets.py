@@ -64,7 +64,7 @@ class Block:
     page: Path
     line: int
     language: str
-    read_string: str
+    text: str
 
     @property
     def name(self) -> str:

@@ -460,7 +460,7 @@ def test_convert_writes_once_and_says_what_it_wrote(tmp_path, monkeypatch, capsy
     assert run(monkeypatch, "convert", source, out) == 0
     assert "30 Gaussians, 30 of them generated" in capsys.readouterr().out.replace("\n", " ")
     assert run(monkeypatch, "convert", source, out) == 2
-    assert "there already" in capsys.readouterr().err
+    assert "exists; name another file" in capsys.readouterr().err
     assert run(monkeypatch, "convert", source, out, "--overwrite", "--quiet") == 0
     assert run(monkeypatch, "convert", source, tmp_path / "b.glb") == 2
     assert run(monkeypatch, "convert", out, tmp_path / "c.ply") == 0

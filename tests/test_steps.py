@@ -54,7 +54,7 @@ class Walk(PosedPhotographs):
     origin = np.zeros(3)
     name: str = "walk"
     num_frames: int = len(PLACES)
-    worst_budget: tuple[int, ...] = ()
+    broken: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return self.num_frames

@@ -70,7 +70,7 @@ class VoxelPass:
             hook.remove()
         return VoxelPass(predicted, between)
 
-    def get_row_paths(self, case: Case) -> Tensor:
+    def rows_of(self, case: Case) -> Tensor:
         """Find our row of each of the authors' voxels; -1 if there is none."""
         ours = {tuple(row): i for i, row in enumerate(self.predicted.grid.coordinates.tolist())}
         return torch.tensor([ours.get(tuple(row), -1) for row in case.values["voxel_coords"]])
@@ -96,7 +96,7 @@ class VoxelPass:
             errors[name] = relative_error(ours, case.tensor(f"mid_{name}")[shared])
         return errors
 
-    def output_block_ids(self) -> dict[str, Tensor]:
+    def outputs(self) -> dict[str, Tensor]:
         g = self.predicted
         spread = quats_to_rotations(g.quats) * g.scales[:, None, :]
         values = {

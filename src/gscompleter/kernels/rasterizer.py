@@ -199,9 +199,9 @@ def _exp_negative(values):
     power = power.where(power.compare(">", -120.0), -120.0)
     whole = builder.fptosi(power.value, _INTS)
     fraction = power - _Lanes(builder, builder.sitofp(whole, _FLOATS))
-    polynomial = fraction.times(_EXP2[0], _EXP2[1])
+    polynomial = fraction.multiply_add(_EXP2[0], _EXP2[1])
     for coefficient in _EXP2[2:]:
-        polynomial = polynomial.times(fraction, coefficient)
+        polynomial = polynomial.multiply_add(fraction, coefficient)
     # The exponent of a float starts at bit 23 and is 127 for 2**0.
     exponent = builder.add(whole, ir.Constant(_INTS, [127] * TILE))
     scale = builder.shl(exponent, ir.Constant(_INTS, [23] * TILE))
@@ -249,7 +249,7 @@ class _Splat:
         dy = builder.fsub(builder.sitofp(row, _FLOAT), self.y)
         s = self.u_dx + _Lanes(builder, _broadcast(builder, builder.fmul(self.v, dy)))
         t = builder.fmul(self.w, dy)
-        sigma = s.times(s, plus=_Lanes(builder, _broadcast(builder, builder.fmul(t, t))))
+        sigma = s.multiply_add(s, plus=_Lanes(builder, _broadcast(builder, builder.fmul(t, t))))
         raw = self.opacity * _exp_negative(sigma)
         capped = raw.where(raw.compare("<=", MAX_ALPHA), MAX_ALPHA)
         return dy, raw, capped, raw.compare(">=", MIN_ALPHA)
@@ -270,13 +270,13 @@ def _blend(splat, state, row):
     _, _, alpha, visible = splat.compute_falloff(row)
     alpha = alpha.where(visible, 0.0)
     before = _Lanes(builder, state.load(row, 0))
-    after = alpha.times(0.0 - before, plus=before)
+    after = alpha.multiply_add(0.0 - before, plus=before)
     passing = after.compare(">", MIN_TRANSMITTANCE)
     weight = (alpha * before).where(passing, 0.0)
     closed = before.where(before.compare("<", 0.0), 0.0 - before)
     state.store(row, 0, after.where(passing, closed).value)
     for index, channel in enumerate(splat.channels[: state.stride // TILE - 1], start=1):
-        total = weight.times(channel, plus=_Lanes(builder, state.load(row, index)))
+        total = weight.multiply_add(channel, plus=_Lanes(builder, state.load(row, index)))
         state.store(row, index, total.value)
     return weight, visible, passing
 
@@ -367,7 +367,7 @@ def _sum_weighted_rows(typing, begin, end, place, state, kept, sums):
             for index, total in enumerate(totals, start=1):
                 value = _Lanes(builder, builder.load(total))
                 if index < 4:
-                    value = weight.times(_Lanes(builder, state.load(loop.index, index)), plus=value)
+                    value = weight.multiply_add(_Lanes(builder, state.load(loop.index, index)), plus=value)
                 else:
                     value = value + weight
                 builder.store(value.value, total)
@@ -437,15 +437,15 @@ def _make_revert(wanted):
                 weight = alpha * before
                 value = gradients[4]
                 for channel, gradient in zip(splat.channels, gradients[:4], strict=True):
-                    value = channel.times(gradient, plus=value)
+                    value = channel.multiply_add(gradient, plus=value)
                 state.store(row, 0, before.value)
-                state.store(row, 1, weight.times(value, plus=behind).value)
+                state.store(row, 1, weight.multiply_add(value, plus=behind).value)
                 if wanted == "nothing":
                     return
 
                 if wanted == "colour":
                     for total, gradient in zip(totals, gradients[:3], strict=True):
-                        value = weight.times(gradient, plus=_Lanes(builder, builder.load(total)))
+                        value = weight.multiply_add(gradient, plus=_Lanes(builder, builder.load(total)))
                         builder.store(value.value, total)
                     return
 

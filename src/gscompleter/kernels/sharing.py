@@ -20,7 +20,7 @@ PIECES_PER_THREAD = 4
 class _Thread(threading.local):
     """State of the calling thread."""
 
-    alone = False
+    is_alone = False
     """True if its kernels run on it alone."""
 
 

@@ -149,21 +149,21 @@ class _ErrorFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, held: ImageComparison, opacities: Tensor, sh: Tensor) -> Tensor:
-        folded = held.scene
-        colors, opaque = folded.shade(to_float32(sh)), to_float32(opacities)
-        image = np.empty_like(folded.image)
-        folded.render_fragments(opaque, colors, image)
+        scene = held.scene
+        colors, opaque = scene.shade(to_float32(sh)), to_float32(opacities)
+        image = np.empty_like(scene.image)
+        scene.render_fragments(opaque, colors, image)
         error, d_image = held.compute_error(image)
-        ctx.scene = (folded, opaque, colors, image, d_image, sh.shape[1])
+        ctx.scene = (scene, opaque, colors, image, d_image, sh.shape[1])
         return torch.tensor(held.frozen_error + error, dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_error: Tensor) -> tuple[Tensor | None, ...]:
-        folded, opacities, colors, image, d_image, bands = ctx.scene
-        found = d_error.item() * folded.slopes(opacities, colors, image, d_image)
+        scene, opacities, colors, image, d_image, bands = ctx.scene
+        found = d_error.item() * scene.compute_gradients(opacities, colors, image, d_image)
         return None, *compute_appearance_gradients(
-            folded, colors, found, bands, ctx.needs_input_grad[2]
+            scene, colors, found, bands, ctx.needs_input_grad[2]
         )
 
 
@@ -171,19 +171,19 @@ class _ImageFunction(torch.autograd.Function):
     """The image of a `BakedScene`."""
 
     @staticmethod
-    def forward(ctx: Any, folded: BakedScene, opacities: Tensor, sh: Tensor) -> Tensor:
-        colors, opaque = folded.shade(to_float32(sh)), to_float32(opacities)
-        image = folded.render(opaque, colors)
-        ctx.scene = (folded, opaque, colors, image, sh.shape[1])
+    def forward(ctx: Any, scene: BakedScene, opacities: Tensor, sh: Tensor) -> Tensor:
+        colors, opaque = scene.shade(to_float32(sh)), to_float32(opacities)
+        image = scene.render(opaque, colors)
+        ctx.scene = (scene, opaque, colors, image, sh.shape[1])
         return torch.from_numpy(image)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_image: Tensor) -> tuple[Tensor | None, ...]:
-        folded, opacities, colors, image, bands = ctx.scene
-        found = folded.slopes(opacities, colors, image, to_float32(d_image))
+        scene, opacities, colors, image, bands = ctx.scene
+        found = scene.compute_gradients(opacities, colors, image, to_float32(d_image))
         return None, *compute_appearance_gradients(
-            folded, colors, found, bands, ctx.needs_input_grad[2]
+            scene, colors, found, bands, ctx.needs_input_grad[2]
         )
 
 
