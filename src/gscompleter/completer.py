@@ -553,7 +553,7 @@ class GSCompleter:
     ) -> TargetView:
         """Render the scene at a target, padded if a hole reaches the border.
 
-        A reference that was synthesized in advance determines the padding by its camera, `pad_depth`.
+        A reference that was synthesized in advance determines the padding by its camera, `padded`.
         """
         camera = self.pad_target(completion, target)
         if padded is not None:

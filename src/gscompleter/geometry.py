@@ -137,7 +137,7 @@ def pad_pixels(camera: Camera, left: int, top: int) -> PaddedCamera:
 
 
 def pad_like(camera: Camera, padded: Camera) -> PaddedCamera:
-    """Pad the image of `camera` to the size of `pad_depth`, centred."""
+    """Pad the image of `camera` to the size of `padded`, centred."""
     return pad_pixels(
         camera, (padded.width - camera.width) // 2, (padded.height - camera.height) // 2
     )

@@ -47,7 +47,7 @@ def estimate_bytes(pixels: int, images: int) -> int:
 
 
 def check_scene_memory(count: int, photographs: int, needed: int) -> None:
-    """Raise InputError if `require_stored` bytes, for `count` Gaussians, exceed the memory."""
+    """Raise InputError if `needed` bytes, for `count` Gaussians, exceed the memory."""
     number = f"The {quote_value(f'{count:,}')} Gaussians of the scene and {photographs} photographs"
     remedy = "crop the scene, or give a folder with fewer photographs"
     _check_available(needed, number, remedy)

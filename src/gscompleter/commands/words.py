@@ -82,7 +82,7 @@ def check_command(words: Sequence[str], names: Collection[str]) -> None:
 
 
 def list_options(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> list[str]:
-    """List the options of the command in `make_words`."""
+    """List the options of the command in `words`."""
     if not words or words[0].startswith("--"):
         return ["--help", "--version"]
     help_text = StringIO()
@@ -107,7 +107,7 @@ def find_misspelling(
 
 
 def get_command_name(words: Sequence[str], names: Collection[str]) -> str:
-    """Return the program with the command in `make_words`, if any."""
+    """Return the program with the command in `words`, if any."""
     return " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
 
 

@@ -288,7 +288,7 @@ def _find_skip_reason(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | Non
 
 
 def _find_size_defect(frame: Frame, needed: tuple[int, int]) -> str | None:
-    """Explain why the stored photograph is not of size `require_stored` (height, width); None if it is."""
+    """Explain why the stored photograph is not of size `needed` (height, width); None if it is."""
     found = frame.read_stored_size()
     if found is None:
         return "its image is missing"

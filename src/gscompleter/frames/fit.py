@@ -133,7 +133,7 @@ def score_image(render: Render, photograph: Float[Tensor, "h w 3"]) -> ImageFit:
 def match_exposure(
     rendered: Float[Tensor, "n 3"], truth: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Match the exposure of `photograph` by one gain and one offset (least squares)."""
+    """Match the exposure of `truth` by one gain and one offset (least squares)."""
     centred = rendered - rendered.mean()
     gain = (centred * (truth - truth.mean())).sum() / centred.square().sum().clamp_min(1e-12)
     return gain.clamp(*GAIN_RANGE) * centred + truth.mean()

@@ -25,7 +25,7 @@ class Pyramid(NamedTuple):
 
 
 def build_pyramid(levels):
-    """Build the pyramid of `project_levels`, float32 [h, w, c] each."""
+    """Build the pyramid of `levels`, float32 [h, w, c] each."""
     sizes = np.array([level.shape[:2] for level in levels])
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]])
     sums = np.concatenate([level.reshape(-1, level.shape[2]) for level in levels])

@@ -17,7 +17,7 @@ MIN_DIVISOR = np.float32(1e-30)
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def mark_run_starts(begin, end, means, scales, generated, centers, focals, reach, largest, begins):
-    """Write to `recognizes` [n] which Gaussians of the blocks begin..end start a run.
+    """Write to `begins` [n] which Gaussians of the blocks begin..end start a run.
 
     It continues while the next Gaussian has the provenance of the first, lies within `reach` pixels
     of it, and has no standard deviation above `largest` pixels, for the smallest pixel of all

@@ -37,7 +37,7 @@ def count_threads(threads):
 
 
 def share(kernel, count, *arguments, threads=None):
-    """Run `kernel(begin, end, *load_arguments)` over range(count) on several threads.
+    """Run `kernel(begin, end, *arguments)` over range(count) on several threads.
 
     `threads` defaults to NUMBA_NUM_THREADS; the result does not depend on it.
     """

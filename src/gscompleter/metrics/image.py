@@ -68,7 +68,7 @@ def blur_gaussian(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 
 def compute_gradient_energy_ratio(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
 ) -> float | None:
-    """Compute the gradient energy of `image` over that of `photograph`: 1 is as sharp, 0 is flat.
+    """Compute the gradient energy of `image` over that of `truth`: 1 is as sharp, 0 is flat.
 
     Squared central differences of luminance are summed over pixels of `where` with all four
     neighbours in `where`. This measures sharpness, not whether edges are correct. None without such

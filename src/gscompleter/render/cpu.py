@@ -350,7 +350,7 @@ class Viewpoint:
         return np.where(tiles.cpu().numpy(), np.float32(np.inf), np.float32(-np.inf))
 
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
-        """Run `kernel(begin, end, *load_arguments)` over range(count) on the threads."""
+        """Run `kernel(begin, end, *arguments)` over range(count) on the threads."""
         share(kernel, count, *arguments, threads=self.threads)
 
 

@@ -97,7 +97,7 @@ def draw_points(svg: Element, points: Float[np.ndarray, "n 3"], added: Sequence[
 
 
 def draw_camera(svg: Element, camera: LabelledCamera, corners: Float[np.ndarray, "11 3"]) -> None:
-    """Draw a camera as one line along `compute_corners`."""
+    """Draw a camera as one line along `corners`."""
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in project_to_drawing(corners))
     shape = add_element(
         svg, "polyline", class_=camera.kind, points=line, data_points=format_points(corners)

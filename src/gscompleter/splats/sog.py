@@ -64,7 +64,7 @@ class SogFiles:
     read: Callable[[str], bytes]
 
     def load_pixels(self, name: object, needed: int) -> UInt8[ndarray, "h w 4"]:
-        """Read an image of at least `require_stored` pixels."""
+        """Read an image of at least `needed` pixels."""
         data = self.read(_check_file_name(self.path, name))
         width, height = _parse_webp_size(self.path, data)
         check_growth(self.path, 4 * width * height, len(data), MAX_GROWTH)

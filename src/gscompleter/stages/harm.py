@@ -197,7 +197,7 @@ def is_mostly_faded(
 
 
 def select_fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
-    """Select the fewest entries whose relief sums to `require_stored`, or to half of all relief.
+    """Select the fewest entries whose relief sums to `needed`, or to half of all relief.
 
     Relief is a first-order estimate, so the other half is re-evaluated after the change.
     """

@@ -253,7 +253,7 @@ class Objective:
         alone: Callable[[Gaussians], Render],
         at_anchor: Render,
     ) -> Float[Tensor, ""]:
-        """Compute the loss; `is_alone` renders `candidates` at the target without the scene."""
+        """Compute the loss; `alone` renders `candidates` at the target without the scene."""
         c = self.config
         loss = torch.zeros((), device=candidates.means.device)
         if c.rendered_depth == "composite" or c.rgb_weight > 0:
