@@ -20,8 +20,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 import gscompleter as gsc
-from gscompleter.matching.depth_range import get_depth_range
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.reconstructors.features.depth_range import get_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.types import Gaussians, View, merge
 

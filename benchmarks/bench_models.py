@@ -19,12 +19,12 @@ from rich.console import Console
 from rich.table import Table
 
 from bench_render import measure_median_seconds
-from gscompleter.commands.demo import write_motorcycle_scene
+from gscompleter.apps.commands.demo import write_motorcycle_scene
 from gscompleter.data.scene import load_views
+from gscompleter.evaluation.memory import measure_peak_memory
+from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.runs.memory import measure_peak_memory
 from gscompleter.types import View
-from gscompleter.weights.published import PUBLISHED
 
 MODELS = (
     "plane-sweep",
@@ -58,7 +58,7 @@ def load_model(
     """Load a reconstructor, with random weights if it has any, and their number."""
     if name not in PUBLISHED:
         return load_reconstructor(name), 0
-    from gscompleter.reconstructors.feed_forward.build import create_network, wrap_network
+    from gscompleter.models.feed_forward.build import create_network, wrap_network
 
     torch.manual_seed(0)
     network = create_network(PUBLISHED[name]).eval().requires_grad_(False).to(device)

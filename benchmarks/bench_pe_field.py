@@ -20,11 +20,11 @@ from rich.console import Console
 from rich.table import Table
 
 from bench_render import read_clock
-from gscompleter.generators.diffusion.kontext import find_nearest_size
-from gscompleter.generators.diffusion.placing import select_dtype
-from gscompleter.generators.diffusion.position_ids import compute_target_ids
-from gscompleter.generators.diffusion.published import PE_FIELD_TRANSFORMER
-from gscompleter.generators.diffusion.rotary import enable_per_head_positions
+from gscompleter.models.diffusion.kontext import find_nearest_size
+from gscompleter.models.diffusion.placing import select_dtype
+from gscompleter.models.diffusion.position_ids import compute_target_ids
+from gscompleter.models.diffusion.published import PE_FIELD_TRANSFORMER
+from gscompleter.models.diffusion.rotary import enable_per_head_positions
 
 BLOCKS = (PE_FIELD_TRANSFORMER["num_layers"], PE_FIELD_TRANSFORMER["num_single_layers"])
 """Double and single blocks of the published transformer."""

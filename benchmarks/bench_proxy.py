@@ -15,12 +15,11 @@ import tyro
 
 from bench_render import make_pixel_gaussians, measure_median_seconds
 from gscompleter import Gaussians, load_renderer, merge
-from gscompleter.benchmark.crowding import multiply_gaussians
-from gscompleter.commands.demo import move_right
-from gscompleter.frames.thinning import thin_gaussians
-from gscompleter.metrics.image import psnr
-from gscompleter.render.proxy import simplify_scene
-from gscompleter.splats.order import argsort_nearby
+from gscompleter.apps.bench.crowding import multiply_gaussians
+from gscompleter.apps.commands.demo import move_right
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.render.lod import simplify_scene, thin_gaussians
+from gscompleter.splats.morton import argsort_nearby
 from gscompleter.types import Camera
 
 

@@ -16,9 +16,9 @@ import torch.nn.functional as F
 import tyro
 from torch import Tensor
 
-from gscompleter.reconstructors.feed_forward.sparse import Grid, SparseConv, build_hierarchy
-from gscompleter.reconstructors.feed_forward.sparse_unet import SparseUNet
-from gscompleter.reconstructors.feed_forward.voxels import voxelize
+from gscompleter.models.feed_forward.sparse import Grid, SparseConv, build_hierarchy
+from gscompleter.models.feed_forward.sparse_unet import SparseUNet
+from gscompleter.models.feed_forward.voxels import voxelize
 
 CHANNELS = 164
 RESOLUTION = 0.001

@@ -28,7 +28,7 @@ from bench_pe_field import build_transformer
 from bench_render import measure_median_seconds
 from gpu_report import Part, Row, main, shorten, try_rows
 from gscompleter import Gaussians, GSCompleter, View, load_renderer
-from gscompleter.generators.diffusion.pe_field import PEField
+from gscompleter.models.diffusion.pe_field import PEField
 from gscompleter.render import FrozenScene, Renderer
 from gscompleter.render.reference import ReferenceFrozenScene
 from gscompleter.types import Camera, GeneratorInput, merge
@@ -220,9 +220,9 @@ def build_random_kontext(device: str) -> Any:
     from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, FluxKontextPipeline
 
     from bench_pe_field import BLOCKS, TEXT
-    from gscompleter.generators.diffusion.kontext import Kontext, Prompt
-    from gscompleter.generators.diffusion.placing import select_dtype
-    from gscompleter.generators.diffusion.rotary import enable_per_head_positions
+    from gscompleter.models.diffusion.kontext import Kontext, Prompt
+    from gscompleter.models.diffusion.placing import select_dtype
+    from gscompleter.models.diffusion.rotary import enable_per_head_positions
 
     dtype, levels = select_dtype(device), 4
     vae = AutoencoderKL(

@@ -21,11 +21,11 @@ from torch import Tensor
 from gscompleter.completer import GSCompleter
 from gscompleter.config import TrustConfig
 from gscompleter.data.formats import open_photographs
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.render import load_renderer
 from gscompleter.splats.formats import load_splat
 from gscompleter.stages.context import measure_depth_range
-from gscompleter.stages.support import (
+from gscompleter.trust.photometric import (
     compute_color_difference,
     compute_trust,
     compute_trusted_alpha,

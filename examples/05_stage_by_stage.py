@@ -12,10 +12,11 @@ from dataclasses import replace
 import torch
 
 import gscompleter as gsc
-from gscompleter.stages.anchor import lift, select_anchor, synthesize
 from gscompleter.stages.context import find_depth_range, init_context
-from gscompleter.stages.integration import compute_hole_mask, filter_holes, refine_opacities
-from gscompleter.stages.registration import register
+from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
+from gscompleter.stages.refine import refine_opacities
+from gscompleter.stages.select_anchor import lift, select_anchor, synthesize
+from gscompleter.stages.slide_along_rays import register
 from gscompleter.types import GeneratorInput
 
 

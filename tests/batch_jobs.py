@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gscompleter.batch.engines import Engine
-from gscompleter.batch.engines.local import LocalEngine
-from gscompleter.batch.engines.ray import RayEngine
-from gscompleter.batch.jobs import JOBS, Job, Outcome, find_missing_jobs, run_claimed
-from gscompleter.batch.places import FolderPlace
-from gscompleter.batch.rounds import BatchRows, Rounds
 from gscompleter.errors import InputError
+from gscompleter.jobs.engines import Engine
+from gscompleter.jobs.engines.local import LocalEngine
+from gscompleter.jobs.engines.ray import RayEngine
+from gscompleter.jobs.jobs import JOBS, Job, Outcome, find_missing_jobs, run_claimed
+from gscompleter.jobs.places import FolderPlace
+from gscompleter.jobs.rounds import BatchRows, Rounds
 
 
 @dataclass(frozen=True)

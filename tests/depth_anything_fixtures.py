@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from feed_forward_fixtures import EVERY, STORED, Case, rule_v1
-from gscompleter.reconstructors.depth_anything.alignment import fit_robust_similarity
-from gscompleter.reconstructors.depth_anything.config import (
+from gscompleter.models.depth_anything.alignment import fit_robust_similarity
+from gscompleter.models.depth_anything.config import (
     VARIANTS,
     WIDE,
     DepthAnythingConfig,
@@ -21,19 +21,16 @@ from gscompleter.reconstructors.depth_anything.config import (
     NestedConfig,
     VitConfig,
 )
-from gscompleter.reconstructors.depth_anything.images import normalize_colors
-from gscompleter.reconstructors.depth_anything.metric import MetricDepthAnything, set_sky_depth
-from gscompleter.reconstructors.depth_anything.nested import NestedDepthAnything
-from gscompleter.reconstructors.depth_anything.network import DepthAnything, Prediction
-from gscompleter.reconstructors.depth_anything.normalisation import (
-    compute_authors_units,
-    normalize_poses,
-)
-from gscompleter.reconstructors.depth_anything.poses import Poses
-from gscompleter.reconstructors.depth_anything.reconstructor import get_camera_centers
-from gscompleter.reconstructors.depth_anything.reference_view import select_reference_view
-from gscompleter.reconstructors.feed_forward.build import create_depth_anything
-from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
+from gscompleter.models.depth_anything.images import normalize_colors
+from gscompleter.models.depth_anything.metric import MetricDepthAnything, set_sky_depth
+from gscompleter.models.depth_anything.nested import NestedDepthAnything
+from gscompleter.models.depth_anything.network import DepthAnything, Prediction
+from gscompleter.models.depth_anything.normalisation import compute_authors_units, normalize_poses
+from gscompleter.models.depth_anything.poses import Poses
+from gscompleter.models.depth_anything.reconstructor import get_camera_centers
+from gscompleter.models.depth_anything.reference_view import select_reference_view
+from gscompleter.models.feed_forward.build import create_depth_anything
+from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
 from parity import relative_error
 
 FIXTURES = STORED / "da3"

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from gscompleter.geometry import multiply_quats, quats_to_rotations, rotations_to_quats
-from gscompleter.reconstructors.feed_forward.cameras import Cameras
-from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
+from gscompleter.models.feed_forward.cameras import Cameras
+from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
 from parity import relative_error
 
 STORED = Path(__file__).parent / "fixtures" / "feed_forward"

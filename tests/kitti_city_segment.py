@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gscompleter.data.driving.range_image import build_poses
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.range_image import build_poses
 from waymo_segment import OPENCV_FROM_CAMERA, Laser, Moment, RigCamera, Seen, write_segment
 
 ABOVE_ROAD = 1.65

@@ -20,7 +20,7 @@ from torch import Tensor
 from gscompleter.data.scene import write_cameras
 from gscompleter.generators import GeneratorOutput, GeneratorRequest, as_generator
 from gscompleter.io.image import write_image
-from gscompleter.io.ply import save_ply
+from gscompleter.splats.ply import save_ply
 from gscompleter.types import (
     Camera,
     DepthMap,

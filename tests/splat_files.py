@@ -15,7 +15,7 @@ import zstandard
 from PIL import Image
 
 from gscompleter import save_splat
-from gscompleter.splats.frames import HALF_TURN_Z, rotate_half_turn
+from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn
 from gscompleter.types import SH_C0, Gaussians
 from scenes import random_gaussians
 

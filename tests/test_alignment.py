@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gscompleter.config import AlignmentConfig, CompleterConfig
-from gscompleter.stages.alignment import fit_affine, refit_at_target
+from gscompleter.stages.align_depth import fit_affine, refit_at_target
 from gscompleter.types import DepthAffine, DepthMap
 
 CONFIG = AlignmentConfig()

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gscompleter.config import AnchorConfig, CompleterConfig
-from gscompleter.stages.anchor import find_nearest_view, lift, select_anchor, synthesize
+from gscompleter.stages.select_anchor import find_nearest_view, lift, select_anchor, synthesize
 from gscompleter.types import Camera, DepthMap, GeneratorInput, Reconstruction, Render, View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 

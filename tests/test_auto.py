@@ -9,8 +9,8 @@ import torch
 
 from command import run
 from gscompleter import load_cameras
+from gscompleter.apps.commands.words import insert_auto_count
 from gscompleter.cli import parse_command
-from gscompleter.commands.words import insert_auto_count
 from gscompleter.data.formats import open_photographs
 from gscompleter.geometry import measure_baseline
 from scenes import camera_at, photographed

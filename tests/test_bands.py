@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 import torch
 
+from gscompleter.evaluation.metrics.image import compute_gradient_energy_ratio
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS
-from gscompleter.metrics.image import compute_gradient_energy_ratio
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, measuring
-from gscompleter.reconstructors.plane_sweep.bands import (
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, sweep
+from gscompleter.reconstructors.plane_sweep.depth_bands import (
     compute_tile_grid,
     make_bands,
     make_full_bands,
     make_guided_bands,
 )
 from gscompleter.reconstructors.plane_sweep.matching import compute_costs, place_planes
-from gscompleter.reconstructors.plane_sweep.measuring import compute_plane_index, sweep_view
 from gscompleter.reconstructors.plane_sweep.rig import build_rig
+from gscompleter.reconstructors.plane_sweep.sweep import compute_plane_index, sweep_view
 from gscompleter.render import load_renderer
 from gscompleter.types import sh_from_rgb
 from scenes import Room, camera_at, view_of
@@ -133,9 +133,7 @@ def test_bands_around_a_guess_hold_the_truth_at_a_fraction_of_the_planes(rig):
 def test_two_large_photographs_are_measured_as_well_as_at_all_planes(rig, monkeypatch):
     views, truth = rig[1], rig[1][0].depth
     guided = PlaneSweep().estimate_depths(views)[0]
-    monkeypatch.setattr(
-        "gscompleter.reconstructors.plane_sweep.measuring.MIN_GUIDED_SIDE", SIZE + 1
-    )
+    monkeypatch.setattr("gscompleter.reconstructors.plane_sweep.sweep.MIN_GUIDED_SIDE", SIZE + 1)
     plain = PlaneSweep().estimate_depths(views)[0]
 
     def off(found):
@@ -153,16 +151,16 @@ def test_coarse_images_say_first_where_to_look_down_to_the_smallest(rig, monkeyp
         seen.append((reference.size, bands.start[-1]))
         return compute_costs(reference, sources, planes, bands)
 
-    monkeypatch.setattr(measuring, "matched_costs", counted)
-    monkeypatch.setattr(measuring, "GUIDED_FROM", SIZE // 2)
-    guided = measuring.sweep_views(stereo_rig, *depths)
+    monkeypatch.setattr(sweep, "compute_costs", counted)
+    monkeypatch.setattr(sweep, "MIN_GUIDED_SIDE", SIZE // 2)
+    guided = sweep.sweep_views(stereo_rig, *depths)
     assert [size for size, _ in seen] == [
         (s, s) for s in (SIZE // 4, SIZE // 2, SIZE) for _ in "ab"
     ]
     work = sum(cells for _, cells in seen)
     seen.clear()
-    monkeypatch.setattr(measuring, "GUIDED_FROM", SIZE + 1)
-    plain = measuring.sweep_views(stereo_rig, *depths)
+    monkeypatch.setattr(sweep, "MIN_GUIDED_SIDE", SIZE + 1)
+    plain = sweep.sweep_views(stereo_rig, *depths)
     assert work < 0.6 * sum(cells for _, cells in seen)
     truth = stereo_rig.unit / views[0].depth.numpy()
     errors = [np.abs(sweeps[0].inverse - truth) / truth for sweeps in (guided, plain)]

@@ -9,21 +9,21 @@ import torch
 from skimage.metrics import structural_similarity
 
 from gscompleter import load_renderer
-from gscompleter.baselines.mixture_wasserstein import (
+from gscompleter.evaluation.baselines.mixture_wasserstein import (
     Mixture,
     compute_matrix_root,
     compute_mixture_wasserstein,
     compute_pairwise_costs,
     reduce_mixture,
 )
-from gscompleter.baselines.optimization import (
+from gscompleter.evaluation.baselines.optimization import (
     OptimizationConfig,
     compute_image_gradients,
     control_density,
     optimize,
     ssim_map,
 )
-from gscompleter.baselines.reggs import (
+from gscompleter.evaluation.baselines.reggs import (
     RegGSConfig,
     Similarity,
     cluster_gaussians,
@@ -32,7 +32,7 @@ from gscompleter.baselines.reggs import (
     register_by_similarity,
     rotate_mixture,
 )
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.types import Gaussians, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of

@@ -13,16 +13,16 @@ import pytest
 from batch_jobs import Writing, engine_named, outcomes, plain_jobs
 from command import run
 from gscompleter import InputError
-from gscompleter.batch import jobs as batch
-from gscompleter.batch.engines.local import LocalEngine
-from gscompleter.batch.engines.submitit import SubmititEngine
-from gscompleter.batch.jobs import Job, find_missing_jobs, run_claimed
-from gscompleter.batch.manifest import read_manifest
-from gscompleter.batch.places import FolderPlace, StorePlace, make_lease, open_place
-from gscompleter.batch.rounds import BatchRows, Rounds, run_in_this_process
-from gscompleter.batch.shards import parse_shard
-from gscompleter.commands.row_options import parse_row
+from gscompleter.apps.batch.manifest import read_manifest
+from gscompleter.apps.commands.row_options import parse_row
 from gscompleter.errors import OutputError
+from gscompleter.jobs import jobs as batch
+from gscompleter.jobs.engines.local import LocalEngine
+from gscompleter.jobs.engines.submitit import SubmititEngine
+from gscompleter.jobs.jobs import Job, find_missing_jobs, run_claimed
+from gscompleter.jobs.places import FolderPlace, StorePlace, make_lease, open_place
+from gscompleter.jobs.rounds import BatchRows, Rounds, run_in_this_process
+from gscompleter.jobs.shards import parse_shard
 from scenes import camera_at, photographed
 from simulate_batch import Fleet, Replay, replay
 
@@ -317,7 +317,7 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
 
 def test_a_store_gets_the_same_results_and_needs_no_folder_here(manifest, tmp_path):
     """Run the work of a worker in this process."""
-    from gscompleter.commands.batch import JobCompleter
+    from gscompleter.apps.commands.batch import JobCompleter
 
     [job] = [j for j in read_manifest(str(manifest), {}) if j.name == "room-0"]
     room = {**job.options, "folder": f"file://{job.options['folder']}"}

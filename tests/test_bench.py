@@ -8,18 +8,18 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.benchmark.completions import PROCESS, REST
-from gscompleter.benchmark.crowding import multiply_gaussians
-from gscompleter.benchmark.growth import Growth, fit_exponent
-from gscompleter.benchmark.manifest import BenchCase, make_series, read_manifest
-from gscompleter.benchmark.plots import plot_growth
-from gscompleter.benchmark.processes import run_command
-from gscompleter.benchmark.report import Report, build_content, compute_time_ratio, format_report
-from gscompleter.benchmark.rounds import BenchTask, measure_in_rounds
-from gscompleter.benchmark.samples import Sample, SampleSet, Spread
-from gscompleter.benchmark.unfrozen import UnfrozenRenderer
-from gscompleter.benchmark.yardstick import Yardstick
-from gscompleter.commands.bench import map_case_names
+from gscompleter.apps.bench.completions import PROCESS, REST
+from gscompleter.apps.bench.crowding import multiply_gaussians
+from gscompleter.apps.bench.growth import Growth, fit_exponent
+from gscompleter.apps.bench.manifest import BenchCase, make_series, read_manifest
+from gscompleter.apps.bench.plots import plot_growth
+from gscompleter.apps.bench.processes import run_command
+from gscompleter.apps.bench.report import Report, build_content, compute_time_ratio, format_report
+from gscompleter.apps.bench.rounds import BenchTask, measure_in_rounds
+from gscompleter.apps.bench.samples import Sample, SampleSet, Spread
+from gscompleter.apps.bench.unfrozen import UnfrozenRenderer
+from gscompleter.apps.bench.yardstick import Yardstick
+from gscompleter.apps.commands.bench import map_case_names
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError

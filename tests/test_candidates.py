@@ -5,16 +5,16 @@ import torch
 
 from gscompleter import Camera
 from gscompleter.config import NextBestViewConfig
-from gscompleter.geometry import measure_baseline, measure_rotation
-from gscompleter.stages.candidates import (
+from gscompleter.geometry import (
     compute_field_of_view,
     compute_spacing,
     estimate_up,
-    make_moves,
-    propose_candidates,
+    measure_baseline,
+    measure_rotation,
     select_spread_cameras,
     shrink_camera,
 )
+from gscompleter.next_best_view.candidates import make_moves, propose_candidates
 from gscompleter.types import Render
 from scenes import Room, camera_at, cast
 

@@ -20,8 +20,8 @@ from chunk_files import (
     save_dataset,
 )
 from gscompleter import InputError
+from gscompleter.data.cases import SkippedScene, filter_usable, open_clips
 from gscompleter.data.chunks import open_chunks
-from gscompleter.data.datasets import SkippedScene, filter_usable, open_clips
 from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.geometry import project

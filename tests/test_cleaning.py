@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.cleaning import find_removable, find_superfluous, predict_error_change
 from gscompleter.config.cleaning import CleaningConfig
-from gscompleter.io.ply import load_ply
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.guards.psnr import compute_squared_error
 from gscompleter.render import load_renderer
-from gscompleter.stages.cleaning import find_removable, find_superfluous, predict_error_change
-from gscompleter.stages.harm import compute_squared_error
+from gscompleter.splats.ply import load_ply
 from gscompleter.types import View, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 

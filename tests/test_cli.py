@@ -21,9 +21,9 @@ import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
+from gscompleter.apps.commands.renamed import warn_renamed
+from gscompleter.apps.commands.row_options import parse_row
 from gscompleter.cli import parse_command
-from gscompleter.commands.renamed import warn_renamed
-from gscompleter.commands.row_options import parse_row
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import (
     GENERATORS,

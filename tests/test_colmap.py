@@ -16,8 +16,8 @@ from gscompleter import InputError, load_cameras
 from gscompleter.data.colmap.lenses import MODELS, build_intrinsics
 from gscompleter.data.colmap.scene import _list_roots
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.lens import Distortion, distort
-from gscompleter.data.sparse_points import add_depth_range
+from gscompleter.data.points import add_depth_range
+from gscompleter.data.undistort import Distortion, distort
 from gscompleter.io.image import write_image
 from gscompleter.types import Camera, View
 from pose_files import (

@@ -14,25 +14,26 @@ from gscompleter import (
     load_ply,
     load_renderer,
 )
-from gscompleter.completer import STAGES
-from gscompleter.config import PsnrGuardConfig
-from gscompleter.generators import GeneratorOutput
-from gscompleter.geometry import project
-from gscompleter.metrics.image import psnr
-from gscompleter.render.antialiasing import adapt_to_mode
-from gscompleter.render.cpu import CpuRenderer
-from gscompleter.reports.completion import (
+from gscompleter.apps.report.completion import (
     Target,
     render_before_after,
     render_context_views,
     write_report,
 )
-from gscompleter.stages.anchor import lift
-from gscompleter.stages.free_space import respect_free_space
-from gscompleter.stages.harm import is_mostly_faded
-from gscompleter.stages.integration import compute_hole_mask
-from gscompleter.stages.registration import apply_affine
-from gscompleter.types import Camera, Completion, Gaussians, View, merge
+from gscompleter.completer import STAGES
+from gscompleter.config import PsnrGuardConfig
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.generators import GeneratorOutput
+from gscompleter.geometry import project
+from gscompleter.guards.free_space import respect_free_space
+from gscompleter.guards.psnr import is_mostly_faded
+from gscompleter.render.antialiasing import adapt_to_mode
+from gscompleter.render.cpu import CpuRenderer
+from gscompleter.stages.filter_holes import compute_hole_mask
+from gscompleter.stages.select_anchor import lift
+from gscompleter.stages.slide_along_rays import apply_affine
+from gscompleter.state import Completion
+from gscompleter.types import Camera, Gaussians, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, reconstruction_of, scaled, view_of
 

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import TypeCheckError
 
 import gscompleter
-from gscompleter.baselines.optimization import ssim_map
+from gscompleter.evaluation.baselines.optimization import ssim_map
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.geometry import quats_to_rotations
-from gscompleter.metrics.image import psnr
 
 MODULES = [
     module.name

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gscompleter.generators.smooth import build_sum_pyramid
-from gscompleter.kernels.continuation import MIN_LEVEL_WEIGHT, build_pyramid, compute_means
+from gscompleter.kernels.pyramid_fill import MIN_LEVEL_WEIGHT, build_pyramid, compute_means
 
 
 def whole_images(levels):

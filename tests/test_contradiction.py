@@ -9,8 +9,9 @@ from torch import Tensor
 from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig, DynamicMasksConfig
 from gscompleter.geometry import project, sample, unproject
-from gscompleter.stages.contradiction import find_dynamic_masks
-from gscompleter.types import Camera, Completion, Render, TargetResult, View
+from gscompleter.guards.dynamic_masks import find_dynamic_masks
+from gscompleter.state import Completion, TargetResult
+from gscompleter.types import Camera, Render, View
 from scenes import Room, camera_at, cast, texture, view_of
 
 SIZE = 96

@@ -25,8 +25,8 @@ from feed_forward_fixtures import Case, extra
 from gscompleter import GSCompleter, InputError
 from gscompleter.config import CompleterConfig, HoleConfig
 from gscompleter.geometry import axis_angle_to_matrix, project, quats_to_rotations, unproject
-from gscompleter.reconstructors import depth_anything, load_reconstructor
-from gscompleter.reconstructors.depth_anything import (
+from gscompleter.models import depth_anything
+from gscompleter.models.depth_anything import (
     VARIANTS,
     AnyViewDepth,
     AnyViewGaussians,
@@ -40,28 +40,22 @@ from gscompleter.reconstructors.depth_anything import (
     NestedDepthAnything,
     ResizeConfig,
 )
-from gscompleter.reconstructors.depth_anything.alignment import (
-    fit_center_similarity,
-    fit_robust_similarity,
-)
-from gscompleter.reconstructors.depth_anything.config import VitConfig
-from gscompleter.reconstructors.depth_anything.harmonics import rotate_3dgs_sh
-from gscompleter.reconstructors.depth_anything.images import normalize_colors
-from gscompleter.reconstructors.depth_anything.inputs import (
-    Window,
-    create_any_view_batch,
-    crop_to_patches,
-)
-from gscompleter.reconstructors.depth_anything.metric import MetricDepth
-from gscompleter.reconstructors.depth_anything.network import Prediction
-from gscompleter.reconstructors.depth_anything.normalisation import (
+from gscompleter.models.depth_anything.alignment import fit_center_similarity, fit_robust_similarity
+from gscompleter.models.depth_anything.config import VitConfig
+from gscompleter.models.depth_anything.harmonics import rotate_3dgs_sh
+from gscompleter.models.depth_anything.images import normalize_colors
+from gscompleter.models.depth_anything.inputs import Window, create_any_view_batch, crop_to_patches
+from gscompleter.models.depth_anything.metric import MetricDepth
+from gscompleter.models.depth_anything.network import Prediction
+from gscompleter.models.depth_anything.normalisation import (
     compute_authors_units,
     compute_scene_units,
     normalize_poses,
 )
-from gscompleter.reconstructors.depth_anything.poses import Poses, decode_poses, encode_poses
-from gscompleter.reconstructors.depth_anything.reconstructor import move_to_given_frame
-from gscompleter.reconstructors.feed_forward.build import create_depth_anything, wrap_network
+from gscompleter.models.depth_anything.poses import Poses, decode_poses, encode_poses
+from gscompleter.models.depth_anything.reconstructor import move_to_given_frame
+from gscompleter.models.feed_forward.build import create_depth_anything, wrap_network
+from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.from_depth import FromDepth
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.types import View

@@ -10,19 +10,12 @@ import torch
 
 from elsewhere import DEVICE, Elsewhere, MixedError, There, without_autocast
 from gscompleter import GSCompleter, load_reconstructor, load_renderer
-from gscompleter.baselines.optimization import OptimizationConfig, optimize
-from gscompleter.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.config import CompleterConfig
+from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
+from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
+from gscompleter.evaluation.metrics.scores import Truth, score
 from gscompleter.generators.agreement import compare_with_observed
-from gscompleter.generators.diffusion.position_ids import compute_source_ids
-from gscompleter.generators.diffusion.source_depth import (
-    compute_context_depth,
-    convert_disparity,
-    rescale_depth,
-)
-from gscompleter.metrics.scores import Truth, score
-from gscompleter.reconstructors import Reconstructor, iterate_tensors, run_reconstructor
-from gscompleter.reconstructors.depth_anything import (
+from gscompleter.models.depth_anything import (
     AnyViewDepth,
     AnyViewGaussians,
     DepthAnything,
@@ -30,20 +23,27 @@ from gscompleter.reconstructors.depth_anything import (
     Inference,
     ResizeConfig,
 )
-from gscompleter.reconstructors.depth_anything.config import VitConfig
-from gscompleter.reconstructors.feed_forward import (
+from gscompleter.models.depth_anything.config import VitConfig
+from gscompleter.models.diffusion.position_ids import compute_source_ids
+from gscompleter.models.diffusion.source_depth import (
+    compute_context_depth,
+    convert_disparity,
+    rescale_depth,
+)
+from gscompleter.models.feed_forward import (
     DepthSplat,
     FeedForward,
     MVSplat,
     VolSplat,
     VolSplatConfig,
 )
-from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
-from gscompleter.reconstructors.feed_forward.depthsplat import VARIANTS
+from gscompleter.models.feed_forward.depth_predictor import DepthConfig
+from gscompleter.models.feed_forward.depthsplat import VARIANTS
+from gscompleter.reconstructors import Reconstructor, iterate_tensors, run_reconstructor
 from gscompleter.reconstructors.from_depth import FromDepth
-from gscompleter.stages.anchor import lift
 from gscompleter.stages.context import init_context, measure_depth_range
-from gscompleter.stages.integration import filter_holes
+from gscompleter.stages.filter_holes import filter_holes
+from gscompleter.stages.select_anchor import lift
 from gscompleter.types import Lift, Reconstruction, View
 from scenes import Room, camera_at, gaussians_of, view_of
 

@@ -28,12 +28,12 @@ from gscompleter.config.generators import (
     get_settings_class,
 )
 from gscompleter.generators import GeneratorRequest
-from gscompleter.generators.diffusion import pe_field
-from gscompleter.generators.diffusion.inpaint import DiffusersInpaint, complete_warp, load_painter
-from gscompleter.generators.diffusion.kontext import SIZES, find_nearest_size
-from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
-from gscompleter.generators.diffusion.pe_field import PEField, group_by_size
-from gscompleter.generators.diffusion.source_depth import (
+from gscompleter.models.diffusion import pe_field
+from gscompleter.models.diffusion.inpaint import DiffusersInpaint, complete_warp, load_painter
+from gscompleter.models.diffusion.kontext import SIZES, find_nearest_size
+from gscompleter.models.diffusion.loading import PROMPT, load_kontext
+from gscompleter.models.diffusion.pe_field import PEField, group_by_size
+from gscompleter.models.diffusion.source_depth import (
     MonocularDepth,
     compute_context_depth,
     load_monocular,
@@ -159,7 +159,7 @@ def test_pe_field_takes_the_depth_that_the_completer_names(kontext_folder, tmp_p
     """`paper()` names a monocular network, the default the scene."""
     network = load_monocular(str(tiny_model(tmp_path)))
     named = {"context": compute_context_depth, "monocular": network}
-    monkeypatch.setattr(pe_field, "source_depth_named", lambda name, device: named[name])
+    monkeypatch.setattr(pe_field, "load_source_depth", lambda name, device: named[name])
     context = known_room()
     generator = PEField(load_kontext(str(kontext_folder)), steps=1)
 

@@ -4,11 +4,11 @@ import pytest
 
 from command import run
 from gscompleter import InputError, load_generator
-from gscompleter.commands.generator_options import GeneratorOptions
+from gscompleter.apps.commands.generator_options import GeneratorOptions
 from gscompleter.config.generators import PEFieldSettings, get_settings_class
-from gscompleter.generators.diffusion import published
-from gscompleter.generators.diffusion.loading import find_sources
-from gscompleter.generators.diffusion.published import (
+from gscompleter.models.diffusion import published
+from gscompleter.models.diffusion.loading import find_sources
+from gscompleter.models.diffusion.published import (
     KONTEXT,
     PE_FIELD,
     IncompleteWeightsError,

@@ -12,13 +12,13 @@ import torch
 
 from command import run
 from gscompleter import InputError, load_cameras, load_ply, save_ply
+from gscompleter.apps.commands import complete as command
+from gscompleter.apps.commands.evaluate import collect_tasks
+from gscompleter.apps.commands.options import CompleteOptions
+from gscompleter.apps.inputs import opening
+from gscompleter.apps.inputs.opening import Opened, Task, read_task, select_near_and_far
+from gscompleter.apps.inputs.plan import describe_budget
 from gscompleter.cli import parse_command
-from gscompleter.commands import complete as command
-from gscompleter.commands import opening
-from gscompleter.commands.evaluate import collect_tasks
-from gscompleter.commands.opening import Opened, Task, read_task, select_near_and_far
-from gscompleter.commands.options import CompleteOptions
-from gscompleter.commands.understood import describe_budget
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.memory import count_fitting_images, estimate_bytes
@@ -48,7 +48,7 @@ def chosen(scene, tmp_path_factory) -> tuple[Path, list[str]]:
     out = tmp_path_factory.mktemp("runs") / "out"
     with pytest.MonkeyPatch.context() as monkeypatch:
         said: list[str] = []
-        monkeypatch.setattr(command, "say", lambda _console, *lines: said.extend(lines))
+        monkeypatch.setattr(command, "print_lines", lambda _console, *lines: said.extend(lines))
         assert run(monkeypatch, *complete(scene, out, "--resolution", 48, "--far", 20)) == 0
     return out, said
 
@@ -121,7 +121,7 @@ def opened_with(scene: Path, *words: object) -> tuple[CompleteOptions, Task]:
 def test_fewer_photographs_are_chosen_where_there_is_no_memory_for_more(scene, monkeypatch):
     pixels = SIZE * SIZE
     for fit, chosen in ((9, 3), (3, 2), (0, 2)):
-        monkeypatch.setattr(opening, "images_that_fit", lambda _pixels, fit=fit: fit)
+        monkeypatch.setattr(opening, "count_fitting_images", lambda _pixels, fit=fit: fit)
         options, task = opened_with(scene, "--target", TARGET)
         assert len(task.views) == chosen
         said = describe_budget(options, task, "cpu")

@@ -14,18 +14,17 @@ from torch import Tensor
 
 from command import run
 from gscompleter.config import CompleterConfig
-from gscompleter.data.cases import Case
-from gscompleter.data.datasets import open_clips
+from gscompleter.data.cases import Case, open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import write_cameras
+from gscompleter.evaluation.protocols import parse_protocol
+from gscompleter.evaluation.tasks import make_tasks
 from gscompleter.io.image import read_image, write_image
 from gscompleter.io.json_file import read_json
-from gscompleter.matching.features import detect_features
-from gscompleter.matching.stereo_image import make_stereo_images
 from gscompleter.reconstructors import load_reconstructor
-from gscompleter.runs.protocols import parse_protocol
-from gscompleter.runs.tasks import make_tasks
+from gscompleter.reconstructors.features.sift import detect_features
+from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.stages.context import init_context
 from gscompleter.types import SH_C0, Camera
 from scenes import camera_at, open_street

@@ -5,14 +5,14 @@ from pathlib import Path
 import pytest
 
 from gscompleter import load_ply, load_splat
-from gscompleter.commands.words import format_error
+from gscompleter.apps.commands.words import format_error
 from gscompleter.data.chunks import open_chunks
 from gscompleter.data.colmap.binary import read_images
-from gscompleter.data.point_cloud import read_point_cloud
-from gscompleter.data.upright import write_upright
+from gscompleter.data.points import read_point_cloud
+from gscompleter.data.sfm.upright import write_upright
 from gscompleter.errors import InputError, join_names, join_numbers, quote_value, warn_deprecated
 from gscompleter.io.image import read_pixels
-from gscompleter.weights.reading import check_kind
+from gscompleter.models.weights.reading import check_kind
 
 
 def test_a_short_value_is_quoted_as_it_is():

@@ -9,11 +9,11 @@ from command import run
 from gscompleter import GSCompleter
 from gscompleter.data.cases import Case
 from gscompleter.data.scene import write_cameras
+from gscompleter.evaluation.runner import RunConfig, evaluate, prepare_task
+from gscompleter.evaluation.store import get_step_path, get_task_folder, load_prediction
+from gscompleter.evaluation.tasks import make_case_task
 from gscompleter.io.image import write_image
-from gscompleter.io.ply import save_ply
-from gscompleter.runs.runner import RunConfig, evaluate, prepare_task
-from gscompleter.runs.store import get_step_path, get_task_folder, load_prediction
-from gscompleter.runs.tasks import make_case_task
+from gscompleter.splats.ply import save_ply
 from scenes import camera_at, view_of
 from test_contradiction import CAMERAS, ROOM, SIZE, photographed
 

@@ -8,9 +8,9 @@ from torch.nn.functional import normalize
 
 from gscompleter.config import TrustConfig
 from gscompleter.geometry import compute_z_depths
-from gscompleter.kernels.evidence import BLOCK, MIN_ANGLE_WEIGHT
+from gscompleter.kernels.support import BLOCK, MIN_ANGLE_WEIGHT
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.stages.support import FULL_TRUST_FRACTION, compute_trust, gather_observations
+from gscompleter.trust.photometric import FULL_TRUST_FRACTION, compute_trust, gather_observations
 from gscompleter.types import PhotoObservations, View
 from scenes import camera_at, random_gaussians
 

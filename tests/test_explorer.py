@@ -7,21 +7,18 @@ import torch
 
 from gscompleter import CompleterConfig, GSCompleter
 from gscompleter.config import AlignmentConfig, NextBestViewConfig, RegistrationConfig
-from gscompleter.explorer import ViewPlanner, add_free_space_cameras
-from gscompleter.metrics.coverage import (
+from gscompleter.evaluation.metrics.coverage import (
     compute_coverage,
     compute_covered_share,
     render_pairs,
     sample_held_out_cameras,
 )
+from gscompleter.next_best_view.gain import compute_gain, make_placeholders, simplify_completion
+from gscompleter.next_best_view.planner import ViewPlanner, add_free_space_cameras
 from gscompleter.render import load_renderer
-from gscompleter.stages.exploration import (
-    compute_gain,
-    compute_overlap,
-    make_placeholders,
-    simplify_completion,
-)
-from gscompleter.types import Camera, Completion, Gaussians, Render, View
+from gscompleter.stages.select_anchor import compute_overlap
+from gscompleter.state import Completion
+from gscompleter.types import Camera, Gaussians, Render, View
 from scenes import Room, camera_at, cast, gaussians_of, view_of
 from test_completer import KnowingGenerator, KnowingReconstructor, knowing
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gscompleter import GSCompleter, View, load_renderer
-from gscompleter.metrics.image import psnr
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, splatter
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, depth_to_gaussians
 from gscompleter.reconstructors.plane_sweep.exposure import estimate_gains
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.rig import build_rig
@@ -59,7 +59,9 @@ def made():
 def uneven():
     """Reconstruction of the same photographs without exposure correction."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(splatter, "gains_of", lambda layers, _: np.ones((len(layers), 3)))
+        patch.setattr(
+            depth_to_gaussians, "estimate_gains", lambda layers, _: np.ones((len(layers), 3))
+        )
         return PlaneSweep()(photographs())
 
 

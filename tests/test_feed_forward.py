@@ -15,7 +15,7 @@ from torch import Tensor
 from feed_forward_fixtures import STORED, Case, Pass, extra, published_shapes, with_rule_v1
 from gscompleter import GSCompleter, InputError
 from gscompleter.geometry import pad_camera, project, quats_to_rotations
-from gscompleter.reconstructors.feed_forward import (
+from gscompleter.models.feed_forward import (
     VARIANTS,
     DepthSplat,
     DepthSplatConfig,
@@ -23,15 +23,12 @@ from gscompleter.reconstructors.feed_forward import (
     MVSplat,
     MVSplatConfig,
 )
-from gscompleter.reconstructors.feed_forward.cameras import Cameras, find_nearest_views
-from gscompleter.reconstructors.feed_forward.cost_volume import (
-    compute_cost_volume,
-    compute_sampling_grid,
-)
-from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig, sample_candidates
-from gscompleter.reconstructors.feed_forward.gaussian_adapter import place_in_world
-from gscompleter.reconstructors.feed_forward.inputs import Crop, compute_central_crops, create_batch
-from gscompleter.reconstructors.feed_forward.spherical_harmonics import (
+from gscompleter.models.feed_forward.cameras import Cameras, find_nearest_views
+from gscompleter.models.feed_forward.cost_volume import compute_cost_volume, compute_sampling_grid
+from gscompleter.models.feed_forward.depth_predictor import DepthConfig, sample_candidates
+from gscompleter.models.feed_forward.gaussian_adapter import place_in_world
+from gscompleter.models.feed_forward.inputs import Crop, compute_central_crops, create_batch
+from gscompleter.models.feed_forward.spherical_harmonics import (
     compute_wigner_matrices,
     evaluate_harmonics,
 )

@@ -208,8 +208,8 @@ def test_a_linked_folder_stays_a_link(tmp_path):
 
 WRITES = """
 import os, signal, sys, time
-from gscompleter.interrupts import handle_stop_signals
-from gscompleter.io.files import output_folder, replacing
+from gscompleter.io.interrupts import handle_stop_signals
+from gscompleter.io.files import open_output_folder, replace_file
 
 for number in (signal.SIGTERM, signal.SIGHUP):
     signal.signal(number, signal.SIG_DFL)  # nohup and shells in the background ignore some
@@ -278,8 +278,9 @@ def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, number):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, number):
     code = (
-        "import os, shutil, sys\nfrom gscompleter.interrupts import handle_stop_signals\n"
-        "from gscompleter.io import unfinished\nfrom gscompleter.io.files import output_folder\n"
+        "import os, shutil, sys\nfrom gscompleter.io.interrupts import handle_stop_signals\n"
+        "from gscompleter.io import unfinished\nfrom gscompleter.io.files import "
+        "open_output_folder\n"
         "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
         "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\nhandle_stop_signals()\n"
@@ -327,7 +328,7 @@ def test_what_was_killed_between_its_renames_is_finished_by_the_next_run(results
 
 def test_a_file_that_a_killed_process_left_is_removed_by_the_next(tmp_path):
     code = (
-        "import os, signal, sys\nfrom gscompleter.io.files import replacing\n"
+        "import os, signal, sys\nfrom gscompleter.io.files import replace_file\n"
         "with replacing(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "a")], check=False)

@@ -13,12 +13,7 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.errors import InputError
-from gscompleter.geometry import measure_baseline, measure_rotation
-from gscompleter.io.video import check_video_writer, write_video
-from gscompleter.progress import show_progress
-from gscompleter.render import load_renderer
-from gscompleter.reports.film import (
+from gscompleter.apps.report.film import (
     FRAMES_PER_SECOND,
     GAP_PIXELS,
     choose_stops,
@@ -28,9 +23,14 @@ from gscompleter.reports.film import (
     render_frames,
     write_comparison_video,
 )
-from gscompleter.reports.film_path import measure_roll, plan_camera_path
-from gscompleter.stages.candidates import resize_camera
-from gscompleter.types import Camera, Completion, DepthAffine, TargetResult, merge
+from gscompleter.apps.report.film_path import measure_roll, plan_camera_path
+from gscompleter.errors import InputError
+from gscompleter.geometry import measure_baseline, measure_rotation, resize_camera
+from gscompleter.io.video import check_video_writer, write_video
+from gscompleter.progress import show_progress
+from gscompleter.render import load_renderer
+from gscompleter.state import Completion, TargetResult
+from gscompleter.types import Camera, DepthAffine, merge
 from scenes import Room, camera_at, half_a_room_of
 
 UP = torch.tensor([0.0, -1.0, 0.0])

@@ -11,8 +11,7 @@ from PIL import Image
 from chunk_files import SIZE, VIEWS, example, pixels_of, row_of, save_chunk, save_dataset
 from command import run
 from gscompleter import InputError
-from gscompleter.data.cases import read_cases
-from gscompleter.data.datasets import open_clips
+from gscompleter.data.cases import open_clips, read_cases
 from gscompleter.data.formats import FORMATS, open_photographs, refuse_scenes_below
 from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.data.real_estate import read_camera_file
@@ -61,7 +60,7 @@ def test_all_formats_give_the_same_views(tmp_path, resolution):
             assert torch.equal(view.image, true.image)
             assert torch.allclose(view.camera.c2w, true.camera.c2w, atol=1e-6)
             assert torch.allclose(view.camera.K, true.camera.K, atol=1e-4)
-        assert "64 × 64 and not 9 × 9" in (clip.reason_to_skip((9, 9)) or "")
+        assert "64 × 64 and not 9 × 9" in (clip.find_skip_reason((9, 9)) or "")
 
 
 def test_a_folder_of_scenes_or_camera_files_is_opened_in_order(tmp_path):

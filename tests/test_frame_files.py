@@ -9,19 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from command import run
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.origin import choose_scene_origin, shift_to_origin
+from gscompleter.data.local_origin import choose_scene_origin, shift_to_origin
 from gscompleter.errors import InputError
-from gscompleter.frames.beside import InputSplat, find_camera_lists, match_names
-from gscompleter.frames.finding import SplatAlignment
-from gscompleter.frames.fit import ImageFit, SplatFit, score_splat
-from gscompleter.frames.placing import align_splat
-from gscompleter.frames.similarity import make_similarity, transform_pose
-from gscompleter.frames.thinning import thin_gaussians
-from gscompleter.frames.trainers import NERFSTUDIO_WORLDS
-from gscompleter.frames.witnesses import sample_views
-from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.render import load_renderer
-from gscompleter.splats.frames import transform_gaussians
+from gscompleter.render.lod import thin_gaussians
+from gscompleter.splat_alignment.estimate import SplatAlignment
+from gscompleter.splat_alignment.fit import ImageFit, SplatFit, score_splat
+from gscompleter.splat_alignment.placing import align_splat
+from gscompleter.splat_alignment.sample_views import sample_views
+from gscompleter.splat_alignment.sidecars import InputSplat, find_camera_lists, match_names
+from gscompleter.splat_alignment.similarity import make_similarity, transform_pose
+from gscompleter.splat_alignment.trainer_frames import NERFSTUDIO_WORLDS
+from gscompleter.splats.ply import load_ply, save_ply
+from gscompleter.splats.transform import transform_gaussians
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 

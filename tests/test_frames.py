@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.errors import InputError
-from gscompleter.frames.beside import InputSplat
-from gscompleter.frames.finding import AlignmentData, estimate_alignment
-from gscompleter.frames.fit import score_splat
-from gscompleter.frames.placing import align_splat
-from gscompleter.frames.similarity import (
+from gscompleter.render import load_renderer
+from gscompleter.splat_alignment.estimate import AlignmentData, estimate_alignment
+from gscompleter.splat_alignment.fit import score_splat
+from gscompleter.splat_alignment.placing import align_splat
+from gscompleter.splat_alignment.sidecars import InputSplat
+from gscompleter.splat_alignment.similarity import (
     fit_pose_similarity,
     get_pose,
     get_scale,
@@ -23,15 +24,14 @@ from gscompleter.frames.similarity import (
     transform_pose,
     transform_view,
 )
-from gscompleter.frames.trainers import (
+from gscompleter.splat_alignment.trainer_frames import (
     compute_trainer_frames,
     normalize_gsplat_cameras,
     normalize_nerfstudio,
     normalize_opensplat,
 )
-from gscompleter.io.ply import load_ply
-from gscompleter.render import load_renderer
-from gscompleter.splats.frames import transform_gaussians
+from gscompleter.splats.ply import load_ply
+from gscompleter.splats.transform import transform_gaussians
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 

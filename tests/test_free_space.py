@@ -7,8 +7,8 @@ import torch
 
 from gscompleter.config import FreeSpaceConfig
 from gscompleter.geometry import project
-from gscompleter.stages import free_space
-from gscompleter.stages.free_space import find_in_free_space, respect_free_space
+from gscompleter.guards import free_space
+from gscompleter.guards.free_space import find_in_free_space, respect_free_space
 from gscompleter.types import Gaussians, Render, make_observed
 from scenes import camera_at
 

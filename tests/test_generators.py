@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from gscompleter import InputError, load_generator, load_renderer
-from gscompleter.generators.harmonize import match_exposures
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.oracle import Oracle
 from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
 from gscompleter.generators.warp import WarpedImage, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint, fill_background_first, remove_cracks
 from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patches
-from gscompleter.metrics.image import psnr
 from gscompleter.types import Camera, GeneratorInput, Render, View, merge
 from scenes import Room, answer, camera_at, gaussians_of, view_of
 

@@ -137,7 +137,9 @@ def test_every_reconstructor_completes_a_room_and_one_that_fails_is_a_row(monkey
     rows = list(gpu.measure_completions(SMALL))
     assert [row.what for row in rows if not row.failed] == list(SMALL.models)
     known = gpu.model
-    monkeypatch.setattr(gpu, "model", lambda name, *a: known(name, *a) if "-" in name else 1 / 0)
+    monkeypatch.setattr(
+        gpu, "load_model", lambda name, *a: known(name, *a) if "-" in name else 1 / 0
+    )
     broken = gpu.Bench("cpu", SMALL.sizes, ("none", "plane-sweep"), repetitions=1)
     failed, fine = gpu.measure_completions(broken)
     assert failed.failed
@@ -163,8 +165,8 @@ def test_pe_field_paints_with_any_model_of_its_kind():
     pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
     pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
     import tiny_diffusion
-    from gscompleter.generators.diffusion.kontext import Kontext, Prompt
-    from gscompleter.generators.diffusion.rotary import enable_per_head_positions
+    from gscompleter.models.diffusion.kontext import Kontext, Prompt
+    from gscompleter.models.diffusion.rotary import enable_per_head_positions
 
     def tiny(device: str) -> Kontext:
         pipeline = tiny_diffusion.kontext_pipeline()

@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from gscompleter.config import PsnrGuardConfig
-from gscompleter.metrics.image import psnr, ssim
-from gscompleter.render import fix_harmonics, load_renderer
-from gscompleter.stages import harm
-from gscompleter.stages.harm import (
+from gscompleter.evaluation.metrics.image import psnr, ssim
+from gscompleter.guards import psnr as guard
+from gscompleter.guards.psnr import (
     add_psnr_loss,
     compute_pixel_errors,
     compute_squared_error,
@@ -18,6 +17,7 @@ from gscompleter.stages.harm import (
     select_fewest,
     set_error_budgets,
 )
+from gscompleter.render import fix_harmonics, load_renderer
 from gscompleter.types import ErrorBudget, View, merge
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
 
@@ -51,8 +51,8 @@ def test_no_photograph_is_matched_worse_than_allowed(halvings, removals, monkeyp
     assert compute_squared_error(frozen.composite(harmful).image, view.image).item() > 10 * before
 
     allowed = add_psnr_loss(before, 0.05)
-    monkeypatch.setattr(harm, "HALVINGS", halvings)
-    monkeypatch.setattr(harm, "REMOVALS", removals)
+    monkeypatch.setattr(guard, "NUM_HALVINGS", halvings)
+    monkeypatch.setattr(guard, "NUM_REMOVALS", removals)
     mended = meet_error_budgets(harmful, [frozen], [[mse(view, allowed)]], MENDED)
     assert compute_squared_error(frozen.composite(mended).image, view.image).item() <= allowed
     assert len(mended) == len(harmful)
@@ -70,10 +70,10 @@ def test_what_has_to_go_for_the_most_part_goes_altogether_and_soon(monkeypatch):
         trials.append(is_mostly_faded(*arguments))
         return trials[-1]
 
-    monkeypatch.setattr(harm, "is_undone", counted)
+    monkeypatch.setattr(guard, "is_mostly_faded", counted)
     assert len(meet_error_budgets(harmful, [frozen], [[mse(view, allowed)]])) == 0
     assert trials == [*[False] * (len(trials) - 1), True]
-    assert len(trials) < harm.NUM_HALVINGS
+    assert len(trials) < psnr.NUM_HALVINGS
 
 
 def test_drawings_that_are_known_already_are_asked_instead():
@@ -105,7 +105,7 @@ def test_where_halving_does_not_help_only_the_worst_pixels_are_given_up(monkeypa
     allowed = add_psnr_loss(
         compute_squared_error(frozen.composite(added).image, view.image).item(), 0.05
     )
-    monkeypatch.setattr(harm, "HALVINGS", 0)
+    monkeypatch.setattr(guard, "NUM_HALVINGS", 0)
     mended = meet_error_budgets(merge([added, wrong]), [frozen], [[mse(view, allowed)]])
     assert compute_squared_error(frozen.composite(mended).image, view.image).item() <= allowed
     assert mended.opacities[: len(added)].mean() > 0.9 * added.opacities.mean()

@@ -15,9 +15,9 @@ import torch
 from gscompleter import InputError, load_ply, save_ply
 from gscompleter.io.image import MAX_PIXELS, decode_pixels, read_depth, read_image, read_image_size
 from gscompleter.io.json_file import read_json
-from gscompleter.weights.fitting import load_strictly
-from gscompleter.weights.published import PUBLISHED
-from gscompleter.weights.reading import check_kind, extract_network_tensors
+from gscompleter.models.weights.fitting import load_strictly
+from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.models.weights.reading import check_kind, extract_network_tensors
 from scenes import random_gaussians
 
 

@@ -17,8 +17,8 @@ import torch
 from chunk_files import example, save_chunk
 from driving_files import infos, write_drive, write_infos, write_swept_dgp
 from gscompleter import InputError
+from gscompleter.data.driving.restricted_pickle import load_plain
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.restricted_pickle import load_plain
 from gscompleter.errors import MAX_MESSAGE_LENGTH
 from pose_files import WRITERS, write_photographs
 

@@ -7,18 +7,18 @@ import torch
 
 from gscompleter import InputError
 from gscompleter.config import RefineConfig
+from gscompleter.data.driving.moving_objects import Box, build_upright_pose, mask_moving
+from gscompleter.data.driving.sparse_depth import compute_sparse_depth
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.moving_objects import Box, build_upright_pose, mask_moving
 from gscompleter.data.photographs import apply_masks
-from gscompleter.data.sparse_depth import compute_sparse_depth
+from gscompleter.evaluation.metrics.scores import Truth, score
 from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import unproject
+from gscompleter.guards.psnr import compute_squared_error, meet_error_budgets
 from gscompleter.io.image import write_image
-from gscompleter.metrics.scores import Truth, score
 from gscompleter.render import load_renderer
 from gscompleter.stages.context import init_context
-from gscompleter.stages.harm import compute_squared_error, meet_error_budgets
-from gscompleter.stages.integration import refine_opacities
+from gscompleter.stages.refine import refine_opacities
 from gscompleter.types import ErrorBudget, GeneratorInput, View, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, photographed, reconstruction_of
 from scenes import view_of as photograph_of

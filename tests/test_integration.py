@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from gscompleter.config import HoleConfig, RefineConfig
-from gscompleter.masks import dilate
+from gscompleter.image_ops import dilate
 from gscompleter.render import load_renderer
-from gscompleter.stages.integration import compute_hole_mask, filter_holes, refine_opacities
+from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
+from gscompleter.stages.refine import refine_opacities
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
 

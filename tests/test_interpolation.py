@@ -2,7 +2,7 @@
 
 import torch
 
-from gscompleter.interpolation import fill_smoothly, smooth_masked
+from gscompleter.image_ops import fill_smoothly, smooth_masked
 
 
 def test_known_values_stay_and_a_constant_is_continued():

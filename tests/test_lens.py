@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gscompleter.data.colmap.lenses import MODELS, build_intrinsics
-from gscompleter.data.lens import (
+from gscompleter.data.undistort import (
     Distortion,
     Pinhole,
     compute_undistortion_map,

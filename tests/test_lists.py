@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from gscompleter.kernels import lists
+from gscompleter.kernels import tiles
 from gscompleter.kernels.rasterizer import DEPTH, NUM_SPLAT_COLUMNS, TILE
-from gscompleter.render.cpu import CpuRenderer, Splats, Viewpoint, make_pinhole, order_by_use
+from gscompleter.render.cpu import CpuRenderer, make_pinhole
+from gscompleter.render.viewpoint import Splats, Viewpoint, order_by_use
 from scenes import camera_at, random_gaussians
 
 RANDOM = np.random.default_rng(0)
@@ -51,7 +52,7 @@ def test_a_list_has_what_touches_its_tile_front_to_back(n, threads):
 
 def test_slots_number_the_entries_splat_by_splat():
     entries = RANDOM.integers(0, 50, 300).astype(np.int32)
-    slots, starts = lists.number_slots(entries, 51)
+    slots, starts = tiles.number_slots(entries, 51)
     assert np.array_equal(starts, np.searchsorted(np.sort(entries), np.arange(52)))
     assert np.array_equal(np.argsort(slots), np.argsort(entries, kind="stable"))
 
@@ -74,7 +75,7 @@ def test_gradients_are_summed_by_the_name_of_the_splat():
     gradients, written = RANDOM.random((200, 3), np.float32), RANDOM.random(200) < 0.7
     totals, wanted = np.zeros((30, 3), np.float32), np.zeros((30, 3))
     for begin, end in ((0, 7), (7, 20)):
-        lists.sum_by_gaussian(begin, end, entries, rows, gradients, written, totals)
+        tiles.sum_by_gaussian(begin, end, entries, rows, gradients, written, totals)
     np.add.at(wanted, rows[entries[written]], gradients[written])
     assert np.allclose(totals, wanted, rtol=1e-5)
 

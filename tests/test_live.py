@@ -20,21 +20,21 @@ from scipy.spatial.transform import Rotation
 
 from command import run
 from gscompleter import load_ply, save_ply
+from gscompleter.apps.commands import live
+from gscompleter.apps.commands.options import LiveOptions
+from gscompleter.apps.live.page import Page, PageServices, describe_outcome, run_request
+from gscompleter.apps.live.poses import camera_from_page, camera_to_page, compute_page_unit
+from gscompleter.apps.live.serving import start_server
+from gscompleter.apps.live.session import Session, complete_camera, undo_step
+from gscompleter.apps.live.splat import make_page_splat
 from gscompleter.cli import parse_command
-from gscompleter.commands import live
-from gscompleter.commands.options import LiveOptions
 from gscompleter.completer import STAGES
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
-from gscompleter.frames.similarity import make_similarity
 from gscompleter.geometry import measure_rotation
-from gscompleter.live.page import Page, PageServices, describe_outcome, run_request
-from gscompleter.live.poses import camera_from_page, camera_to_page, compute_page_unit
-from gscompleter.live.serving import start_server
-from gscompleter.live.session import Session, complete_camera, undo_step
-from gscompleter.live.splat import make_page_splat
 from gscompleter.progress import notify_of_stages
-from gscompleter.splats.frames import transform_gaussians
+from gscompleter.splat_alignment.similarity import make_similarity
+from gscompleter.splats.transform import transform_gaussians
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
 

@@ -10,8 +10,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.metrics import lpips as module
-from gscompleter.metrics.lpips import NETWORKS, WeightsNotAvailable, compute_lpips, load_lpips
+from gscompleter.evaluation.metrics import lpips as module
+from gscompleter.evaluation.metrics.lpips import (
+    NETWORKS,
+    WeightsNotAvailable,
+    compute_lpips,
+    load_lpips,
+)
 
 # Written out by hand from the papers: (number in the file, in, out, kernel) of each convolution.
 VGG = [(0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128), (10, 128, 256), (12, 256, 256)]

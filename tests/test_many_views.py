@@ -7,11 +7,15 @@ import pytest
 import torch
 
 from gscompleter import View, load_renderer
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.geometry import project
 from gscompleter.kernels import stereo
-from gscompleter.matching.neighbours import NUM_COMPARED, NUM_SOURCES, find_neighbours
-from gscompleter.matching.stereo_image import make_stereo_images
-from gscompleter.metrics.image import psnr
+from gscompleter.reconstructors.features.neighbours import (
+    NUM_COMPARED,
+    NUM_SOURCES,
+    find_neighbours,
+)
+from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.fusion import (
     Layer,
@@ -78,7 +82,7 @@ def test_a_view_from_the_same_place_tells_no_depth_and_is_not_chosen():
 def test_the_work_grows_with_the_number_of_views_and_not_with_its_square(monkeypatch):
     swept, compared = [], []
     costs = stereo.compute_matching_costs
-    monkeypatch.setattr(stereo, "matching_costs", lambda *a: swept.append(1) or costs(*a))
+    monkeypatch.setattr(stereo, "compute_matching_costs", lambda *a: swept.append(1) or costs(*a))
     for count in (5, 10):
         views = [
             replace(v, camera=replace(v.camera, near=1.0, far=10.0))
@@ -197,7 +201,9 @@ def test_each_view_has_its_turn_as_often_as_the_others():
 def test_large_images_are_matched_at_half_their_size_first(monkeypatch, count, size, expected):
     matched, costs = set(), stereo.compute_matching_costs
     monkeypatch.setattr(
-        stereo, "matching_costs", lambda image, *a: matched.add(len(image)) or costs(image, *a)
+        stereo,
+        "compute_matching_costs",
+        lambda image, *a: matched.add(len(image)) or costs(image, *a),
     )
     depths = PlaneSweep().estimate_depths(row_of_views(count, size=size))
     assert matched == expected

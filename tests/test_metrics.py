@@ -12,10 +12,9 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.masks import dilate
-from gscompleter.metrics.fid import fid
-from gscompleter.metrics.flip import compute_flip_map
-from gscompleter.metrics.geometry import (
+from gscompleter.evaluation.metrics.fid import fid
+from gscompleter.evaluation.metrics.flip import compute_flip_map
+from gscompleter.evaluation.metrics.geometry import (
     Alignment,
     compute_abs_rel,
     compute_cloud_distances,
@@ -23,18 +22,20 @@ from gscompleter.metrics.geometry import (
     measure_alignment,
     measure_primitive_alignment,
 )
-from gscompleter.metrics.haarpsi import haarpsi
-from gscompleter.metrics.image import (
+from gscompleter.evaluation.metrics.haarpsi import haarpsi
+from gscompleter.evaluation.metrics.image import (
     MAX_PSNR,
     compute_gradient_energy_ratio,
     compute_masked_psnr,
     psnr,
     ssim,
 )
-from gscompleter.metrics.scores import Truth, measure_perceptual_quality, score
+from gscompleter.evaluation.metrics.scores import Truth, measure_perceptual_quality, score
+from gscompleter.image_ops import dilate
 from gscompleter.render import load_renderer
-from gscompleter.stages.integration import compute_hole_mask, filter_holes
-from gscompleter.types import Camera, DepthAffine, Gaussians, TargetResult, merge
+from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
+from gscompleter.state import TargetResult
+from gscompleter.types import Camera, DepthAffine, Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 
 

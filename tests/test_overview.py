@@ -5,8 +5,12 @@ from itertools import pairwise
 import torch
 
 from gscompleter import Camera
-from gscompleter.stages.overview import find_medoids, has_partner, select_overview
-from gscompleter.stages.selection import make_points_in_front
+from gscompleter.stages.select_context import (
+    find_medoids,
+    has_partner,
+    make_points_in_front,
+    select_overview,
+)
 from scenes import camera_at
 
 

@@ -14,22 +14,22 @@ import pytest
 import torch
 
 from feed_forward_fixtures import rule_v1
-from gscompleter.generators.diffusion.pe_field import preview
-from gscompleter.generators.diffusion.position_ids import (
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.models.diffusion.pe_field import preview
+from gscompleter.models.diffusion.position_ids import (
     LEVELS,
     compute_source_ids,
     compute_target_ids,
     pack_cells,
     project_to_target,
 )
-from gscompleter.generators.diffusion.published import PE_FIELD_TRANSFORMER
-from gscompleter.generators.diffusion.rotary import (
+from gscompleter.models.diffusion.published import PE_FIELD_TRANSFORMER
+from gscompleter.models.diffusion.rotary import (
     POSITION_OF_HEAD,
     PerHeadRotary,
     enable_per_head_positions,
 )
-from gscompleter.generators.diffusion.splat import splat_forward
-from gscompleter.metrics.image import psnr
+from gscompleter.models.diffusion.splat import splat_forward
 from gscompleter.types import Camera
 from parity import assert_close
 from scenes import Room, view_of

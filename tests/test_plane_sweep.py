@@ -8,14 +8,14 @@ import torch
 from skimage.data import stereo_motorcycle
 
 from gscompleter import InputError, View
-from gscompleter.commands.demo import (
+from gscompleter.apps.commands.demo import (
     BASELINE_M,
     FOCAL_PX,
     PRINCIPAL_POINT_DX_PX,
     get_motorcycle_cameras,
 )
 from gscompleter.geometry import project
-from gscompleter.matching.depth_range import estimate_depth_range, get_depth_range
+from gscompleter.reconstructors.features.depth_range import estimate_depth_range, get_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.types import DepthMap
 from scenes import Room, camera_at, view_of

@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 
 from gscompleter import InputError, load_cameras
-from gscompleter.data.dataparser import read_dataparser_transforms
 from gscompleter.data.formats import FORMATS, open_photographs
+from gscompleter.data.local_origin import read_dataparser_transforms
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.points import MIN_POINTS, add_depth_range, compute_depth_range
 from gscompleter.data.scene import write_cameras
-from gscompleter.data.sparse_points import MIN_POINTS, add_depth_range, compute_depth_range
 from gscompleter.types import Camera
 from pose_files import (
     CAMERAS,

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from command import run
-from gscompleter.data import structure_from_motion
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.match_pairs import (
+from gscompleter.data.sfm import poses
+from gscompleter.data.sfm.match_pairs import (
     compute_similarity,
     is_sequence,
     make_sort_key,
@@ -21,8 +21,8 @@ from gscompleter.data.match_pairs import (
     pair_neighbours,
     pair_similar,
 )
-from gscompleter.data.structure_from_motion import FoundPoses, find_poses, list_photograph_files
-from gscompleter.data.upright import MAX_SIDE, write_upright
+from gscompleter.data.sfm.poses import FoundPoses, find_poses, list_photograph_files
+from gscompleter.data.sfm.upright import MAX_SIDE, write_upright
 from gscompleter.errors import InputError
 from gscompleter.io.image import write_image
 from scenes import Room, camera_at, view_of
@@ -63,7 +63,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> No
     """Replace the process that runs COLMAP by a script."""
     (tmp_path / "stand_in_mapping.py").write_text(script)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(structure_from_motion, "PROCESS", "stand_in_mapping")
+    monkeypatch.setattr(poses, "PROCESS", "stand_in_mapping")
 
 
 def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatch, capsys):
@@ -182,7 +182,7 @@ def test_a_focal_length_that_was_held_is_told(tmp_path, monkeypatch):
 
 def test_lenses_that_no_camera_has_are_told():
     pycolmap = pytest.importorskip("pycolmap")
-    from gscompleter.data.mapping_process import _find_camera_defect
+    from gscompleter.data.sfm.mapping_process import _find_camera_defect
 
     def camera(focal: float, distortion: float) -> object:
         return pycolmap.Camera(
@@ -218,7 +218,7 @@ def test_parts_that_do_not_connect_are_told():
 
 
 def test_a_model_among_placed_photographs_is_no_part():
-    parts = pytest.importorskip("gscompleter.data.mapping_process").parts
+    parts = pytest.importorskip("gscompleter.data.sfm.mapping_process").parts
     large, other, inside = set(range(12)), {20, 21, 22}, {3, 4, 5, 20}
     assert parts([large, inside, other, {7, 23}]) == [12, 3]
     assert parts([{1, 2}]) == [2]
@@ -270,7 +270,7 @@ def test_a_file_that_is_no_image_is_named(tmp_path):
 
 
 def test_a_missing_package_is_told_how_to_install(tmp_path, monkeypatch):
-    monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: None)
+    monkeypatch.setattr(poses, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'gscompleter\[poses\]'"):
         find_poses(blank(tmp_path / "p", 3), tmp_path / "out")
 
@@ -336,7 +336,7 @@ def test_photographs_alone_are_completed_and_their_cameras_kept(tmp_path, monkey
     shutil.rmtree(out)
     out.mkdir()
     (tmp_path / "colmap").rename(out / "colmap")
-    monkeypatch.setattr(structure_from_motion, "PROCESS", "nobody")
+    monkeypatch.setattr(poses, "PROCESS", "nobody")
     assert run(monkeypatch, *words, "--target", 4) == 0  # with the cameras that are there
 
 

@@ -8,11 +8,11 @@ import pytest
 
 from chunk_files import VIEWS, example, save_chunk
 from gscompleter import InputError
+from gscompleter.data.cases import open_clips
 from gscompleter.data.chunks import open_chunks
-from gscompleter.data.datasets import open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import PosedPhotographs
-from gscompleter.runs.protocols import (
+from gscompleter.evaluation.protocols import (
     EvaluationIndex,
     Extrapolation,
     Split,
@@ -22,7 +22,7 @@ from gscompleter.runs.protocols import (
     read_evaluation_index,
     write_evaluation_index,
 )
-from gscompleter.runs.tasks import find_neighbours, make_tasks
+from gscompleter.evaluation.tasks import find_neighbours, make_tasks
 from gscompleter.types import View
 
 

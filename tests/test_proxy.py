@@ -7,18 +7,23 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.benchmark.crowding import multiply_gaussians
+from gscompleter.apps.bench.crowding import multiply_gaussians
 from gscompleter.completer import GSCompleter
 from gscompleter.config import TrustConfig
-from gscompleter.frames.thinning import thin_gaussians
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.memory import BYTES_PER_SPLAT
-from gscompleter.metrics.image import psnr
+from gscompleter.next_best_view.gain import thin_observations
 from gscompleter.render import load_renderer
-from gscompleter.render import proxy as proxies
-from gscompleter.render.proxy import MAX_DEVIATION, MAX_REACH, build_proxy, simplify_scene
-from gscompleter.splats.order import argsort_nearby
-from gscompleter.stages.exploration import thin_observations
-from gscompleter.stages.support import (
+from gscompleter.render import lod as proxies
+from gscompleter.render.lod import (
+    MAX_DEVIATION,
+    MAX_REACH,
+    build_proxy,
+    simplify_scene,
+    thin_gaussians,
+)
+from gscompleter.splats.morton import argsort_nearby
+from gscompleter.trust.photometric import (
     compute_trust,
     compute_trusted_alpha,
     gather_observations,
@@ -182,7 +187,7 @@ def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
     paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
     asked = (VIEWS[::2], TARGET, CROWD, VIEWS[1:2])
     whole = GSCompleter(KnowingReconstructor(), paint)(*asked)
-    monkeypatch.setattr(proxies, "WORTH", 0)
+    monkeypatch.setattr(proxies, "MIN_PROXY_GAUSSIANS", 0)
     found = GSCompleter(KnowingReconstructor(), paint)(*asked)
     assert found.proxy is not None
     assert len(found.rendered_context) < 0.5 * len(CROWD)
@@ -198,7 +203,7 @@ def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
 
 
 def test_a_scene_is_drawn_as_finely_as_the_targets_that_are_known(monkeypatch):
-    monkeypatch.setattr(proxies, "WORTH", 0)
+    monkeypatch.setattr(proxies, "MIN_PROXY_GAUSSIANS", 0)
     completer = GSCompleter(KnowingReconstructor())
     near = replace(TARGET, K=TARGET.K * torch.tensor([[4.0], [4.0], [1.0]]))
     coarse = completer.begin(VIEWS[::2], CROWD)

@@ -8,10 +8,10 @@ import torch
 
 from command import run
 from gscompleter import InputError, load_reconstructor
+from gscompleter.models.feed_forward import FeedForward, MVSplat
+from gscompleter.models.feed_forward.build import build, create_network
+from gscompleter.models.weights import PUBLISHED
 from gscompleter.reconstructors import RECONSTRUCTORS
-from gscompleter.reconstructors.feed_forward import FeedForward, MVSplat
-from gscompleter.reconstructors.feed_forward.build import build, create_network
-from gscompleter.weights import PUBLISHED
 from scenes import Room, camera_at, photographed, view_of
 
 SIZE = 64

@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from gscompleter import InputError, load_splat
-from gscompleter.reading import check_plain, open_file, read_bytes, read_head, read_lines
+from gscompleter.io.reading import check_plain, open_file, read_bytes, read_head, read_lines
 from splat_files import made, plausible
 
 

@@ -11,7 +11,7 @@ from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.reference import ReferenceFrozenScene
 from gscompleter.sky import SKY_DEPTH
-from gscompleter.stages.registration import Objective, apply_affine, move_along_rays, register
+from gscompleter.stages.slide_along_rays import Objective, apply_affine, move_along_rays, register
 from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
@@ -167,7 +167,7 @@ def test_only_candidates_that_reach_what_is_compared_are_drawn(config, monkeypat
     # The paper's colour loss covers the whole target.
     assert 0 < max(drawn) <= (SIZE**2 if config.rgb_weight > 0 else 0.3 * SIZE**2)
     monkeypatch.setattr(
-        Objective, "reached_by", lambda _, candidates, *__: torch.ones(len(candidates)) > 0
+        Objective, "find_reached", lambda _, candidates, *__: torch.ones(len(candidates)) > 0
     )
     every = registered_to_a_corner()
     assert max(drawn) == SIZE**2

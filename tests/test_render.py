@@ -14,7 +14,7 @@ from gscompleter.geometry import compute_z_depths, move_to_depths
 from gscompleter.kernels import rasterizer
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.render.cuda import freeze_with
+from gscompleter.render.gsplat import freeze_with
 from gscompleter.render.reference import ReferenceFrozenScene, ReferenceRenderer
 from gscompleter.types import make_observed, sh_from_rgb
 from parity import assert_close
@@ -238,7 +238,10 @@ def test_an_extended_view_is_the_frozen_view_of_both(renderer, antialiased):
     for ours, truth in (
         (extended.render, frozen.render),
         (extended.composite(last), frozen.composite(last)),
-        (extended.vary_opacities(last)(last.opacities), frozen.vary_opacities(last)(last.opacities)),
+        (
+            extended.vary_opacities(last)(last.opacities),
+            frozen.vary_opacities(last)(last.opacities),
+        ),
         (extended.extend(last).render, frozen.extend(last).render),
     ):
         for name in DRAWN:

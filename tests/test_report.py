@@ -14,36 +14,36 @@ import torch
 from PIL import Image
 
 from command import run
-from gscompleter.config import RegistrationConfig
-from gscompleter.errors import InputError
-from gscompleter.io.image import read_pixels, write_image
-from gscompleter.metrics.coverage import RenderPair
-from gscompleter.reports.camera_figure import project_to_drawing
-from gscompleter.reports.completion_page import render_completion_page
-from gscompleter.reports.depth_picture import (
+from gscompleter.apps.report.camera_figure import project_to_drawing
+from gscompleter.apps.report.completion_page import render_completion_page
+from gscompleter.apps.report.depth_picture import (
     NO_DEPTH_COLOR,
     compute_depth_limits,
     make_palette,
     write_depth_image,
 )
-from gscompleter.reports.evaluation_page import render_evaluation_page
-from gscompleter.reports.figures import (
+from gscompleter.apps.report.evaluation_page import render_evaluation_page
+from gscompleter.apps.report.figures import (
     compute_ticks,
     draw_color_scale,
     draw_time_bars,
     plot_depth_scatter,
     plot_loss,
 )
-from gscompleter.reports.finished import AlignmentRow, TargetRow, read_completion_folder
-from gscompleter.reports.page import encode_data_uri, open_gallery
-from gscompleter.reports.plain_words import (
+from gscompleter.apps.report.finished import AlignmentRow, TargetRow, read_completion_folder
+from gscompleter.apps.report.page import encode_data_uri, open_gallery
+from gscompleter.apps.report.plain_words import (
     describe_motion,
     format_change,
     format_number,
     format_percent,
     list_target_notes,
 )
-from gscompleter.reports.record import MAX_SURROUNDING_VIEWS, select_most_changed
+from gscompleter.apps.report.record import MAX_SURROUNDING_VIEWS, select_most_changed
+from gscompleter.config import RegistrationConfig
+from gscompleter.errors import InputError
+from gscompleter.evaluation.metrics.coverage import RenderPair
+from gscompleter.io.image import read_pixels, write_image
 from gscompleter.types import DepthMap, Render
 
 VOID = {"meta", "img", "input", "link", "br", "hr"}

@@ -18,33 +18,33 @@ import torch
 from chunk_files import as_tensor, example, save_chunk
 from command import run
 from gscompleter import GSCompleter, InputError, memory
-from gscompleter.baselines.reggs import RegGSConfig
 from gscompleter.completer import STAGES
 from gscompleter.data.cases import Case
-from gscompleter.io.image import read_image
-from gscompleter.metrics.image import psnr
-from gscompleter.reports.plots import draw_plots
-from gscompleter.reports.summary import (
-    GEOMETRY,
-    average_gains_by_gap,
-    compute_psnr_gain,
-    summarize_run,
-)
-from gscompleter.reports.tables import write_tables
-from gscompleter.runs import methods as runs_methods
-from gscompleter.runs import runner
-from gscompleter.runs.memory import measure_peak_memory
-from gscompleter.runs.methods import BASELINES, METHODS, check_methods, expand_methods
-from gscompleter.runs.protocols import read_evaluation_index
-from gscompleter.runs.runner import RowCounts, RunConfig, evaluate
-from gscompleter.runs.store import (
+from gscompleter.evaluation import methods as runs_methods
+from gscompleter.evaluation import runner
+from gscompleter.evaluation.baselines.reggs import RegGSConfig
+from gscompleter.evaluation.memory import measure_peak_memory
+from gscompleter.evaluation.methods import BASELINES, METHODS, check_methods, expand_methods
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.evaluation.plots import draw_plots
+from gscompleter.evaluation.protocols import read_evaluation_index
+from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate
+from gscompleter.evaluation.store import (
     get_step_path,
     get_task_folder,
     load_context,
     load_prediction,
     read_json,
 )
-from gscompleter.runs.tasks import Task, make_case_task
+from gscompleter.evaluation.summary import (
+    GEOMETRY,
+    average_gains_by_gap,
+    compute_psnr_gain,
+    summarize_run,
+)
+from gscompleter.evaluation.tables import write_tables
+from gscompleter.evaluation.tasks import Task, make_case_task
+from gscompleter.io.image import read_image
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -207,8 +207,8 @@ LIFE = """
 import os, signal, sys, threading, time
 from pathlib import Path
 from gscompleter.data.cases import read_cases
-from gscompleter.runs.runner import RunConfig, evaluate
-from gscompleter.runs.tasks import task_of
+from gscompleter.evaluation.runner import RunConfig, evaluate
+from gscompleter.evaluation.tasks import make_case_task
 
 cases, out, methods, iterations, *delays = sys.argv[1:]
 
@@ -323,7 +323,7 @@ def test_fid_is_a_number_or_a_reason(finished, monkeypatch):
         calls.append([image.shape for image in images])
         return float(len(calls))
 
-    monkeypatch.setattr("gscompleter.reports.tables.fid", stand_in)
+    monkeypatch.setattr("gscompleter.evaluation.tables.fid", stand_in)
     write_tables(finished, with_fid=True)
     assert calls == [[(SIZE, SIZE, 3)] * 2] * len(METHOD_NAMES)
     assert "| full | 2.00 |" in (finished / "tables.md").read_text()
@@ -550,7 +550,7 @@ def test_full_is_what_the_completer_does_by_itself(tasks):
 
 
 def test_a_task_beyond_the_memory_is_a_row_that_says_so(tasks, tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "memory_bytes", lambda: 10**8)
+    monkeypatch.setattr(memory, "read_memory_bytes", lambda: 10**8)
     assert evaluate(tasks[:1], ("full",), tmp_path / "out", CONFIG) == RowCounts(0, 1, 0)
     (row,) = (tmp_path / "out" / "tasks").glob("*/full.json")
     assert "of memory, and there are 1 GB; choose a smaller" in read_json(row)["error"]

@@ -7,7 +7,7 @@ import torch
 
 from gscompleter import Camera
 from gscompleter.geometry import measure_baseline
-from gscompleter.stages.selection import make_points_in_front, select_context
+from gscompleter.stages.select_context import make_points_in_front, select_context
 from scenes import camera_at
 
 TARGET = camera_at(0.0)

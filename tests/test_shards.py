@@ -10,13 +10,11 @@ from pathlib import Path
 import pytest
 
 from gscompleter import InputError
-from gscompleter.batch.places import FolderPlace
-from gscompleter.commands import evaluate as command
+from gscompleter.apps.commands import evaluate as command
 from gscompleter.config.generators import PEFieldSettings
 from gscompleter.data.cases import read_cases
-from gscompleter.reports.tables import write_tables
-from gscompleter.runs import store
-from gscompleter.runs.runner import (
+from gscompleter.evaluation import store
+from gscompleter.evaluation.runner import (
     RowCounts,
     RunConfig,
     TaskRunner,
@@ -24,8 +22,10 @@ from gscompleter.runs.runner import (
     evaluate,
     make_task_job,
 )
-from gscompleter.runs.store import VERSION, claim, list_row_paths, read_json, write_json
-from gscompleter.runs.tasks import Task, make_case_task
+from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json, write_json
+from gscompleter.evaluation.tables import write_tables
+from gscompleter.evaluation.tasks import Task, make_case_task
+from gscompleter.jobs.places import FolderPlace
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -36,7 +36,7 @@ CLAIM = """
 import json, os, sys
 from pathlib import Path
 from gscompleter.errors import InputError
-from gscompleter.runs.store import claim
+from gscompleter.evaluation.store import claim
 
 out, count, kinds = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 hold, start = os.pipe()
@@ -215,7 +215,7 @@ def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_pat
         if len(written) == 1:
             late.rename(row)
 
-    monkeypatch.setattr(command, "draw", draw)
+    monkeypatch.setattr(command, "try_plots", draw)
     command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert written == [2, 3]
     same_tables(out, finished)
@@ -232,7 +232,7 @@ def test_a_shard_leaves_the_last_tables_to_the_others(finished, tmp_path, monkey
         calls.append(summary)
         list_row_paths(out)[0].touch()
 
-    monkeypatch.setattr(command, "draw", draw)
+    monkeypatch.setattr(command, "try_plots", draw)
     command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert len(calls) == 1
 

@@ -21,11 +21,11 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.apps.commands.doctor import PURPOSES
+from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import COMMANDS, parse_command
-from gscompleter.commands.doctor import PURPOSES
 from gscompleter.config.settings import validate
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.viewer.packages import Libraries
 from scenes import camera_at, photographed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -220,7 +220,9 @@ def scene(tmp_path_factory) -> Path:
 def sandbox(scene, completed_room, tmp_path, monkeypatch) -> Path:
     """A folder with all that the commands name."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gscompleter.viewer.packages.load_libraries", lambda: Libraries({}, {}))
+    monkeypatch.setattr(
+        "gscompleter.apps.viewer.packages.load_libraries", lambda: Libraries({}, {})
+    )
     for name in ("SCENE", "scene"):
         shutil.copytree(scene, name)
     shutil.copytree(completed_room, "OUT")

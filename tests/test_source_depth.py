@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gscompleter import InputError
-from gscompleter.generators.diffusion import source_depth
-from gscompleter.generators.diffusion.source_depth import (
+from gscompleter.models.diffusion import source_depth
+from gscompleter.models.diffusion.source_depth import (
     MonocularDepth,
     compute_context_depth,
     convert_disparity,
@@ -153,7 +153,7 @@ def test_other_networks_of_transformers_are_read_as_what_they_give(tiny, tmp_pat
 
 def test_a_network_of_which_it_is_not_known_what_it_gives_is_refused(tmp_path, monkeypatch):
     folder = str(tiny_model(tmp_path))
-    monkeypatch.setattr(source_depth, "METRIC", {"dpt": False})
+    monkeypatch.setattr(source_depth, "PREDICTS_DEPTH", {"dpt": False})
     with pytest.raises(InputError, match=r"unsupported kind depth_anything; choose one of dpt"):
         load_source_depth(folder)
 

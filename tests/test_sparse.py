@@ -9,7 +9,7 @@ import torch.nn.functional as F
 
 from feed_forward_fixtures import rule_v1
 from gscompleter import InputError
-from gscompleter.reconstructors.feed_forward.sparse import (
+from gscompleter.models.feed_forward.sparse import (
     OFFSETS,
     Grid,
     convolve,
@@ -17,9 +17,9 @@ from gscompleter.reconstructors.feed_forward.sparse import (
     find_neighbours_within,
     unique_rows,
 )
-from gscompleter.reconstructors.feed_forward.sparse_unet import SparseUNet
-from gscompleter.reconstructors.feed_forward.volsplat import GaussianHead
-from gscompleter.reconstructors.feed_forward.voxels import voxelize
+from gscompleter.models.feed_forward.sparse_unet import SparseUNet
+from gscompleter.models.feed_forward.volsplat import GaussianHead
+from gscompleter.models.feed_forward.voxels import voxelize
 from parity import assert_close
 from volsplat_fixtures import FIXTURES, with_sparse_rule
 

@@ -26,14 +26,14 @@ from gscompleter import (
     save_ply,
     save_splat,
 )
-from gscompleter.splats.frames import (
+from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.provenance import get_labels_path
+from gscompleter.splats.transform import (
     HALF_TURN_X,
     HALF_TURN_Z,
     rotate_half_turn,
     transform_gaussians,
 )
-from gscompleter.splats.labels import get_labels_path
-from gscompleter.splats.order import sort_along_morton
 from scenes import camera_at, random_gaussians, scaled
 from splat_files import (
     FORMATS_BUT_PLY,

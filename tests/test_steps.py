@@ -13,18 +13,14 @@ import torch
 
 from command import run
 from gscompleter import InputError
-from gscompleter.baselines.reggs import RegGSConfig
 from gscompleter.data.photographs import PosedPhotographs
-from gscompleter.geometry import slide
-from gscompleter.io.image import read_pixels
-from gscompleter.reports.plots import draw_plots
-from gscompleter.reports.summary import SEQUENCE, average_gains_by_gap
-from gscompleter.reports.tables import write_tables
-from gscompleter.runs import methods, steps
-from gscompleter.runs.methods import METHODS
-from gscompleter.runs.protocols import ViewByView, parse_protocol
-from gscompleter.runs.runner import RowCounts, RunConfig, evaluate, prepare_task
-from gscompleter.runs.steps import (
+from gscompleter.evaluation import methods, steps
+from gscompleter.evaluation.baselines.reggs import RegGSConfig
+from gscompleter.evaluation.methods import METHODS
+from gscompleter.evaluation.plots import draw_plots
+from gscompleter.evaluation.protocols import ViewByView, parse_protocol
+from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate, prepare_task
+from gscompleter.evaluation.steps import (
     PreparedTask,
     Progress,
     complete_task,
@@ -32,8 +28,12 @@ from gscompleter.runs.steps import (
     compute_scale_drift,
     get_metric_depth,
 )
-from gscompleter.runs.store import read_json
-from gscompleter.runs.tasks import Task, make_tasks
+from gscompleter.evaluation.store import read_json
+from gscompleter.evaluation.summary import SEQUENCE, average_gains_by_gap
+from gscompleter.evaluation.tables import write_tables
+from gscompleter.evaluation.tasks import Task, make_tasks
+from gscompleter.geometry import slide
+from gscompleter.io.image import read_pixels
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from gscompleter.kernels import stereo, variation
-from gscompleter.kernels.sharing import run
-from gscompleter.matching.features import detect_features, match_features
-from gscompleter.matching.stereo_image import (
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.kernels import stereo, tgv
+from gscompleter.kernels.parallel import run
+from gscompleter.reconstructors.features.sift import detect_features, match_features
+from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
     compute_source_from_reference,
     make_stereo_images,
 )
-from gscompleter.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.appearance import (
     OPACITY_STEPS,
@@ -193,13 +193,13 @@ def test_without_any_measurement_nothing_is_made_up():
 
 
 @pytest.mark.parametrize(
-    "iterations", [1, variation.ITERATIONS_PER_PASS, 2 * variation.ITERATIONS_PER_PASS + 3]
+    "iterations", [1, tgv.ITERATIONS_PER_PASS, 2 * tgv.ITERATIONS_PER_PASS + 3]
 )
 @pytest.mark.parametrize("threads", [2, 3])
 def test_bands_of_rows_fit_the_surfaces_of_one(monkeypatch, threads, iterations):
     """To the bit, also at the seams, and with as many bands as threads."""
     rows, random, found, parts = (
-        threads * variation.MIN_BAND_ROWS + 7,
+        threads * tgv.MIN_BAND_ROWS + 7,
         np.random.default_rng(0),
         [],
         [],
@@ -212,14 +212,14 @@ def test_bands_of_rows_fit_the_surfaces_of_one(monkeypatch, threads, iterations)
         parts.append(len(calls))
         return run(kernel, calls, threads)
 
-    monkeypatch.setattr(variation, "run", counted)
+    monkeypatch.setattr(tgv, "run", counted)
     for count in (1, threads):
         heights, gradients = np.zeros(shape, np.float32), np.zeros((2, *shape), np.float32)
-        variation.fit(heights, gradients, *given, threads=count)
+        tgv.fit(heights, gradients, *given, threads=count)
         found.append(np.concatenate([heights[None], gradients]))
     assert np.array_equal(*found)
     assert np.abs(found[0]).max() > 0
-    assert parts == [threads, threads - 1] * -(-iterations // variation.ITERATIONS_PER_PASS)
+    assert parts == [threads, threads - 1] * -(-iterations // tgv.ITERATIONS_PER_PASS)
 
 
 def test_stereo_does_not_depend_on_the_number_of_threads(monkeypatch):
@@ -281,7 +281,7 @@ def test_a_step_on_the_opacities_draws_one_photograph(monkeypatch):
             centers.append(view.viewpoint.pinhole.center[0]) or render(opacities)
         )
 
-    monkeypatch.setattr(CpuFrozenScene, "plan", counted)
+    monkeypatch.setattr(CpuFrozenScene, "vary_opacities", counted)
     fit_opacities(merge([gaussians_of(view) for view in views]), views, load_renderer("cpu"))
     assert len(centers) == OPACITY_STEPS
     assert centers[::2] == [views[0].camera.center[0]] * (OPACITY_STEPS // 2)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.apps.report.completion import InputSplatFile, restore_file_order
 from gscompleter.completer import GSCompleter
 from gscompleter.config import (
     AlignmentConfig,
@@ -17,26 +18,26 @@ from gscompleter.config import (
     RegistrationConfig,
     TrustConfig,
 )
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.geometry import is_inside, project
-from gscompleter.io.ply import load_ply, save_ply
+from gscompleter.guards.mvs_hint import apply_stereo, render_stereo
+from gscompleter.guards.prune_occluders import find_unneeded
+from gscompleter.guards.psnr import compute_squared_error
 from gscompleter.memory import estimate_bytes
-from gscompleter.metrics.image import psnr
 from gscompleter.render import load_renderer
 from gscompleter.render.cpu import CpuFrozenScene
-from gscompleter.render.proxy import MIN_PROXY_GAUSSIANS
-from gscompleter.reports.completion import InputSplatFile, restore_file_order
-from gscompleter.splats.order import argsort_nearby
-from gscompleter.stages.harm import compute_squared_error
-from gscompleter.stages.reconciliation import PhotoSchedule, compute_hole_error, refine_appearance
-from gscompleter.stages.setting_aside import find_unneeded
-from gscompleter.stages.stereo import apply_stereo, render_stereo
-from gscompleter.stages.support import (
+from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
+from gscompleter.splats.morton import argsort_nearby
+from gscompleter.splats.ply import load_ply, save_ply
+from gscompleter.stages.fit_to_photos import PhotoSchedule, compute_hole_error, refine_appearance
+from gscompleter.state import Completion
+from gscompleter.trust.photometric import (
     compute_trust,
     compute_trusted_alpha,
     gather_observations,
     sum_weights,
 )
-from gscompleter.types import Completion, ErrorBudget, GeneratorInput, merge, sh_from_rgb
+from gscompleter.types import ErrorBudget, GeneratorInput, merge, sh_from_rgb
 from scenes import (
     Room,
     camera_at,
@@ -191,7 +192,7 @@ def test_what_is_added_is_drawn_only_where_it_counts(monkeypatch):
         asked.append((self, where))
         return plan(self, new, where)
 
-    monkeypatch.setattr(CpuFrozenScene, "plan_appearance", noted)
+    monkeypatch.setattr(CpuFrozenScene, "vary_appearance", noted)
     half = SURFACES[SURFACES.means[:, 0] < 0.3]
     completion = knowing()(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
     *at_photographs, (at_target, holes) = asked
@@ -293,7 +294,7 @@ def complete(scene, splat, out, *more):
 @pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
 def test_the_command_sets_aside_and_strip_puts_back(tmp_path, monkeypatch, worth):
     """Restored to the byte, whether or not the scene was sorted in between."""
-    monkeypatch.setattr("gscompleter.commands.complete.WORTH", worth)
+    monkeypatch.setattr("gscompleter.apps.commands.complete.WORTH", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = tmp_path / "splat.ply", tmp_path / "out"
     save_ply(splat, SCENE)
@@ -347,7 +348,7 @@ def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, ca
 
 @pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
 def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch, worth):
-    monkeypatch.setattr("gscompleter.commands.complete.WORTH", worth)
+    monkeypatch.setattr("gscompleter.apps.commands.complete.WORTH", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *complete(scene, splat, out)) == 0

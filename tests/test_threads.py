@@ -10,8 +10,8 @@ import numba
 import pytest
 import torch
 
-from gscompleter import threads
-from gscompleter.kernels.sharing import (
+from gscompleter import cpu_threads
+from gscompleter.kernels.parallel import (
     get_thread_pool,
     map_small_tasks,
     run,
@@ -22,7 +22,7 @@ from scenes import camera_at, photographed
 
 COUNTS = """
 import sys
-from gscompleter.threads import bound_threads
+from gscompleter.cpu_threads import limit_threads
 bound_threads(int(sys.argv[1]) if sys.argv[1:] else None)
 import cv2, numba, torch
 print(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS, cv2.getNumThreads())
@@ -31,7 +31,9 @@ print(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS, cv2.getNumThreads
 
 def counted(*arguments: str, **told: str) -> list[int]:
     """Count the threads of torch, numba and OpenCV in a process with only these variables."""
-    environment = {k: v for k, v in os.environ.items() if k not in threads.THREAD_VARIABLES} | told
+    environment = {
+        k: v for k, v in os.environ.items() if k not in cpu_threads.THREAD_VARIABLES
+    } | told
     command = [sys.executable, "-c", COUNTS, *arguments]
     life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return [int(word) for word in life.stdout.split()]
@@ -43,7 +45,7 @@ def test_every_library_takes_as_many_as_it_is_told():
 
 
 def test_what_the_environment_says_gives_way_to_what_is_told_and_to_nothing_else():
-    cores = threads.count_available_cores()
+    cores = cpu_threads.count_available_cores()
     assert counted() == [cores, cores, cores]
     assert counted(OPENCV_FOR_THREADS_NUM="3") == [cores, cores, 3]
     assert counted("1", OPENCV_FOR_THREADS_NUM="3") == [1, 1, 1]
@@ -55,13 +57,13 @@ def test_what_the_environment_says_gives_way_to_what_is_told_and_to_nothing_else
 def test_a_container_is_granted_a_share_of_the_cores(tmp_path, said, cores):
     quota = tmp_path / "cpu.max"
     quota.write_text(said)
-    assert threads.read_quota(quota) == cores
-    assert threads.read_quota(tmp_path / "missing") == float("inf")
+    assert cpu_threads.read_quota(quota) == cores
+    assert cpu_threads.read_quota(tmp_path / "missing") == float("inf")
 
 
 def test_torch_has_its_threads_back_after_it_had_one():
     before = torch.get_num_threads()
-    with pytest.raises(KeyError), threads.use_one_torch_thread():
+    with pytest.raises(KeyError), cpu_threads.use_one_torch_thread():
         assert torch.get_num_threads() == 1
         raise KeyError
     assert torch.get_num_threads() == before
@@ -70,8 +72,8 @@ def test_torch_has_its_threads_back_after_it_had_one():
 def test_a_share_of_a_core_is_one_thread(tmp_path, monkeypatch):
     quota = tmp_path / "cpu.max"
     quota.write_text("20000 100000")
-    monkeypatch.setattr(threads, "QUOTA", quota)
-    assert threads.count_available_cores() == 1
+    monkeypatch.setattr(cpu_threads, "QUOTA_FILE", quota)
+    assert cpu_threads.count_available_cores() == 1
 
 
 def test_the_bytes_of_a_completion_do_not_depend_on_the_threads(tmp_path):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from command import run
 from gscompleter import GSCompleter
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.gaussians import compute_normals
 from scenes import Room, camera_at, gaussians_of, photographed, scaled, view_of

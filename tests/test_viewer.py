@@ -19,20 +19,14 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.data.scene import write_cameras
-from gscompleter.errors import InputError
-from gscompleter.io.image import write_image
-from gscompleter.io.ply import save_ply
-from gscompleter.splats.formats import load_splat
-from gscompleter.types import Gaussians, merge
-from gscompleter.viewer import page as pages
-from gscompleter.viewer.exhibit import (
+from gscompleter.apps.viewer import page as pages
+from gscompleter.apps.viewer.exhibit import (
     ViewerCamera,
     ViewerContent,
     load_viewer_completion,
     load_viewer_files,
 )
-from gscompleter.viewer.packages import (
+from gscompleter.apps.viewer.packages import (
     MODULES,
     REGISTRY_VARIABLE,
     Libraries,
@@ -44,8 +38,14 @@ from gscompleter.viewer.packages import (
     read_lock,
     write_libraries,
 )
-from gscompleter.viewer.page import Page, make_page
-from gscompleter.viewer.server import make_page_server
+from gscompleter.apps.viewer.page import Page, make_page
+from gscompleter.apps.viewer.server import make_page_server
+from gscompleter.data.scene import write_cameras
+from gscompleter.errors import InputError
+from gscompleter.io.image import write_image
+from gscompleter.splats.formats import load_splat
+from gscompleter.splats.ply import save_ply
+from gscompleter.types import Gaussians, merge
 from pose_files import CAMERAS, NAMES, write_colmap_binary, write_photographs
 from scenes import camera_at
 from viewer_pages import LEFT, SIDE, TARGET, room_exhibit, room_from
@@ -392,7 +392,7 @@ def test_a_folder_that_is_no_completion_is_refused(tmp_path):
 @pytest.fixture
 def packed(monkeypatch) -> None:
     """Let the command find its libraries."""
-    monkeypatch.setattr("gscompleter.viewer.packages.load_libraries", lambda: NONE)
+    monkeypatch.setattr("gscompleter.apps.viewer.packages.load_libraries", lambda: NONE)
 
 
 def test_a_page_is_saved_once(packed, tmp_path, monkeypatch, capsys):

@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from browsing import Picture, Tab, launched, needed
+from gscompleter.apps.viewer import page as pages
+from gscompleter.apps.viewer.exhibit import ViewerContent
+from gscompleter.apps.viewer.packages import Libraries, load_libraries
+from gscompleter.apps.viewer.page import make_page
 from gscompleter.errors import InputError
 from gscompleter.render import load_renderer
 from gscompleter.types import Camera, Gaussians
-from gscompleter.viewer import page as pages
-from gscompleter.viewer.exhibit import ViewerContent
-from gscompleter.viewer.packages import Libraries, load_libraries
-from gscompleter.viewer.page import make_page
 from viewer_pages import LEFT, SIDE, TARGET, room_exhibit
 
 pytestmark = pytest.mark.browser

@@ -10,11 +10,11 @@ import torch
 from feed_forward_fixtures import Case, extra, published_shapes
 from gscompleter import GSCompleter, InputError
 from gscompleter.geometry import is_inside, project
-from gscompleter.reconstructors.feed_forward import FeedForward, VolSplat, VolSplatConfig
-from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
-from gscompleter.reconstructors.feed_forward.inputs import create_batch
-from gscompleter.reconstructors.feed_forward.volsplat import MAX_VOXEL_OFFSET, VoxelGaussians
-from gscompleter.stages.anchor import lift
+from gscompleter.models.feed_forward import FeedForward, VolSplat, VolSplatConfig
+from gscompleter.models.feed_forward.depth_predictor import DepthConfig
+from gscompleter.models.feed_forward.inputs import create_batch
+from gscompleter.models.feed_forward.volsplat import MAX_VOXEL_OFFSET, VoxelGaussians
+from gscompleter.stages.select_anchor import lift
 from gscompleter.types import SH_C0, View
 from parity import assert_within
 from scenes import Room, camera_at, view_of

@@ -13,11 +13,11 @@ from PIL import Image
 
 from command import run
 from gscompleter import InputError
-from gscompleter.data.datasets import open_clips
+from gscompleter.data.cases import open_clips
+from gscompleter.data.driving.range_image import build_poses
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.range_image import build_poses
-from gscompleter.runs.store import list_row_paths, read_json
+from gscompleter.evaluation.store import list_row_paths, read_json
 from kitti_city_segment import kitti_city_segment
 from waymo_segment import (
     SEGMENT,

@@ -27,9 +27,7 @@ from torch import Tensor, nn
 from gscompleter import reconstructors
 from gscompleter.cli import main
 from gscompleter.errors import InputError
-from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.weights import (
+from gscompleter.models.weights import (
     PUBLISHED,
     PublishedWeights,
     WeightsNotAvailable,
@@ -39,6 +37,8 @@ from gscompleter.weights import (
     place_of,
     read_state_dict,
 )
+from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
+from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.types import Camera, Gaussians, merge
-from gscompleter.viewer.exhibit import ViewerCamera, ViewerContent
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIDE = 64

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from feed_forward_fixtures import EVERY, STORED, Case, rule_v1
 from gscompleter.geometry import quats_to_rotations
-from gscompleter.reconstructors.feed_forward.volsplat import VoxelGaussians
+from gscompleter.models.feed_forward.volsplat import VoxelGaussians
 from parity import relative_error
 
 FIXTURES = STORED / "volsplat"

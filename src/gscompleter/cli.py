@@ -15,10 +15,10 @@ from typing import Annotated, Any, TextIO, Union
 import tyro
 
 from gscompleter import __version__
-from gscompleter.commands.batch import BatchOptions
-from gscompleter.commands.convert import ConvertOptions
-from gscompleter.commands.doctor import DoctorOptions
-from gscompleter.commands.options import (
+from gscompleter.apps.commands.batch import BatchOptions
+from gscompleter.apps.commands.convert import ConvertOptions
+from gscompleter.apps.commands.doctor import DoctorOptions
+from gscompleter.apps.commands.options import (
     BenchOptions,
     CleanOptions,
     CompleteOptions,
@@ -31,39 +31,39 @@ from gscompleter.commands.options import (
     RunOptions,
     TablesOptions,
 )
-from gscompleter.commands.poses import PosesOptions
-from gscompleter.commands.report import ReportOptions
-from gscompleter.commands.strip import StripOptions
-from gscompleter.commands.view import ViewOptions
-from gscompleter.commands.warmup import WarmupOptions
-from gscompleter.commands.words import format_error, parse_words
-from gscompleter.compilation import begin_compilation
+from gscompleter.apps.commands.poses import PosesOptions
+from gscompleter.apps.commands.report import ReportOptions
+from gscompleter.apps.commands.strip import StripOptions
+from gscompleter.apps.commands.view import ViewOptions
+from gscompleter.apps.commands.warmup import WarmupOptions
+from gscompleter.apps.commands.words import format_error, parse_words
+from gscompleter.apps.warmup.compilation import begin_compilation
+from gscompleter.apps.warmup.garbage import freeze_objects
 from gscompleter.config.settings import validate
+from gscompleter.cpu_threads import limit_threads
 from gscompleter.errors import PROGRAM, InputError
-from gscompleter.garbage import freeze_objects
-from gscompleter.interrupts import handle_stop_signals
-from gscompleter.threads import limit_threads
+from gscompleter.io.interrupts import handle_stop_signals
 
 # Options, module and function of each command. The module is imported after the options are
 # validated, so that `--help` does not wait for torch.
 COMMANDS: dict[str, tuple[type, str, str]] = {
-    "complete": (CompleteOptions, "gscompleter.commands.complete", "run_completion"),
-    "batch": (BatchOptions, "gscompleter.commands.batch", "run_batch"),
-    "live": (LiveOptions, "gscompleter.commands.live", "run_live"),
-    "clean": (CleanOptions, "gscompleter.commands.clean", "run_clean"),
-    "demo": (DemoOptions, "gscompleter.commands.demo", "run_demo"),
-    "evaluate": (EvaluateOptions, "gscompleter.commands.evaluate", "run_evaluation"),
-    "tables": (TablesOptions, "gscompleter.commands.evaluate", "run_tables"),
-    "index": (IndexOptions, "gscompleter.commands.evaluate", "run_index"),
-    "bench": (BenchOptions, "gscompleter.commands.bench", "run_bench"),
-    "models": (ModelsOptions, "gscompleter.commands.models", "run_models"),
-    "convert": (ConvertOptions, "gscompleter.commands.convert", "run_convert"),
-    "poses": (PosesOptions, "gscompleter.commands.poses", "run_poses"),
-    "report": (ReportOptions, "gscompleter.commands.report", "run_report"),
-    "strip": (StripOptions, "gscompleter.commands.strip", "run_strip"),
-    "view": (ViewOptions, "gscompleter.commands.view", "run_view"),
-    "doctor": (DoctorOptions, "gscompleter.commands.doctor", "run_doctor"),
-    "warmup": (WarmupOptions, "gscompleter.commands.warmup", "run_warmup"),
+    "complete": (CompleteOptions, "gscompleter.apps.commands.complete", "run_completion"),
+    "batch": (BatchOptions, "gscompleter.apps.commands.batch", "run_batch"),
+    "live": (LiveOptions, "gscompleter.apps.commands.live", "run_live"),
+    "clean": (CleanOptions, "gscompleter.apps.commands.clean", "run_clean"),
+    "demo": (DemoOptions, "gscompleter.apps.commands.demo", "run_demo"),
+    "evaluate": (EvaluateOptions, "gscompleter.apps.commands.evaluate", "run_evaluation"),
+    "tables": (TablesOptions, "gscompleter.apps.commands.evaluate", "run_tables"),
+    "index": (IndexOptions, "gscompleter.apps.commands.evaluate", "run_index"),
+    "bench": (BenchOptions, "gscompleter.apps.commands.bench", "run_bench"),
+    "models": (ModelsOptions, "gscompleter.apps.commands.models", "run_models"),
+    "convert": (ConvertOptions, "gscompleter.apps.commands.convert", "run_convert"),
+    "poses": (PosesOptions, "gscompleter.apps.commands.poses", "run_poses"),
+    "report": (ReportOptions, "gscompleter.apps.commands.report", "run_report"),
+    "strip": (StripOptions, "gscompleter.apps.commands.strip", "run_strip"),
+    "view": (ViewOptions, "gscompleter.apps.commands.view", "run_view"),
+    "doctor": (DoctorOptions, "gscompleter.apps.commands.doctor", "run_doctor"),
+    "warmup": (WarmupOptions, "gscompleter.apps.commands.warmup", "run_warmup"),
 }
 
 Command: Any = Union[  # noqa: UP007  (of as many as there are)

@@ -15,7 +15,6 @@ from torch import Tensor
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
 from gscompleter.errors import InputError
-from gscompleter.frames.thinning import thin_gaussians
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import (
     is_same_camera,
@@ -24,9 +23,15 @@ from gscompleter.geometry import (
     pad_pixels,
     project,
     sample,
+    shrink_camera,
     slide,
 )
-from gscompleter.masks import dilate, is_enclosed
+from gscompleter.guards.dynamic_masks import find_dynamic_masks
+from gscompleter.guards.free_space import respect_free_space
+from gscompleter.guards.mvs_hint import StereoRender, apply_stereo, render_stereo
+from gscompleter.guards.prune_occluders import find_unneeded
+from gscompleter.guards.psnr import meet_error_budgets, set_error_budgets
+from gscompleter.image_ops import dilate, is_enclosed
 from gscompleter.progress import stage, track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import (
@@ -38,17 +43,9 @@ from gscompleter.render import (
     restrict_to_image,
 )
 from gscompleter.render.antialiasing import adapt_to_mode
-from gscompleter.render.proxy import build_proxy
+from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, build_proxy, thin_gaussians
 from gscompleter.sky import mask_out_sky
-from gscompleter.stages.anchor import (
-    AnchorChoice,
-    GeneratedView,
-    lift,
-    select_anchor,
-    synthesize_all,
-)
-from gscompleter.stages.candidates import shrink_camera
-from gscompleter.stages.compared_depths import sample_depth_pairs
+from gscompleter.stages.align_depth import sample_depth_pairs
 from gscompleter.stages.context import (
     check_texture,
     find_depth_range,
@@ -56,17 +53,21 @@ from gscompleter.stages.context import (
     normalize_exposures,
     sort_by_frame,
 )
-from gscompleter.stages.contradiction import find_dynamic_masks
-from gscompleter.stages.exploration import MAX_GAUSSIANS, compute_overlap
-from gscompleter.stages.free_space import respect_free_space
-from gscompleter.stages.harm import meet_error_budgets, set_error_budgets
-from gscompleter.stages.integration import compute_hole_mask, filter_holes, refine_opacities
-from gscompleter.stages.kept_views import SceneRenderer
-from gscompleter.stages.reconciliation import refine_appearance
-from gscompleter.stages.registration import Registration, register
-from gscompleter.stages.setting_aside import find_unneeded
-from gscompleter.stages.stereo import StereoRender, apply_stereo, render_stereo
-from gscompleter.stages.support import (
+from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
+from gscompleter.stages.fit_to_photos import refine_appearance
+from gscompleter.stages.frozen_views import SceneRenderer
+from gscompleter.stages.refine import refine_opacities
+from gscompleter.stages.select_anchor import (
+    AnchorChoice,
+    GeneratedView,
+    compute_overlap,
+    lift,
+    select_anchor,
+    synthesize_all,
+)
+from gscompleter.stages.slide_along_rays import Registration, register
+from gscompleter.state import Completion, InitialContext, TargetResult
+from gscompleter.trust.photometric import (
     compute_front_depth,
     compute_observed_fraction,
     compute_trust,
@@ -76,16 +77,13 @@ from gscompleter.stages.support import (
 )
 from gscompleter.types import (
     Camera,
-    Completion,
     DepthAffine,
     Gaussians,
     GeneratorInput,
-    InitialContext,
     Lift,
     PaddedCamera,
     PhotoObservations,
     Render,
-    TargetResult,
     View,
     merge,
 )
@@ -171,7 +169,9 @@ class GSCompleter:
     @cached_property
     def small_scenes(self) -> SceneRenderer:
         """A simplified version of the current scene, frozen at the cameras of small images."""
-        return SceneRenderer(self.renderer, partial(thin_gaussians, max_gaussians=MAX_GAUSSIANS))
+        return SceneRenderer(
+            self.renderer, partial(thin_gaussians, max_gaussians=MAX_PREVIEW_GAUSSIANS)
+        )
 
     def __call__(
         self,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import normalize, pad
 
 from gscompleter.types import Camera, Gaussians, PaddedCamera
 
@@ -204,3 +205,69 @@ def slerp_rotation(rotation: Float[Tensor, "3 3"], share: float) -> Float[Tensor
 def stack_matrices(*rows: list[Float[Tensor, "*n"]]) -> Float[Tensor, "*n r c"]:
     """Stack entries, given row by row, to matrices."""
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def compute_field_of_view(camera: Camera) -> tuple[float, float]:
+    """Compute the horizontal and vertical field of view in radians."""
+    half = torch.tensor([camera.width, camera.height]) / 2 / camera.K.diagonal()[:2].cpu()
+    wide, high = (2 * torch.atan(half)).tolist()
+    return wide, high
+
+
+def estimate_up(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
+    """Estimate the unit up direction that most images share."""
+    ups = torch.stack([-camera.c2w[:3, 1] for camera in cameras])
+    likeness = (ups @ ups.T).sum(dim=1)
+    return normalize(ups[(ups @ ups[likeness.argmax()]) > 0].mean(dim=0), dim=0)
+
+
+def shrink_camera(camera: Camera, side: int) -> Camera:
+    """Reduce the image of a camera to at most `side` pixels on its longer side."""
+    factor = min(side / max(camera.width, camera.height), 1.0)
+    return resize_camera(
+        camera, *(max(round(factor * n), 1) for n in (camera.width, camera.height))
+    )
+
+
+def resize_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Change the image size of a camera, in pixels."""
+    scale = torch.tensor([width / camera.width, height / camera.height, 1.0]).to(camera.K)
+    return replace(camera, K=scale[:, None] * camera.K, width=width, height=height)
+
+
+def select_spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
+    """Select up to `count` cameras that are far apart (farthest point sampling); return indices."""
+    where = embed_cameras(cameras)
+    chosen = [0]
+    apart = (where - where[0]).norm(dim=1)
+    while len(chosen) < min(count, len(cameras)):
+        chosen.append(int(apart.argmax()))
+        apart = torch.minimum(apart, (where - where[chosen[-1]]).norm(dim=1))
+        apart[chosen] = -1.0
+    return chosen
+
+
+def embed_cameras(cameras: Sequence[Camera]) -> Float[Tensor, "n 6"]:
+    """Embed cameras as centres, relative to their extent, and viewing directions."""
+    centers = torch.stack([camera.center for camera in cameras])
+    extent = (centers - centers.mean(dim=0)).norm(dim=1).max().clamp_min(1e-30)
+    return torch.cat([centers / extent, torch.stack([c.forward for c in cameras])], dim=1)
+
+
+def compute_spacing(cameras: Sequence[Camera]) -> float:
+    """Compute the median distance to the nearest other camera, in scene units."""
+    centers = torch.stack([camera.center for camera in cameras]).double()
+    apart = (centers[:, None] - centers).norm(dim=-1)
+    apart.fill_diagonal_(torch.inf)
+    nearest = apart.amin(dim=1)
+    return nearest.median().item() if len(cameras) > 1 else 0.0
+
+
+def project_mask(
+    mask: Bool[Tensor, "h w"], gaussians: Gaussians, camera: Camera
+) -> Bool[Tensor, "n"]:
+    """Find Gaussians whose means project into `mask`."""
+    pixels, z = project(gaussians.means, camera)
+    seen = is_inside(pixels, z, camera)
+    x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
+    return seen & mask[y, x]

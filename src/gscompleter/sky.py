@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gscompleter.interpolation import push_pull
-from gscompleter.masks import dilate
+from gscompleter.image_ops import dilate, push_pull
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View, make_observed, sh_from_rgb
 
 SKY_DEPTH = 8.0

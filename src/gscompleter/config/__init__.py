@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
+from gscompleter.config.coverage import COVERED
 from gscompleter.config.renamed import refuse_old_keys
 from gscompleter.config.settings import Count, Settings, Share, Weight, apply_changes
-from gscompleter.coverage import COVERED
 from gscompleter.errors import InputError, quote_value
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]

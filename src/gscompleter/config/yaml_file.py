@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.reading import read_bytes
+from gscompleter.io.reading import read_bytes
 
 MAX_CONFIG_BYTES = 65_536
 """Largest size of a settings file, in bytes."""

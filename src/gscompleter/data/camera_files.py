@@ -13,8 +13,8 @@ from gscompleter.data.colmap.scene import (
     read_scene_cameras,
 )
 from gscompleter.data.frame import Frame
-from gscompleter.data.framing import Resolution
 from gscompleter.data.other_exports import refuse_other_exports
+from gscompleter.data.resize import Resolution
 from gscompleter.data.supersplat import is_supersplat, parse_poses
 from gscompleter.data.transforms import NAME, read_frames
 from gscompleter.io.json_file import read_json

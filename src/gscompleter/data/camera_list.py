@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.cameras import Intrinsics, find_pose_defect, make_rigid
 from gscompleter.data.frame import Frame, capitalize
 from gscompleter.data.image_folders import ImageFinder, keep_existing
-from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.json_numbers import get_array, get_number, get_size, get_text
+from gscompleter.data.json_fields import get_array, get_number, get_size, get_text
 from gscompleter.data.limits import MAX_IN_PIXELS
 from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.data.poses import find_pose_defect, make_rigid
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import is_json_list, read_json
 

@@ -9,14 +9,15 @@ file of cases is JSON: `{"resolution": [h, w], "cases": [{"scene", "context", "t
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from gscompleter.data.formats import open_photographs
-from gscompleter.data.framing import Resolution
-from gscompleter.data.photographs import Photographs, apply_masks
+from gscompleter.data.ego_vehicle import attach_vehicle_detector
+from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
+from gscompleter.data.photographs import Photographs, PosedPhotographs, apply_masks
+from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
 from gscompleter.types import View
@@ -115,3 +116,48 @@ def _check_whole(value: Any) -> int:
     if type(value) is not int:
         raise TypeError(f"{quote_value(value)} is no whole number")
     return value
+
+
+P = TypeVar("P", bound=PosedPhotographs)
+
+
+@dataclass(frozen=True)
+class SkippedScene:
+    """A scene that was left out, and why."""
+
+    name: str
+    reason: str
+
+
+def open_clips(path: Path | str) -> Iterator[Photographs]:
+    """Open the scenes in a file or folder of any format, a folder of such, or a `cases.json`.
+
+    For a vehicle with several cameras only the front camera is used. Scenes are read one at a time,
+    so damage raises an InputError while iterating.
+    """
+    path = Path(path)
+    if has_cases(path):
+        return open_cases(path)
+    inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
+    folders = [child for child in inside if child.is_dir() and find_format(child)]
+    scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]
+    clips = (select_front_camera(clip) for format, place in scenes for clip in format.open(place))
+    return (replace(clip, frames=attach_vehicle_detector(clip.frames)) for clip in clips)
+
+
+def select_front_camera(clip: Photographs) -> Photographs:
+    """Keep the frames of the front camera if a vehicle has several cameras."""
+    if clip.front is None:
+        return clip
+    ahead = tuple(frame for frame in clip.frames if frame.sensor == clip.front)
+    return replace(clip, frames=ahead)
+
+
+def filter_usable(clips: Iterable[P], skipped: list[SkippedScene]) -> Iterator[P]:
+    """Yield the scenes that benchmarks keep, and append the others to `skipped`."""
+    for clip in clips:
+        reason = clip.find_skip_reason()
+        if reason is None:
+            yield clip
+        else:
+            skipped.append(SkippedScene(clip.name, reason))

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 
+from gscompleter.data.cameras import find_pose_defect
 from gscompleter.data.frame import Frame
-from gscompleter.data.lens import Pinhole
-from gscompleter.data.poses import find_pose_defect
+from gscompleter.data.undistort import Pinhole
 from gscompleter.errors import InputError
 
 FEWEST, MOST = 6, 12

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from gscompleter.data.intrinsics import FRACTIONS, Intrinsics, find_pinhole_defect
-from gscompleter.data.lens import Pinhole, undistort_pinhole
+from gscompleter.data.cameras import FRACTIONS, Intrinsics, find_pinhole_defect, find_pose_defect
+from gscompleter.data.driving.moving_objects import Box
 from gscompleter.data.limits import MAX_SIDE
-from gscompleter.data.moving_objects import Box
-from gscompleter.data.poses import find_pose_defect
+from gscompleter.data.undistort import Pinhole, undistort_pinhole
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.image import decode_pixels, read_brightness, read_image_size, read_pixels
 

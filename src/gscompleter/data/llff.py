@@ -17,14 +17,14 @@ from tokenize import TokenError
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import list_image_folders
-from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.limits import DEPTH_RANGE, MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.data.sparse_points import widen_depth_range
+from gscompleter.data.points import widen_depth_range
 from gscompleter.errors import InputError, quote_value
-from gscompleter.reading import check_file
+from gscompleter.io.reading import check_file
 
 NAME = "poses_bounds.npy"
 IMAGES = (".jpg", ".jpeg", ".png")

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.reading import read_head
+from gscompleter.io.reading import read_head
 
 HEAD = 4096
 EXPORT_ADVICE = {

@@ -17,14 +17,13 @@ from jaxtyping import Bool, Float, Shaped
 from PIL import Image
 from torch import Tensor
 
+from gscompleter.data.cameras import compute_fov, find_pose_defect
+from gscompleter.data.driving.moving_objects import mask_moving
+from gscompleter.data.driving.sparse_depth import compute_sparse_depth
 from gscompleter.data.frame import Frame
-from gscompleter.data.framing import Resolution, compute_framing, resize
-from gscompleter.data.intrinsics import compute_fov
-from gscompleter.data.lens import compute_undistortion_map, remap
-from gscompleter.data.moving_objects import mask_moving
-from gscompleter.data.origin import choose_local_origin
-from gscompleter.data.poses import find_pose_defect
-from gscompleter.data.sparse_depth import compute_sparse_depth
+from gscompleter.data.local_origin import choose_local_origin
+from gscompleter.data.resize import Resolution, compute_framing, resize
+from gscompleter.data.undistort import compute_undistortion_map, remap
 from gscompleter.errors import InputError
 from gscompleter.io.image import convert_to_image, read_depth, read_pixels
 from gscompleter.types import Camera, View

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.cameras import FRACTIONS, Intrinsics, invert_viewmat
 from gscompleter.data.frame import Frame
-from gscompleter.data.intrinsics import FRACTIONS, Intrinsics
 from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.data.poses import invert_viewmat
 from gscompleter.errors import InputError
-from gscompleter.reading import read_head, read_lines
+from gscompleter.io.reading import read_head, read_lines
 
 
 def has_camera_files(path: Path) -> bool:

@@ -10,9 +10,9 @@ import numpy as np
 
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.framing import Resolution
 from gscompleter.data.limits import check_planes
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.resize import Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.errors import InputError
 from gscompleter.io.files import replace_file

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame, capitalize
-from gscompleter.data.framing import Resolution
-from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.json_numbers import get_array, get_optional_number
+from gscompleter.data.json_fields import get_array, get_optional_number
+from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
 
 DEFAULT_FOV = 60.0

@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.cameras import Intrinsics, find_pose_defect, make_rigid
 from gscompleter.data.frame import Frame, capitalize
-from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.json_numbers import get_optional_number, get_text
-from gscompleter.data.lens import Distortion
+from gscompleter.data.json_fields import get_optional_number, get_text
 from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.data.point_cloud import read_point_cloud
-from gscompleter.data.poses import find_pose_defect, make_rigid
+from gscompleter.data.points import read_point_cloud
+from gscompleter.data.undistort import Distortion
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import is_json_list, read_json
 

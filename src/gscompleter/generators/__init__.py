@@ -125,11 +125,11 @@ def _make_generator(
 ) -> Generator:
     match settings:
         case PEFieldSettings():
-            from gscompleter.generators.diffusion.pe_field import load_pe_field
+            from gscompleter.models.diffusion.pe_field import load_pe_field
 
             return load_pe_field(seed, device, settings)
         case DiffusersInpaintSettings():
-            from gscompleter.generators.diffusion.inpaint import load_diffusers_inpaint
+            from gscompleter.models.diffusion.inpaint import load_diffusers_inpaint
 
             return FunctionGenerator(load_diffusers_inpaint(seed, device, settings))
         case OracleSettings():

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.generators import GeneratorOutput
-from gscompleter.generators.robust import fit_robust_affine
+from gscompleter.generators.exposure import fit_robust_affine
 from gscompleter.generators.warp import WarpedImage
-from gscompleter.interpolation import smooth_masked
+from gscompleter.image_ops import smooth_masked
 
 BLUR_RADIUS = 2
 """Blur radius in pixels before colours are compared; edges may be a pixel off."""

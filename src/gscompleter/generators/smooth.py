@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.kernels.continuation import build_pyramid, compute_means
+from gscompleter.kernels.pyramid_fill import build_pyramid, compute_means
 
 BLUR_SIGMA = 1.5
 """Standard deviation of the blur of each pyramid level, in its pixels."""

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.coverage import COVERED
-from gscompleter.generators.harmonize import match_exposures
+from gscompleter.config.coverage import COVERED
+from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.geometry import is_inside, measure_baseline, project, sample, unproject
-from gscompleter.masks import dilate
+from gscompleter.image_ops import dilate
 from gscompleter.types import Camera, GeneratorInput, Render, View
 
 DEPTH_TOLERANCE = 0.03

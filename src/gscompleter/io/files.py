@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gscompleter.errors import InputError, OutputError, quote_value
-from gscompleter.interrupts import defer_interrupts
+from gscompleter.io.interrupts import defer_interrupts
 from gscompleter.io.unfinished import (
     UNFINISHED_PREFIX,
     create_file,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.reading import check_plain, read_bytes, read_head
+from gscompleter.io.reading import check_plain, read_bytes, read_head
 
 MAX_BYTES = 1 << 29
 """Longest file, in bytes."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
-from gscompleter.kernels import variation
+from gscompleter.kernels import tgv
 
 
 def is_compiled(part):
@@ -22,7 +22,7 @@ def mark_compiled(part):
 
 def get_cache_folder():
     """Return the folder of numba's cache."""
-    return Path(variation.advance.stats.cache_path)
+    return Path(tgv.advance.stats.cache_path)
 
 
 def _get_marker(part):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from gscompleter.kernels.sharing import share
+from gscompleter.kernels.parallel import share
 
 RADIUS = 3
 """Radius of a patch of 2 * radius + 1 pixels; a compile-time constant for vectorised rows."""
@@ -148,7 +148,7 @@ def search(problem, costs, field, rounds, max_reach, seed):
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _improve(begin, end, problem, costs, number, max_reach, seed, before, field, cost, shift):
     """Run pass `number` over the queries begin..end; `before` is the previous field."""
-    usable, query_at = problem.usable, problem.query_at
+    usable, query_at = problem.usable_mask, problem.query_at
     num_sources, H, W = usable.shape
     h, w = query_at.shape
     patch, weight = np.empty((SIDE, LANES), np.float32), np.empty((SIDE, LANES), np.float32)

@@ -367,7 +367,9 @@ def _sum_weighted_rows(typing, begin, end, place, state, kept, sums):
             for index, total in enumerate(totals, start=1):
                 value = _Lanes(builder, builder.load(total))
                 if index < 4:
-                    value = weight.multiply_add(_Lanes(builder, state.load(loop.index, index)), plus=value)
+                    value = weight.multiply_add(
+                        _Lanes(builder, state.load(loop.index, index)), plus=value
+                    )
                 else:
                     value = value + weight
                 builder.store(value.value, total)
@@ -445,7 +447,9 @@ def _make_revert(wanted):
 
                 if wanted == "colour":
                     for total, gradient in zip(totals, gradients[:3], strict=True):
-                        value = weight.multiply_add(gradient, plus=_Lanes(builder, builder.load(total)))
+                        value = weight.multiply_add(
+                            gradient, plus=_Lanes(builder, builder.load(total))
+                        )
                         builder.store(value.value, total)
                     return
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from gscompleter.kernels.sharing import run, share
+from gscompleter.kernels.parallel import run, share
 
 UNSEEN = 255
 """Cost of a plane at which the pixel falls outside the other image."""

@@ -12,8 +12,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
+from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.types import Reconstruction, View
-from gscompleter.weights.published import PUBLISHED
 
 
 @runtime_checkable
@@ -81,7 +81,7 @@ def _load_plane_sweep(weights: Path | None, device: str) -> Reconstructor:
 
 
 def _load_feed_forward(name: str, weights: Path | None, device: str) -> Reconstructor:
-    from gscompleter.reconstructors.feed_forward.build import build
+    from gscompleter.models.feed_forward.build import build
 
     return build(name, weights, device)
 

@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.matching.stereo_image import (
+from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
     compute_source_from_reference,
     make_stereo_images,
 )
+from gscompleter.reconstructors.plane_sweep.depth_to_gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.fusion import Layer, Transforms
 from gscompleter.reconstructors.plane_sweep.reconstructor import set_depth_range
-from gscompleter.reconstructors.plane_sweep.splatter import Splatter
 from gscompleter.types import DepthMap, Reconstruction, View
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.kernels.sharing import map_small_tasks
+from gscompleter.kernels.parallel import map_small_tasks
 from gscompleter.types import Camera, Gaussians, Render
 
 OpacityRender = Callable[[Float[Tensor, "n"]], Render]
@@ -141,7 +141,7 @@ def load_renderer(name: str) -> Renderer:
 
         return ReferenceRenderer()
     if name == "cuda":
-        from gscompleter.render.cuda import CudaRenderer
+        from gscompleter.render.gsplat import CudaRenderer
 
         return CudaRenderer()
     raise InputError(f"There is no renderer '{quote_value(name)}'; choose reference, cpu or cuda.")

@@ -2,34 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import accumulate, pairwise
 from typing import Any
 
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64, Integer
+from jaxtyping import Bool, Float, Float32, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import max_pool2d
 
 from gscompleter.errors import InputError
-from gscompleter.kernels import lists, rasterizer
+from gscompleter.kernels import rasterizer, tiles
+from gscompleter.kernels.parallel import run, split_range
 from gscompleter.kernels.rasterizer import TILE, GaussianArrays, Layer, Pinhole, RasterFrame
-from gscompleter.kernels.sharing import run, share, split_range
 from gscompleter.render import ColorErrors, ColorSums, DepthRender, OpacityRender
-from gscompleter.render.folded import BakedScene, bake_scene, to_float32
+from gscompleter.render.fragments import BakedScene, bake_scene
+from gscompleter.render.viewpoint import (
+    BinnedSplats,
+    Splats,
+    Viewpoint,
+    assign_splat_slots,
+    compute_starts,
+    gather_splats,
+    order_by_use,
+    to_float32,
+)
 from gscompleter.types import Camera, Gaussians, Render
 
 MAX_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
-
-MAX_ENTRIES = np.iinfo(np.int32).max
-"""Largest total length of the tiles' lists, which kernels number in 32 bits."""
 
 
 MIN_USED_SHARE = 0.9
@@ -53,7 +57,7 @@ class CpuRenderer:
 
     def _freeze_nothing(self, camera: Camera) -> CpuFrozenScene:
         threads = self.threads or numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-        return Viewpoint(make_pinhole(camera), threads).freeze_nothing()
+        return freeze_nothing(Viewpoint(make_pinhole(camera), threads))
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ class CpuFrozenScene:
         count = self.count + len(new)
         if len(added.entries) == 0:
             return replace(self, count=count)
-        frame = self.viewpoint.composite(self, added)
+        frame = self.viewpoint.composite(self.layer, self.frame, added)
         used = np.zeros_like(frame.used)
         used[:, 0] = frame.used.sum(axis=1)
         tile_start = compute_starts(used[:, 0])
@@ -103,7 +107,7 @@ class CpuFrozenScene:
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Backproject `image` by the backward pass on the frozen frame."""
-        nothing, itself = self.viewpoint.freeze_nothing().layer, assign_own_slots(self.layer)
+        nothing, itself = freeze_nothing(self.viewpoint).layer, assign_own_slots(self.layer)
         frame = self.frame._replace(used=np.ascontiguousarray(self.frame.used[:, ::-1]))
         d_frame = (image, torch.zeros_like(image[..., 0]), torch.zeros_like(image[..., 0]))
         composited = (nothing, itself, frame, d_frame, rasterizer.WANT_COLOR)
@@ -112,16 +116,16 @@ class CpuFrozenScene:
         named = (self.layer.entries, self.rows, *gradients, totals)
         pieces = split_range(len(self.rows), self.viewpoint.threads)  # Each reads all entries.
         calls = [(*piece, *named) for piece in pieces]
-        run(lists.sum_by_gaussian, calls, self.viewpoint.threads)
+        run(tiles.sum_by_gaussian, calls, self.viewpoint.threads)
         return torch.from_numpy(totals)
 
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Composite the frozen lists once more, with the values as red."""
         splats = self.layer.splats.copy()
         splats[:, rasterizer.RED] = np.maximum(to_float32(values)[self.rows], 0)
-        frame = self.viewpoint.composite(
-            self.viewpoint.freeze_nothing(), self.layer._replace(splats=splats)
-        )
+        nothing = freeze_nothing(self.viewpoint)
+        layer = self.layer._replace(splats=splats)
+        frame = self.viewpoint.composite(nothing.layer, nothing.frame, layer)
         return torch.from_numpy(frame.image[..., 0].copy())
 
     def composite(self, new: Gaussians) -> Render:
@@ -143,7 +147,7 @@ class CpuFrozenScene:
         arrays = to_opaque_arrays(new)
         limits = np.minimum(self.viewpoint.limit_to_mask(where), self.depth_limits)
         binned = self.viewpoint.bin(arrays, new.is_antialiased, limits)
-        return bake_scene(self, binned, arrays.means, where)
+        return bake_scene(self.viewpoint, self.layer, self.frame, binned, arrays.means, where)
 
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Project, sort and bin `new` once."""
@@ -171,189 +175,6 @@ class CpuFrozenScene:
         return render
 
 
-@dataclass(frozen=True)
-class Splats:
-    """Projected Gaussians, see `Layer`."""
-
-    columns: Float32[ndarray, "n 9"]
-    opacities: Float32[ndarray, "n"]
-    boxes: Integer[ndarray, "n 4"]
-    factors: Float32[ndarray, "n"] | None = None
-    """Factors on the opacities of antialiased Gaussians, or None for classic ones."""
-
-    def move_to_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
-        """Move the splats to other z-depths; those not beyond `near` get empty boxes."""
-        columns = self.columns.copy()
-        columns[:, rasterizer.DEPTH] = depths
-        return replace(self, columns=columns).keep_only(depths > near)
-
-    def keep_only(self, which: Bool[ndarray, "n"]) -> Splats:
-        """Empty the boxes of all other splats."""
-        return replace(self, boxes=self.boxes * which[:, None])
-
-
-@dataclass(frozen=True)
-class BinnedSplats:
-    """Splats in the lists of the tiles, with the slots of their gradients."""
-
-    layer: Layer
-    slots: Int32[ndarray, "entries"]
-    """Slot of the gradient of each entry."""
-    slot_start: Int64[ndarray, "bounds"]
-    """First slot of each Gaussian, and the end [n + 1]."""
-
-
-SplatArrays = tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]
-"""Splats, their opacities and their boxes, see `Layer`."""
-
-EntryGradients = tuple[Float32[ndarray, "entries columns"], Bool[ndarray, "entries"]]
-"""Gradients of the tiles' entries by slot, and True for slots that were written."""
-
-
-@dataclass(frozen=True)
-class Viewpoint:
-    """A camera and its rendering threads; calls the kernels in order."""
-
-    pinhole: Pinhole
-    threads: int
-
-    @property
-    def tiles_x(self) -> int:
-        """Number of tiles in a row."""
-        return -(-self.pinhole.width // TILE)
-
-    @property
-    def tiles(self) -> int:
-        """Number of tiles of the image."""
-        return self.tiles_x * -(-self.pinhole.height // TILE)
-
-    @property
-    def box_dtype(self) -> type[np.signedinteger]:
-        """Smallest type that holds pixel coordinates, to save memory."""
-        fits = max(self.pinhole.width, self.pinhole.height) <= np.iinfo(np.int16).max
-        return np.int16 if fits else np.int32
-
-    def freeze_nothing(self) -> CpuFrozenScene:
-        """Freeze a context without Gaussians."""
-        height, width = self.pinhole.height, self.pinhole.width
-        frame = RasterFrame(
-            image=np.zeros((height, width, 3), np.float32),
-            depth=np.zeros((height, width), np.float32),
-            alpha=np.zeros((height, width), np.float32),
-            transmittance=np.ones((height, width), np.float32),
-            last=np.full((height, width), -1, np.int32),
-            used=np.zeros((self.tiles, 2), np.int32),
-            full=np.zeros(self.tiles, np.bool_),
-        )
-        layer = Layer(
-            np.empty((0, rasterizer.NUM_SPLAT_COLUMNS), np.float32),
-            np.empty(0, np.float32),
-            np.empty((0, 4), self.box_dtype),
-            np.zeros(self.tiles + 1, np.int64),
-            np.empty(0, np.int32),
-        )
-        limits = np.full(self.tiles, np.inf, np.float32)
-        return CpuFrozenScene(self, layer, frame, limits, np.empty(0, np.int32), 0)
-
-    def bin(
-        self,
-        gaussians: GaussianArrays,
-        is_antialiased: bool,
-        depth_limits: Float32[ndarray, "tiles"],
-    ) -> BinnedSplats:
-        """Project, sort and enter Gaussians into the lists of the tiles."""
-        return assign_splat_slots(
-            self.fill_lists(self.project(gaussians, is_antialiased), depth_limits)
-        )
-
-    def project(self, gaussians: GaussianArrays, is_antialiased: bool) -> Splats:
-        """Project Gaussians to splats; invisible ones get empty boxes."""
-        n = check_lengths(gaussians)
-        columns = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
-        boxes = np.empty((n, 4), self.box_dtype)
-        factors = np.zeros(n, np.float32) if is_antialiased else None
-        self.share(rasterizer.project, n, gaussians, self.pinhole, columns, boxes, factors)
-        opacities = gaussians.opacities if factors is None else gaussians.opacities * factors
-        return Splats(columns, opacities, boxes, factors)
-
-    def fill_lists(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Layer:
-        """Enter splats into the lists of the tiles, and sort these."""
-        chunks = split_range(len(splats.columns), self.threads)
-        counts = np.zeros((len(chunks), self.tiles), np.int32)
-        seen = (splats.columns, splats.boxes, depth_limits, self.tiles_x)
-        counting = [(*chunk, *seen, count) for chunk, count in zip(chunks, counts, strict=True)]
-        run(lists.count_entries, counting, self.threads)
-        total = int(counts.sum(dtype=np.int64))
-        if total > MAX_ENTRIES:
-            raise InputError(
-                f"The {len(splats.columns):,} Gaussians cover {total:,} tiles of the image, and at "
-                f"most {MAX_ENTRIES:,} can be rendered; use fewer or smaller Gaussians, or a "
-                "smaller image."
-            )
-        tile_start = lists.counts_to_offsets(counts)
-        entries, keys = np.empty(total, np.int32), np.empty(total, np.uint32)
-        filling = [
-            (*chunk, *seen, places, entries, keys)
-            for chunk, places in zip(chunks, counts, strict=True)
-        ]
-        run(lists.fill_entries, filling, self.threads)
-        self.share(lists.sort_lists, self.tiles, tile_start, entries, keys)
-        return Layer(splats.columns, splats.opacities, splats.boxes, tile_start, entries)
-
-    def composite(self, scene: CpuFrozenScene, new: Layer) -> RasterFrame:
-        """Composite the context of `scene` with a new layer, in the tiles that this touches."""
-        frame = RasterFrame(*(array.copy() for array in scene.frame))
-        tiles = find_touched_tiles(new)
-        self.share(rasterizer.composite, len(tiles), tiles, scene.layer, new, frame)
-        return frame
-
-    def composite_backward(
-        self,
-        context: Layer,
-        new: BinnedSplats,
-        frame: RasterFrame,
-        d_frame: tuple[Tensor, ...],
-        wanted: int = rasterizer.WANT_ALL,
-    ) -> EntryGradients:
-        """Compute the gradients of new entries from those of image, depth and alpha."""
-        columns = {rasterizer.WANT_ALL: rasterizer.NUM_GRADIENT_COLUMNS, rasterizer.WANT_COLOR: 3}
-        values = np.empty((len(new.slots), columns.get(wanted, 1)), np.float32)
-        written = np.zeros(len(new.slots), np.bool_)
-        tiles = find_touched_tiles(new.layer)
-        composited = (tiles, context, new.layer, frame, tuple(map(to_float32, d_frame)))
-        received = (new.slots, wanted, values, written)
-        self.share(rasterizer.composite_backward, len(tiles), *composited, *received)
-        return values, written
-
-    def backproject_residual(
-        self, context: Layer, new: BinnedSplats, photograph: Float32[ndarray, "h w 3"]
-    ) -> Float32[ndarray, "n 4"]:
-        """Backproject the residual of a photograph; the fourth column sums the weights."""
-        values = np.empty((len(new.slots), 4), np.float32)
-        written = np.zeros(len(new.slots), np.bool_)
-        tiles = find_touched_tiles(new.layer)
-        composited = (tiles, context, new.layer, photograph, new.slots, values, written)
-        self.share(rasterizer.backproject_residual, len(tiles), *composited)
-        return self.sum_by_gaussian(new, (values, written))
-
-    def sum_by_gaussian(
-        self, new: BinnedSplats, gradients: EntryGradients
-    ) -> Float32[ndarray, "n columns"]:
-        """Sum the gradients of the entries of each Gaussian."""
-        totals = np.empty((len(new.slot_start) - 1, gradients[0].shape[1]), np.float32)
-        self.share(lists.sum_entries, len(totals), new.slot_start, *gradients, totals)
-        return totals
-
-    def limit_to_mask(self, where: Bool[Tensor, "h w"]) -> Float32[ndarray, "tiles"]:
-        """Make depth limits that exclude all tiles outside a mask."""
-        tiles = max_pool2d(where[None].float(), TILE, ceil_mode=True).flatten() > 0
-        return np.where(tiles.cpu().numpy(), np.float32(np.inf), np.float32(-np.inf))
-
-    def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
-        """Run `kernel(begin, end, *arguments)` over range(count) on the threads."""
-        share(kernel, count, *arguments, threads=self.threads)
-
-
 class _Composite(torch.autograd.Function):
     """Image, depth and alpha of a frozen context with new Gaussians."""
 
@@ -364,7 +185,7 @@ class _Composite(torch.autograd.Function):
         gaussians = GaussianArrays(*map(to_float32, tensors))
         splats = view.viewpoint.project(gaussians, is_antialiased)
         binned = assign_splat_slots(view.viewpoint.fill_lists(splats, view.depth_limits))
-        frame = view.viewpoint.composite(view, binned.layer)
+        frame = view.viewpoint.composite(view.layer, view.frame, binned.layer)
         render = to_render(frame)
         ctx.scene = (view, splats.factors, binned, frame)
         # Torch raises an error if a saved tensor is written to before the backward pass.
@@ -394,7 +215,7 @@ class _VaryOpacities(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         seen = to_float32(opacities) * binned.layer.opacities  # those of opaque Gaussians
         layer = binned.layer._replace(opacities=seen)
-        frame = view.viewpoint.composite(view, layer)
+        frame = view.viewpoint.composite(view.layer, view.frame, layer)
         render = to_render(frame)
         ctx.scene = (view, replace(binned, layer=layer), frame)
         ctx.save_for_backward(opacities, render.depth, render.alpha)
@@ -407,7 +228,7 @@ class _VaryOpacities(torch.autograd.Function):
         opacities = to_float32(ctx.saved_tensors[0])
         composited = (view.layer, binned, frame, d_frame)
         gradients = view.viewpoint.composite_backward(*composited, rasterizer.WANT_OPACITY)
-        sums = view.viewpoint.sums(binned, gradients)[:, 0]
+        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]
         result = np.divide(sums, opacities, out=np.zeros_like(sums), where=sums != 0)
         return None, None, torch.from_numpy(result)
 
@@ -421,7 +242,7 @@ class _VaryDepths(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         moved = splats.move_to_depths(to_float32(depths), view.viewpoint.pinhole.near)
         binned = assign_splat_slots(view.viewpoint.fill_lists(moved, limits))
-        frame = view.viewpoint.composite(view, binned.layer)
+        frame = view.viewpoint.composite(view.layer, view.frame, binned.layer)
         render = to_render(frame)
         ctx.scene = (view, binned, frame)
         ctx.save_for_backward(render.depth, render.alpha)
@@ -434,7 +255,35 @@ class _VaryDepths(torch.autograd.Function):
         view, binned, frame = ctx.scene
         composited = (view.layer, binned, frame, d_frame)
         gradients = view.viewpoint.composite_backward(*composited, rasterizer.WANT_DEPTH)
-        return None, None, None, torch.from_numpy(view.viewpoint.sums(binned, gradients)[:, 0])
+        return (
+            None,
+            None,
+            None,
+            torch.from_numpy(view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]),
+        )
+
+
+def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
+    """Freeze a context without Gaussians."""
+    height, width = viewpoint.pinhole.height, viewpoint.pinhole.width
+    frame = RasterFrame(
+        image=np.zeros((height, width, 3), np.float32),
+        depth=np.zeros((height, width), np.float32),
+        alpha=np.zeros((height, width), np.float32),
+        transmittance=np.ones((height, width), np.float32),
+        last=np.full((height, width), -1, np.int32),
+        used=np.zeros((viewpoint.tiles, 2), np.int32),
+        full=np.zeros(viewpoint.tiles, np.bool_),
+    )
+    layer = Layer(
+        np.empty((0, rasterizer.NUM_SPLAT_COLUMNS), np.float32),
+        np.empty(0, np.float32),
+        np.empty((0, 4), viewpoint.box_dtype),
+        np.zeros(viewpoint.tiles + 1, np.int64),
+        np.empty(0, np.int32),
+    )
+    limits = np.full(viewpoint.tiles, np.inf, np.float32)
+    return CpuFrozenScene(viewpoint, layer, frame, limits, np.empty(0, np.int32), 0)
 
 
 def make_pinhole(camera: Camera) -> Pinhole:
@@ -458,22 +307,6 @@ def make_pinhole(camera: Camera) -> Pinhole:
         width=camera.width,
         height=camera.height,
     )
-
-
-def find_touched_tiles(layer: Layer) -> Int64[ndarray, "touched"]:
-    """Find the tiles in which a layer has entries."""
-    return np.flatnonzero(np.diff(layer.tile_start))
-
-
-def compute_starts(sizes: Integer[ndarray, "tiles"]) -> Int64[ndarray, "bounds"]:
-    """Compute the starts of consecutive lists of these sizes, and the end."""
-    return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)])
-
-
-def order_by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
-    """Reorder splats by first use and drop unused ones, for locality; also return their order."""
-    order, entries = lists.number_by_use(layer.entries, len(layer.splats))
-    return Layer(*gather_splats([layer], [order]), layer.tile_start, entries), order
 
 
 def join_layers(
@@ -504,33 +337,6 @@ def assign_own_slots(layer: Layer) -> BinnedSplats:
     """Give each entry of a layer its own slot."""
     slots = np.arange(len(layer.entries), dtype=np.int32)
     return BinnedSplats(layer, slots, np.zeros(1, np.int64))
-
-
-def assign_splat_slots(layer: Layer) -> BinnedSplats:
-    """Give the entries of each splat adjacent slots."""
-    return BinnedSplats(layer, *lists.number_slots(layer.entries, len(layer.splats)))
-
-
-def gather_splats(layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]) -> SplatArrays:
-    """Gather the splats, opacities and boxes of these rows of each layer."""
-    bounds = [0, *accumulate(map(len, rows))]
-    taken = (
-        np.empty((bounds[-1], rasterizer.NUM_SPLAT_COLUMNS), np.float32),
-        np.empty(bounds[-1], np.float32),
-        np.empty((bounds[-1], 4), layers[0].boxes.dtype),
-    )
-    for layer, row, (start, stop) in zip(layers, rows, pairwise(bounds), strict=True):
-        into = tuple(array[start:stop] for array in taken)
-        share(lists.copy_splats, len(row), row, *layer[:3], into)
-    return taken
-
-
-def check_lengths(gaussians: GaussianArrays) -> int:
-    """Return the number of Gaussians; raise ValueError if the arrays differ in length."""
-    lengths = {len(array) for array in gaussians}
-    if len(lengths) > 1:
-        raise ValueError(f"the fields of Gaussians have different lengths: {sorted(lengths)}")
-    return lengths.pop()
 
 
 def to_arrays(gaussians: Gaussians) -> GaussianArrays:

@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gscompleter.geometry import move_to_depths, quats_to_rotations
 from gscompleter.render import AppearanceRender, ColorErrors, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import (
+from gscompleter.render.redraw import (
     FullRedraw,
     backproject_by_autograd,
     backproject_errors_by_autograd,

@@ -17,9 +17,17 @@ from numpy import ndarray
 
 from gscompleter.errors import quote_value
 from gscompleter.io.files import replace_file
-from gscompleter.io.ply import MODE_COMMENT, Element, encode, read_header, read_mode
-from gscompleter.splats.decoding import assemble_sh, build_gaussians, check_size, make_damage_error
-from gscompleter.splats.packing import drop_largest, quantize, restore_largest, unpack_fraction
+from gscompleter.splats.packing import (
+    assemble_sh,
+    build_gaussians,
+    check_size,
+    drop_largest,
+    make_damage_error,
+    quantize,
+    restore_largest,
+    unpack_fraction,
+)
+from gscompleter.splats.ply import MODE_COMMENT, Element, encode, read_header, read_mode
 from gscompleter.types import SH_C0, Gaussians
 
 CHUNK_SIZE = 256

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
-from gscompleter.io.ply import load_ply, require_finite, save_ply
-from gscompleter.reading import open_file
+from gscompleter.io.reading import open_file
 from gscompleter.splats.compressed_ply import (
     is_compressed_ply,
     read_compressed_ply,
@@ -18,8 +17,9 @@ from gscompleter.splats.compressed_ply import (
 )
 from gscompleter.splats.glb import is_glb, read_glb
 from gscompleter.splats.ksplat import read_ksplat
-from gscompleter.splats.labels import load_labels, save_labels
-from gscompleter.splats.order import sort_along_morton
+from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.ply import load_ply, require_finite, save_ply
+from gscompleter.splats.provenance import load_labels, save_labels
 from gscompleter.splats.sog import META, is_sog, read_sog
 from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import is_spz, read_spz, write_spz

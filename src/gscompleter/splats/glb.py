@@ -21,9 +21,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.reading import read_bytes
-from gscompleter.splats.decoding import build_gaussians, check_size, make_damage_error
-from gscompleter.splats.frames import HALF_TURN_Z, rotate_half_turn, transform_gaussians
+from gscompleter.io.reading import read_bytes
+from gscompleter.splats.packing import build_gaussians, check_size, make_damage_error
+from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
 from gscompleter.types import Gaussians, merge
 
 MAGIC = b"glTF"

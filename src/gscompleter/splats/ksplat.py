@@ -17,8 +17,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.reading import read_bytes
-from gscompleter.splats.decoding import assemble_sh, build_gaussians, check_size, make_damage_error
+from gscompleter.io.reading import read_bytes
+from gscompleter.splats.packing import assemble_sh, build_gaussians, check_size, make_damage_error
 from gscompleter.types import Gaussians, merge
 
 HEADER, SECTION_HEADER = 4096, 1024

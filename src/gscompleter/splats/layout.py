@@ -18,7 +18,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.io.files import replace_file
-from gscompleter.io.ply import Element, iterate_blocks, make_rows, read_header, save_ply
+from gscompleter.splats.ply import Element, iterate_blocks, make_rows, read_header, save_ply
 from gscompleter.types import Gaussians, merge
 
 LABEL_COLUMN = "generated"

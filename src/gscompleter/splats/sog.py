@@ -25,14 +25,14 @@ from numpy import ndarray
 from PIL import Image
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.reading import read_bytes
-from gscompleter.splats.decoding import (
+from gscompleter.io.reading import read_bytes
+from gscompleter.splats.packing import (
     assemble_sh,
     build_gaussians,
     check_growth,
     make_damage_error,
+    restore_largest,
 )
-from gscompleter.splats.packing import restore_largest
 from gscompleter.types import SH_C0, Gaussians
 
 META = "meta.json"

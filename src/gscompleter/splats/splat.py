@@ -12,8 +12,8 @@ import numpy as np
 
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
-from gscompleter.reading import read_bytes
-from gscompleter.splats.decoding import assemble_sh, build_gaussians
+from gscompleter.io.reading import read_bytes
+from gscompleter.splats.packing import assemble_sh, build_gaussians
 from gscompleter.types import SH_C0, Gaussians
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

@@ -20,17 +20,18 @@ from numpy import ndarray
 
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
-from gscompleter.io.ply import encode
-from gscompleter.reading import read_bytes
-from gscompleter.splats.decoding import (
+from gscompleter.io.reading import read_bytes
+from gscompleter.splats.packing import (
     assemble_sh,
     build_gaussians,
     check_growth,
     check_size,
+    drop_largest,
     make_damage_error,
+    restore_largest,
 )
-from gscompleter.splats.frames import HALF_TURN_X, rotate_half_turn
-from gscompleter.splats.packing import drop_largest, restore_largest
+from gscompleter.splats.ply import encode
+from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
 from gscompleter.types import SH_C0, Gaussians
 
 MAGIC = b"NGSP"

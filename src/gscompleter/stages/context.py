@@ -11,11 +11,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.errors import InputError
-from gscompleter.geometry import compute_z_depths
-from gscompleter.matching.depth_range import get_depth_range
+from gscompleter.geometry import compute_z_depths, project_mask
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
+from gscompleter.reconstructors.features.depth_range import get_depth_range
 from gscompleter.render import Renderer
-from gscompleter.stages.integration import project_mask
 from gscompleter.types import Camera, Gaussians, Reconstruction, View
 
 MIN_CONTRAST = 0.02

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap.lenses import build_intrinsics, find_model
 from gscompleter.data.colmap.records import PosedImage, make_portable
-from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.errors import InputError, quote_value, refuse_pointer
-from gscompleter.reading import open_file
+from gscompleter.io.reading import open_file
 
 MAX_NAME = 1024
 """Longest image name, in bytes."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.lens import Distortion, Projection
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.limits import MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
+from gscompleter.data.undistort import Distortion, Projection
 from gscompleter.errors import InputError, quote_value
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.poses import compute_rotation, invert_viewmat
+from gscompleter.data.cameras import compute_rotation, invert_viewmat
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import binary, text
 from gscompleter.data.colmap.records import PosedImage
 from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import FOLDERS, ORIGINALS, ImageFinder, find_path, keep_existing
-from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.data.point_cloud import read_point_cloud
+from gscompleter.data.points import read_point_cloud
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.image import has_orientation_tag
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap.lenses import build_intrinsics, find_model
 from gscompleter.data.colmap.records import PosedImage, make_portable
-from gscompleter.data.intrinsics import Intrinsics
 from gscompleter.errors import InputError, quote_value
-from gscompleter.reading import read_lines
+from gscompleter.io.reading import read_lines
 
 MAX_LINE = 1 << 22
 """Longest line in characters: the features of an image."""

@@ -21,7 +21,7 @@ from gscompleter.generators.warp import (
     warp_photographs,
 )
 from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patches
-from gscompleter.interpolation import smooth_masked
+from gscompleter.image_ops import smooth_masked
 from gscompleter.types import Camera, GeneratorInput, View
 
 STRUCTURE_REACH = 0.15

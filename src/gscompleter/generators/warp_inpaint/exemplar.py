@@ -19,9 +19,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from gscompleter.generators.smooth import compute_distance_to_known
+from gscompleter.image_ops import dilate
 from gscompleter.kernels import patchmatch
 from gscompleter.kernels.patchmatch import RADIUS, SIDE
-from gscompleter.masks import dilate
 
 MAX_BIAS = 0.1
 """Largest colour shift of a patch per channel."""

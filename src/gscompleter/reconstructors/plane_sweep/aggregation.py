@@ -7,7 +7,7 @@ from jaxtyping import Float32, Int16, UInt8
 
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import Bands
-from gscompleter.matching.stereo_image import StereoImage, compute_contrast
+from gscompleter.reconstructors.features.stereo_image import StereoImage, compute_contrast
 
 SMALL_PENALTY = 25
 """Cost of a change by one plane between neighbouring pixels."""

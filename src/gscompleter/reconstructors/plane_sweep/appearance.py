@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import torch
 
-from gscompleter.descent import Adam
+from gscompleter.optim import Adam
 from gscompleter.render import Renderer
 from gscompleter.types import SH_C0, Gaussians, View, sh_from_rgb
 

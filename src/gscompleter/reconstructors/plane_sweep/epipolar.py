@@ -13,8 +13,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.matching.features import Pixels
-from gscompleter.matching.stereo_image import StereoImage, compute_source_from_reference
+from gscompleter.reconstructors.features.sift import Pixels
+from gscompleter.reconstructors.features.stereo_image import (
+    StereoImage,
+    compute_source_from_reference,
+)
 
 MIN_MATCHES = 20
 """Fewest matches for a correction; with fewer the pose is kept."""

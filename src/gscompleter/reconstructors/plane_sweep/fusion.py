@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from gscompleter.kernels import stereo
-from gscompleter.matching.stereo_image import StereoImage
+from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.confidence import MAX_RETURN_ERROR, Map, Mask
 from gscompleter.reconstructors.plane_sweep.occlusion import UNKNOWN
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.descent import Adam
+from gscompleter.optim import Adam
 from gscompleter.render import Renderer
 from gscompleter.types import Gaussians, View
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import Bands
-from gscompleter.matching.stereo_image import StereoImage
+from gscompleter.reconstructors.features.stereo_image import StereoImage
 
 Source = tuple[StereoImage, Float[np.ndarray, "3 4"]]
 """Another view, and the transform from reference pixels to its pixels."""

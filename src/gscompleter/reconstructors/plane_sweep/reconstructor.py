@@ -10,25 +10,25 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.kernels.sharing import map_in_parallel
-from gscompleter.matching.depth_range import get_depth_range
-from gscompleter.matching.stereo_image import StereoImage
+from gscompleter.kernels.parallel import map_in_parallel
+from gscompleter.reconstructors.features.depth_range import get_depth_range
+from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.confidence import Mask
+from gscompleter.reconstructors.plane_sweep.depth_to_gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
-from gscompleter.reconstructors.plane_sweep.measuring import (
-    Measurement,
-    compute_inverse_depth,
-    measure_depths,
-)
-from gscompleter.reconstructors.plane_sweep.open_sky import (
+from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
+from gscompleter.reconstructors.plane_sweep.sky_mask import (
     exclude_pixels,
     find_skies,
     find_sky,
     transfer_sky,
 )
-from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
-from gscompleter.reconstructors.plane_sweep.splatter import Splatter
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
+from gscompleter.reconstructors.plane_sweep.sweep import (
+    Measurement,
+    compute_inverse_depth,
+    measure_depths,
+)
 from gscompleter.sky import SKY_DEPTH, is_sky
 from gscompleter.types import DepthMap, Reconstruction, View
 

@@ -9,8 +9,8 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float32
 
-from gscompleter.matching.neighbours import Neighbours, find_neighbours
-from gscompleter.matching.stereo_image import (
+from gscompleter.reconstructors.features.neighbours import Neighbours, find_neighbours
+from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
     compute_source_from_reference,
     make_stereo_images,

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gscompleter.interpolation import fill_smoothly
-from gscompleter.kernels import variation
-from gscompleter.matching.stereo_image import compute_contrast
+from gscompleter.image_ops import fill_smoothly
+from gscompleter.kernels import tgv
+from gscompleter.reconstructors.features.stereo_image import compute_contrast
 
 Image = Float32[np.ndarray, "h w 3"]
 Map = Float32[np.ndarray, "h w"]
@@ -55,7 +55,7 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
         across, down = (cost / np.float32(scale) for cost in compute_step_costs(colours))
         bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
         steps = ITERATIONS * 2**number
-        variation.fit(heights, gradients, data, weight, across, down, bend, tolerance, steps)
+        tgv.fit(heights, gradients, data, weight, across, down, bend, tolerance, steps)
     return heights
 
 
