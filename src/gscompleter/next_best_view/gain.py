@@ -26,9 +26,6 @@ from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, t
 from gscompleter.state import Completion
 from gscompleter.types import Camera, Gaussians, PhotoObservations, Render, make_observed, merge
 
-SURFACE_TOLERANCE = 0.1
-"""Tolerated distance behind the anchor's depth map, relative to depth, for the same surface."""
-
 
 @dataclass(frozen=True)
 class Choice:

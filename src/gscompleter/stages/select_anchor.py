@@ -25,9 +25,6 @@ from gscompleter.geometry import (
     sample,
     unproject,
 )
-from gscompleter.next_best_view.gain import (
-    SURFACE_TOLERANCE,
-)
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
 from gscompleter.types import (
     Camera,
@@ -36,6 +33,9 @@ from gscompleter.types import (
     Render,
     View,
 )
+
+SURFACE_TOLERANCE = 0.1
+"""Tolerated distance behind the anchor's depth map, relative to depth, for the same surface."""
 
 
 @dataclass(frozen=True)
